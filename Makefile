@@ -48,7 +48,7 @@ $(VENV)/.interfaces: $(VENV)/.locked $(wildcard $(INTERFACES)/msg/*) $(INTERFACE
 	@touch $@
 
 # Compat: folders on the path, where the default is a program that runs at each start of Python.
-$(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_analysis/model/arithmetic/*.c msg_agents/setup.* analysis/package.xml msg_agents/package.xml $(EXAMPLES)/setup.* $(EXAMPLES)/package.xml)
+$(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_analysis/arithmetic/*.c msg_agents/setup.* analysis/package.xml msg_agents/package.xml $(EXAMPLES)/setup.* $(EXAMPLES)/package.xml)
 	$(PIP) install $(LOCAL) --config-settings editable_mode=compat $(addprefix --editable ,analysis msg_agents $(EXAMPLES))
 	$(BIN)/python -m compileall -q analysis/msg_analysis msg_agents/msg_agents
 	@touch $@

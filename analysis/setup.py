@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 import os
 import sys
@@ -25,7 +14,7 @@ WHEEL = {"bdist_wheel", "editable_wheel", "dist_info"} & set(sys.argv)
 # Without a compiler the package works all the same, only slower. Fused multiply-adds would change the last bits.
 KERNEL = Extension(
     f"{PACKAGE}.model.arithmetic._kernel",
-    [f"{PACKAGE}/model/arithmetic/_kernel.c"],
+    [f"{PACKAGE}/arithmetic/_kernel.c"],
     extra_compile_args=["-O2", "-ffp-contract=off"] if os.name == "posix" else [],
     optional=True,
 )
@@ -51,10 +40,10 @@ setup(
     package_data={
         PACKAGE: [
             "py.typed",
-            "examples/experiments/*.yaml",
-            "model/arithmetic/_kernel.pyi",
-            "report/html/templates/*",
-            "wire/definitions/*/msg/*.msg",
+            "experiment/bundled/*.yaml",
+            "arithmetic/_kernel.pyi",
+            "report/templates/*",
+            "messages/definitions/*/msg/*.msg",
         ],
     },
     data_files=[

@@ -21,11 +21,11 @@ import numpy as np
 import scipy.linalg
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.theory.jump_system import continuous
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.system.jump_system import continuous
-from msg_analysis.types import FloatArray
 
 Result = TypeVar("Result")
 

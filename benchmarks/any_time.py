@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.common.cores import count_cores
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.sequential.watched_evidence import WatchedEvidence
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.common.resources import count_cores
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.sequential_sums import WatchedEvidence
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.twin.simulate import simulate
 

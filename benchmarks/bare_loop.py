@@ -23,13 +23,12 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.nodes.node_process import prefer_throughput
-from msg_agents.nodes.ros.rclpy_error import RCLError
-from msg_agents.processes.core_pinning import keep_to, place
-from msg_agents.processes.environment import node_environment
-from msg_agents.processes.process_plan import RECORDER, ProcessPlan
-from msg_analysis.common.cores import available_cores
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
+from msg_agents.nodes.process import prefer_throughput
+from msg_agents.nodes.ros import RCLError
+from msg_agents.process_layout import RECORDER, ProcessPlan, keep_to, place
+from msg_analysis.common.resources import available_cores
 
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, depth=0)
 FRAME = struct.Struct("<4xQI")  # CDR header, step, agent

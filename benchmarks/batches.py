@@ -16,12 +16,11 @@ import rclpy
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.nodes.ros.lean_node import LeanNode
-from msg_agents.nodes.ros.rclpy_error import RCLError
-from msg_agents.processes.environment import node_environment
-from msg_analysis.wire.state_batches import encode_batch
-from msg_analysis.wire.topics import STATES
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
+from msg_agents.nodes.ros import LeanNode, RCLError
+from msg_analysis.messages.cdr import encode_batch
+from msg_analysis.messages.topics import STATES
 
 SIZES = (8192, 16384, 32768, 60000)  # bytes
 STATE = 196  # bytes of a state of 16 replicas

@@ -22,11 +22,11 @@ from calibration_laws import FALSE, LONG, MESSAGES, SHORT, TRUE, line_ring
 from calibration_runs import ROOT, run_all
 from calibration_tables import complaints, message_tables, tables
 
-from msg_analysis.inference.errors.estimates import Estimate
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.inference.verdict.comparison import Comparison
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.comparison import Comparison
+from msg_analysis.inference.estimates import Estimate
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.simulate import new_record, simulate
 
 PAGE = ROOT / "docs/calibration.md"

@@ -13,10 +13,10 @@ import numpy as np
 from any_time import EVERY, LEVEL, experiment
 from scipy import stats
 
-from msg_analysis.inference.errors.time_means import time_means
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.sequential.watched_evidence import WatchedEvidence
-from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.sequential_sums import WatchedEvidence
+from msg_analysis.inference.statistics import simultaneous_half_width
+from msg_analysis.inference.time_means import time_means
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.twin.simulate import simulate
 

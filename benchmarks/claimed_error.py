@@ -14,12 +14,12 @@ import mpmath
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.step_model import build_step_model
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.step_model import build_step_model
+from msg_analysis.theory import jump_system
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.system import jump_system
-from msg_analysis.types import FloatArray
 
 DIGITS = 80
 DECADES = (2, 6, 12)

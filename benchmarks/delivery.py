@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 
 from msg_agents.channel.channel_file import Channel
-from msg_agents.running.run_result import RunResult, conclude
-from msg_agents.running.runner import run_network
+from msg_agents.run.result import RunResult, conclude
+from msg_agents.run.runner import run_network
 from msg_analysis.errors import InputError
-from msg_analysis.examples.bundled import find
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.examples import find
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 
 COLUMNS = (

@@ -13,9 +13,9 @@ from statistics import median
 
 import networkx as nx
 
-from msg_agents.nodes.agents.batch_links import ONLY_TOPICS
-from msg_agents.running.runner import run_network
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_agents.nodes.agent_group import ONLY_TOPICS
+from msg_agents.run.runner import run_network
+from msg_analysis.experiment.experiment import ValidExperiment
 
 NETWORKS = ((24, 3, 23), (40, 4, 39), (100, 4, 6), (100, 4, 20), (100, 4, 99))  # agents, processes, neighbours
 HOPELESS = (100, 4, 99)  # with topics

@@ -18,12 +18,12 @@ from functools import partial
 import numpy as np
 from calibration_laws import TRUE, line_ring
 
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.inference.verdict.comparison import Comparison
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.step_model import StepModel
+from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.comparison import Comparison
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.step_model import StepModel
 from msg_analysis.twin.simulate import simulate
-from msg_analysis.types import FloatArray, IntArray
 
 Random = np.random.Generator
 STRETCH = 20  # steps

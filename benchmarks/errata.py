@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from msg_analysis.types import FloatArray
+from msg_analysis.common.arrays import FloatArray
 
 LINE = [(1, 2), (2, 3), (3, 4), (4, 5)]
 RING = [*LINE, (1, 5)]

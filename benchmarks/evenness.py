@@ -17,10 +17,10 @@ import numpy as np
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.inference.verdict.comparison import Comparison
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.comparison import Comparison
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.simulate import simulate
 
 

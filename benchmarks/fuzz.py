@@ -28,16 +28,16 @@ from fuzz_bags import make_bags, mutate_bag
 from fuzz_documents import BOMB, mutate_document, mutate_text
 from mcap.reader import make_reader
 
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import InputError
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment import memory
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.report.documents.info import describe_bag, describe_experiment
+from msg_analysis.experiment import loading
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.verdict import compare
+from msg_analysis.report.documents import describe_bag, describe_experiment
 
 ROOT = Path(__file__).parents[1]
-EXPERIMENTS = [ROOT / "analysis/msg_analysis/examples/experiments", ROOT / "tests/data/golden"]
+EXPERIMENTS = [ROOT / "analysis/msg_analysis/experiment/bundled", ROOT / "tests/data/golden"]
 MEMORY = 2 * 10**8  # bytes that an experiment is told that there are
 ADDRESS_SPACE = 2 * 10**9  # bytes that a process gets
 SECONDS = 60  # of CPU time
@@ -128,7 +128,7 @@ def work(task: tuple[str, int, int, list[Path], Path]) -> tuple[Counter[str], li
     """A stretch of seeds in a process of its own: outcomes, findings, the longest case [s], most memory [kB]."""
     kind, first, last, sources, findings = task
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
-    memory.available_memory = lambda: MEMORY
+    loading.available_memory = lambda: MEMORY
     signal.signal(signal.SIGPROF, _too_slow)
     outcomes: Counter[str] = Counter()
     found, longest = [], 0.0
@@ -168,7 +168,7 @@ def run(kind: str, count: int, seed: int, sources: list[Path], findings: Path, j
         for part, new, slowest, most in pool.imap_unordered(work, tasks):
             outcomes += part
             found += new
-            longest, memory = max(longest, slowest), max(memory, most)
+            longest, memory = max(longest, slowest), max(loading, most)
             for line in new:
                 print(line, file=sys.stderr, flush=True)
     listed = ", ".join(f"{number} {name}" for name, number in sorted(outcomes.items()))

@@ -19,13 +19,13 @@ from fuzz_documents import mutate_document, mutate_text
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from msg_analysis.bags import written_file
-from msg_analysis.bags.format.mcap_file import MAGIC
-from msg_analysis.bags.format.storage_options import COMPRESSIONS, Storage
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.bags import writing
+from msg_analysis.bags.mcap_chunks import COMPRESSIONS, Storage
+from msg_analysis.bags.mcap_reading import MAGIC
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.messages.messages import decode_string, encode_string
 from msg_analysis.twin.simulate import simulate
-from msg_analysis.wire.messages import decode_string, encode_string
 
 CHUNK, MESSAGE, METADATA = 0x06, 0x05, 0x0C
 _RECORD = struct.Struct("<BQ")
@@ -39,7 +39,7 @@ Record = tuple[int, bytes]  # opcode, content
 
 def make_bags(directory: Path) -> list[Path]:
     """A bag of every kind that there is, each with several chunks."""
-    written_file.CHUNK_SIZE = 3000
+    writing.CHUNK_SIZE = 3000
     graphs = {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}}
     plain = {"name": "fuzz", "graphs": graphs, "switching": {"generator": [[-1, 1], [1, -1]]}}
     run = {"dt": 0.05, "duration": 6.0, "replicas": 2, "start": "zero"}

@@ -11,8 +11,8 @@ import argparse
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.inference.online.running_errors import RunningErrors
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.online_errors import RunningErrors
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 

@@ -11,13 +11,13 @@ from collections.abc import Callable
 
 import numpy as np
 
-from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.graph_path import mode_path
-from msg_analysis.model.run.trajectory import Completeness, Trajectory
-from msg_analysis.model.step.phases import phases
-from msg_analysis.model.step.process_noise import ProcessNoise
-from msg_analysis.model.step.step_model import StepModel, build_step_model
+from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.graph_path import mode_path
+from msg_analysis.model.phases import phases
+from msg_analysis.model.process_noise import ProcessNoise
+from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.step_model import StepModel, build_step_model
 from msg_analysis.twin.simulate import new_record
 
 Lateness = Callable[[np.random.Generator], float]

@@ -14,9 +14,9 @@ from collections.abc import Iterator
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.cli.progress import SolveProgress
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.theory.leaders.selection import LeaderProblem, select_leaders
+from msg_analysis.cli.console import SolveProgress
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.theory.leaders import LeaderProblem, select_leaders
 
 
 def random_network(seed: int, agents: int, graphs: int) -> ValidExperiment:

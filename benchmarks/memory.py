@@ -26,21 +26,21 @@ from typing import Any
 import numpy as np
 import rclpy
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.nodes.network_node import NetworkNode
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
+from msg_agents.nodes.base import NetworkNode
 from msg_agents.nodes.recorder import keep_freed_memory
-from msg_agents.nodes.ros.lean_node import LeanNode
-from msg_agents.processes.environment import node_environment
-from msg_agents.running.runner import run_network
+from msg_agents.nodes.ros import LeanNode
+from msg_agents.run.runner import run_network
 from msg_agents.stepping.state_receiver import StateReceiver
-from msg_analysis.bags.writer import BagWriter
-from msg_analysis.model.arithmetic.step_clock import SECOND, StepClock
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
+from msg_analysis.arithmetic.step_clock import SECOND, StepClock
+from msg_analysis.bags.writing import BagWriter
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.messages.cdr import encode_batch
+from msg_analysis.messages.messages import STATE_HEAD, StateCodec
+from msg_analysis.messages.topics import GRAPH, PROGRESS, STATE, STATES, agent_node_name, network_topics
+from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.simulate import new_record
-from msg_analysis.wire.messages import STATE_HEAD, StateCodec
-from msg_analysis.wire.state_batches import encode_batch
-from msg_analysis.wire.topics import GRAPH, PROGRESS, STATE, STATES, agent_name, network_topics
 
 POINTS = 5
 AGENTS, STEPS_IN_AN_HOUR = 1000, 210_000  # at 58 steps a second, docs/performance.md
@@ -141,7 +141,7 @@ class MadeUpAgents(NetworkNode):
     """The first agent, which speaks for all: each is as far as the graph is known."""
 
     def __init__(self, record: RunRecord) -> None:
-        super().__init__(agent_name(0), record=record)
+        super().__init__(agent_node_name(0), record=record)
         self.reached, self._sojourns = 0, 0
         self._progress = self.publisher_of(PROGRESS)
         self.subscribe(GRAPH, self._receive)
@@ -176,7 +176,7 @@ def switcher(agents: int, steps: int) -> None:
         with subprocess.Popen([sys.executable, "-m", "msg_agents", "switcher", str(file)]) as process:
             rclpy.init()
             node = MadeUpAgents(record)
-            others = [LeanNode(agent_name(i)) for i in range(1, agents)]
+            others = [LeanNode(agent_node_name(i)) for i in range(1, agents)]
             while "switcher" not in node.get_node_names() or not node.count_publishers(GRAPH.name):
                 time.sleep(0.1)
             node.begin()

@@ -13,11 +13,11 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.sequential_law import build_run_model
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.step_model import build_run_model
+from msg_analysis.theory.jump_system import emulated
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.system.jump_system import emulated
 
 AIR = {"broadcast": 0.2, "link": 0.3}
 HELD = {"loss": 0.3, "on_loss": "hold"}

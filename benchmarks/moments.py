@@ -20,10 +20,10 @@ import numpy as np
 import scipy.linalg
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.model.network.markov_chain import Time, stationary_law
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.experiment.markov_chain import Time, stationary_law
+from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.system.jump_system import JumpSystem
-from msg_analysis.types import FloatArray
 
 DT = 0.02
 """Length of a step in discrete time."""

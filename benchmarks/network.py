@@ -23,10 +23,10 @@ from pathlib import Path
 
 import bare_loop
 
-from msg_agents.running.runner import run_network
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_agents.run.runner import run_network
+from msg_analysis.experiment.experiment import ValidExperiment
 
-EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
+EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"
 LARGE, PROCESSES = 100, 4  # agents, and the processes that they share
 RATIOS = {
     "network / bare loop": ("network", "bare loop"),

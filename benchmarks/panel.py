@@ -18,7 +18,7 @@ import termios
 import threading
 from pathlib import Path
 
-EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
+EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 KINDS = ("plain", "panel", "panel and page")
 

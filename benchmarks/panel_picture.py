@@ -13,16 +13,15 @@ from pathlib import Path
 
 from rich.console import Console
 
-from msg_agents.running.runner import run_network
-from msg_agents.watching.run_observer import RunObserver
-from msg_agents.watching.snapshot import Snapshot, SnapshotSource
-from msg_agents.watching.terminal_panel import panel_of
-from msg_agents.watching.view import View
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
+from msg_agents.run.runner import run_network
+from msg_agents.watch.observer import RunObserver
+from msg_agents.watch.panel import View, panel_of
+from msg_agents.watch.snapshot import Snapshot, SnapshotSource
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.run_record import RunRecord
 
 ROOT = Path(__file__).parents[1]
-EXPERIMENT = ROOT / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
+EXPERIMENT = ROOT / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"
 WIDTH, HEIGHT = 80, 24
 
 

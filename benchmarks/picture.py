@@ -1,6 +1,6 @@
 """The picture of the README: what one recorded run looks like, from its bag.
 
-.venv/bin/msg-agents run analysis/msg_analysis/examples/experiments/line_ring.yaml
+.venv/bin/msg-agents run analysis/msg_analysis/experiment/bundled/line_ring.yaml
 .venv/bin/python benchmarks/picture.py runs/line_ring_... docs/images/run.svg
 """
 
@@ -15,10 +15,10 @@ import networkx as nx
 import numpy as np
 from matplotlib.figure import Figure
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.inference.online.running_errors import RunningErrors
-from msg_analysis.model.network.graphs import Graph
-from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.experiment.graphs import Graph
+from msg_analysis.inference.online_errors import RunningErrors
+from msg_analysis.model.run import Trajectory
 from msg_analysis.theory.prediction import predict
 
 SHOWN = 30.0  # units of time of which the states are drawn

@@ -1,17 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """What `msg-analysis plan` says, against runs: standard errors of the system error, and lengths of runs.
 
@@ -34,15 +22,15 @@ import any_time
 import numpy as np
 
 from msg_analysis.api import Experiment
-from msg_analysis.common.cores import count_cores
-from msg_analysis.common.text.number_words import percent
-from msg_analysis.inference.errors.time_means import time_means
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.planning.fault_power import Fault, fault_powers
-from msg_analysis.inference.planning.precision import precision_of
-from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
-from msg_analysis.inference.verdict.compare import judge
-from msg_analysis.inference.verdict.evidence import Evidence
+from msg_analysis.common.resources import count_cores
+from msg_analysis.common.text import percent
+from msg_analysis.inference.evidence import Evidence
+from msg_analysis.inference.fault_power import Fault, fault_powers
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.sample_size import precision_of
+from msg_analysis.inference.statistics import simultaneous_half_width
+from msg_analysis.inference.time_means import time_means
+from msg_analysis.inference.verdict import judge
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.theory.time_mean_variance import mean_variance
 from msg_analysis.twin.simulate import simulate

@@ -14,12 +14,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from msg_agents.running.runner import run_network
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_agents.run.runner import run_network
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.verdict import compare
 from msg_analysis.twin.simulate import simulate
 
-EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
+EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"
 REPLICAS = (16, 64, 256)
 TARGET = 0.01
 PILOT = 4000.0  # simulated time units of the twin

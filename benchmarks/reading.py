@@ -26,7 +26,7 @@ from typing import TypeVar
 
 import numpy as np
 
-EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
+EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"
 TOPICS = [f"/agent_{i}/state" for i in range(1, 6)]
 Result = TypeVar("Result")
 
@@ -55,8 +55,8 @@ class Stopwatch:
 
 def make_bag(directory: Path, states: int, replicas: int) -> None:
     """A bag with at least so many states."""
-    from msg_analysis.bags.trajectory_writer import write_trajectory
-    from msg_analysis.model.experiment.experiment import ValidExperiment
+    from msg_analysis.bags.run_writer import write_trajectory
+    from msg_analysis.experiment.experiment import ValidExperiment
     from msg_analysis.twin.simulate import simulate
 
     document = ValidExperiment.load(EXPERIMENT).to_document()
@@ -90,7 +90,7 @@ def without_chunks(directory: Path) -> None:
 
 def read_bag(directory: Path) -> Reading:
     """The reader of this software."""
-    from msg_analysis.bags.reader import read_bag as read
+    from msg_analysis.bags.reading import read_bag as read
 
     watch = Stopwatch()
     trajectory = read(directory)

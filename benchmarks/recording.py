@@ -10,17 +10,17 @@ import tempfile
 import time
 from pathlib import Path
 
-from msg_agents.nodes.agents.state_batches import BATCH_SIZE
+from msg_agents.nodes.agent_group import BATCH_SIZE
 from msg_agents.nodes.recorder import write_size
 from msg_agents.stepping.state_receiver import StateReceiver
-from msg_analysis.bags.format.storage_options import COMPRESSIONS, Storage
-from msg_analysis.bags.writer import BagWriter
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
+from msg_analysis.bags.mcap_chunks import COMPRESSIONS, Storage
+from msg_analysis.bags.writing import BagWriter
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.messages.cdr import encode_batch
+from msg_analysis.messages.messages import StateCodec
+from msg_analysis.messages.topics import STATE, STATES, network_topics
+from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.simulate import simulate
-from msg_analysis.wire.messages import StateCodec
-from msg_analysis.wire.state_batches import encode_batch
-from msg_analysis.wire.topics import STATE, STATES, network_topics
 
 SPLITS = (None, 5_000_000)  # bytes
 DURATION = 2000.0  # 200,005 states

@@ -27,8 +27,8 @@ from msg_agents_interfaces.msg import AgentState
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import node_environment
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
 
 AGENTS = 5
 PAUSE = 2.0  # s before each kill

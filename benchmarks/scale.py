@@ -20,8 +20,8 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from msg_agents.running.runner import run_network
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_agents.run.runner import run_network
+from msg_analysis.experiment.experiment import ValidExperiment
 
 AGENTS = (5, 20, 40, 100, 300, 1000)
 PROCESSES = (1, 2, 4, 40)

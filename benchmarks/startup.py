@@ -22,7 +22,7 @@ import yaml
 from msg_agents import run_network
 from msg_agents.cli.main import main as agents
 from msg_analysis.cli.main import main as analysis
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 
 ROUNDS = 7
 STARTS = 3  # of each network

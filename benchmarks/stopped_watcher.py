@@ -14,10 +14,10 @@ import sys
 import time
 from pathlib import Path
 
-from msg_agents.discovery.ros_domain import free_domain
+from msg_agents.discovery.rtps import free_domain
 
 PROGRAM = str(Path(sys.executable).with_name("msg-agents"))
-EXPERIMENT = str(Path(__file__).parents[1] / "analysis/msg_analysis/examples/experiments/line_ring.yaml")
+EXPERIMENT = str(Path(__file__).parents[1] / "analysis/msg_analysis/experiment/bundled/line_ring.yaml")
 BEFORE = 3000  # steps made before the stop
 
 

@@ -24,10 +24,9 @@ from typing import Any
 import networkx as nx
 import numpy as np
 
-from msg_analysis.sweep.jobs.evaluate import evaluate
-from msg_analysis.sweep.jobs.job import Outcome
-from msg_analysis.sweep.jobs.workers import Workers
-from msg_analysis.sweep.plan import load_sweep
+from msg_analysis.sweep.grid import load_sweep
+from msg_analysis.sweep.points import Outcome, evaluate
+from msg_analysis.sweep.workers import Workers
 
 AGENTS, GRAPHS = 50, 3
 

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.common.cores import count_cores
-from msg_analysis.inference.errors.estimates import estimates
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.verdict.compare import judge
-from msg_analysis.inference.verdict.evidence import Evidence
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.common.resources import count_cores
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.estimates import estimates
+from msg_analysis.inference.evidence import Evidence
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.verdict import judge
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.twin.simulate import simulate
 

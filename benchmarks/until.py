@@ -12,13 +12,12 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.inference.online import running_errors
-from msg_analysis.inference.online.running_errors import LiveEstimate
-from msg_analysis.inference.online.stopping import reached
-from msg_analysis.inference.verdict import compare as verdicts
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.trajectory import Completeness, Trajectory
-from msg_analysis.model.run.until import Until
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference import online_errors
+from msg_analysis.inference import verdict as verdicts
+from msg_analysis.inference.online_errors import LiveEstimate, reached
+from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run_record import Until
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -54,7 +53,7 @@ def main() -> None:
     runs = parser.parse_args().runs
     experiment = ValidExperiment.parse(EXPERIMENT)
     law = predict(experiment)
-    for module in (running_errors, verdicts):  # one prediction for all: they differ in their seeds and lengths only
+    for module in (online_errors, verdicts):  # one prediction for all: they differ in their seeds and lengths only
         module.predict = lambda experiment, *_: replace(law, experiment=experiment)  # type: ignore[attr-defined]
     rules = {"20%": Until(0.2), "decided, at 20%": Until(0.2, decided=True)}
     print("| rule | ended early | steps, median | interval misses | false alarms |\n|---|---:|---:|---:|---:|")

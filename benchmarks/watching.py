@@ -13,10 +13,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-from msg_agents.discovery.ros_domain import free_domain
+from msg_agents.discovery.rtps import free_domain
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
-EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
+EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"
 
 
 def end(process: subprocess.Popen[str]) -> float:

@@ -71,7 +71,7 @@ def main(folder: str) -> None:
         )
         machine("pip", "check")
         assert_equal(machine)
-        kernels = list(machine.bin.parent.glob("lib/python*/site-packages/msg_analysis/model/arithmetic/_kernel.*.so"))
+        kernels = list(machine.bin.parent.glob("lib/python*/site-packages/msg_analysis/arithmetic/_kernel.*.so"))
         assert len(kernels) == 1, kernels
         kernels[0].unlink()
         assert_equal(machine)

@@ -24,7 +24,7 @@ ROOT = HERE.parent
 SOURCES = ROOT / "ros_ws" / "src"
 MESSAGES = "msg_agents_interfaces"
 PACKAGES = (MESSAGES, "msg_analysis", "msg_agents", "msg_agents_example_protocols")
-KERNEL = re.compile(r"msg_analysis/model/arithmetic/_kernel\.[\w.-]+\.so")
+KERNEL = re.compile(r"msg_analysis/arithmetic/_kernel\.[\w.-]+\.so")
 NOT_FOR_RUNS = (
     "include",
     f"share/{MESSAGES}/cmake",

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """What is installed works without ROS. Run by ``colcon test`` in the workspace that has been built."""
 
@@ -25,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import msg_analysis
-from msg_analysis.examples import bundled
+from msg_analysis.experiment import examples
 
 EXPERIMENT = """
 name: pair
@@ -55,9 +44,9 @@ def test_data_files() -> None:
 
 
 def test_examples() -> None:
-    assert "line_ring" in bundled.names()
+    assert "line_ring" in examples.names()
 
 
-@pytest.mark.parametrize("name", bundled.names())
+@pytest.mark.parametrize("name", examples.names())
 def test_example(name: str) -> None:
     msg_analysis.Experiment.load(name).require_available()

@@ -21,12 +21,12 @@ from cyclone_messages import AgentState, Header, Node, Progress, StateBatch, Tim
 from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.util import duration
 
-from msg_analysis.model.arithmetic.step_clock import SECOND, StepClock
-from msg_analysis.model.run.agent_law import agent_law
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.wire import messages, topics
-from msg_analysis.wire.messages import StateCodec
-from msg_analysis.wire.signatures import genuine, sign
+from msg_analysis.arithmetic.step_clock import SECOND, StepClock
+from msg_analysis.messages import messages, topics
+from msg_analysis.messages.acceptance import genuine, sign
+from msg_analysis.messages.messages import StateCodec
+from msg_analysis.model.agent_law import agent_law
+from msg_analysis.model.run_record import RunRecord
 
 WINDOW = 64  # steps that an agent may be ahead of any that it exchanges states with
 KEPT = 6000  # steps that are sent again to an agent that was killed and has come back

@@ -92,7 +92,7 @@ def test_the_folders_without_ros() -> None:
 
 def test_ros_would_be_found() -> None:
     pytest.importorskip("rclpy")
-    loaded = loaded_by(["msg_agents.nodes.ros.qos"])
+    loaded = loaded_by(["msg_agents.nodes.ros"])
     assert {"rclpy"} <= {name for name in loaded if is_ros(name)}
 
 
@@ -111,9 +111,9 @@ def test_help_needs_no_ros() -> None:
 
 
 PROCESSES = {
-    "agent": [*modules("msg_agents", AGENTS, "nodes/agents"), "msg_agents.nodes.node_process"],
-    "recorder": ["msg_agents.nodes.recorder", "msg_agents.nodes.node_process"],
-    "switcher": ["msg_agents.nodes.switcher", "msg_agents.nodes.node_process"],
+    "agent": [*modules("msg_agents", AGENTS, "nodes/agents"), "msg_agents.nodes.process"],
+    "recorder": ["msg_agents.nodes.recorder", "msg_agents.nodes.process"],
+    "switcher": ["msg_agents.nodes.switcher", "msg_agents.nodes.process"],
 }
 
 
@@ -124,16 +124,16 @@ def test_processes_of_a_run_import_little(process: str) -> None:
     What they import when they run: tests/integration/test_lockstep.py.
     """
     pytest.importorskip("rclpy")
-    loaded = loaded_by([*PROCESSES[process], "msg_analysis.model.step.step_model"])
-    assert {"rclpy", "msg_agents.nodes.network_node", "msg_analysis.wire.messages"} <= loaded
+    loaded = loaded_by([*PROCESSES[process], "msg_analysis.model.step_model"])
+    assert {"rclpy", "msg_agents.nodes.base", "msg_analysis.messages.messages"} <= loaded
     assert {name.split(".")[0] for name in loaded}.isdisjoint({"scipy", "networkx", "matplotlib", "rich", "rosbags"})
 
 
 def test_parsing_an_experiment_imports_little() -> None:
     code = (
         "import sys\n"
-        "from msg_analysis.model.experiment.experiment import ValidExperiment\n"
-        "from msg_analysis.model.step.step_model import build_model\n"
+        "from msg_analysis.experiment.experiment import ValidExperiment\n"
+        "from msg_analysis.model.step_model import build_model\n"
         "document = {'name': 'two', 'graphs': {'pair': {'path': [1, 2]}, 'grid': {'grid': [1, 2]}},\n"
         "            'switching': {'generator': [[-1, 1], [1, -1]]}}\n"
         "build_model(ValidExperiment.parse(document))\n"

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from msg_analysis.model.experiment import protocol_binding
+from msg_analysis.experiment import protocols
 
 ROOT = Path(__file__).parents[2]
 INTERFACES = ROOT / "ros_ws" / "src" / "msg_agents_interfaces" / "msg"
@@ -40,6 +40,6 @@ def offer(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
             )
             for name, kind in offers
         ]
-        monkeypatch.setattr(protocol_binding, "offered", lambda: tuple(points))
+        monkeypatch.setattr(protocols, "offered", lambda: tuple(points))
 
     return have

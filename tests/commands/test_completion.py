@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from programs import COMMANDS, PROGRAMS, command_of
 
 from msg_analysis.api import Experiment
-from msg_analysis.examples.bundled import names
+from msg_analysis.experiment.examples import names
 
 BIN = Path(sys.executable).parent
 PAIR = {

@@ -12,8 +12,7 @@ from rich.panel import Panel
 from rich.table import Table
 
 from msg_analysis.api import Experiment
-from msg_analysis.common.text.safe_console import SafeConsole
-from msg_analysis.common.text.safe_text import visible
+from msg_analysis.common.text import SafeConsole, visible
 
 HOSTILE = "\x1b]0;owned\x07\x9b31m\x1b[2J\u202e"
 SHOWN = r"\x1b]0;owned\x07\x9b31m\x1b[2J\u202e"

@@ -54,11 +54,11 @@ def test_other_wheels_require_the_messages_of_any_ros(wheels: Any) -> None:
 def test_a_wheel_without_compiled_code_is_refused(wheels: Any, tmp_path: Path) -> None:
     wheel = tmp_path / "msg_analysis-0.1.0-py3-none-any.whl"
     with zipfile.ZipFile(wheel, "w") as archive:
-        archive.writestr("msg_analysis/model/arithmetic/_kernel.pyi", "")
+        archive.writestr("msg_analysis/arithmetic/_kernel.pyi", "")
     with pytest.raises(SystemExit, match=r"^error: msg_analysis.*: without the compiled _kernel: install a C compiler"):
         wheels.require_kernel(wheel)
     with zipfile.ZipFile(wheel, "a") as archive:
-        archive.writestr("msg_analysis/model/arithmetic/_kernel.cpython-311-x86_64-linux-gnu.so", "")
+        archive.writestr("msg_analysis/arithmetic/_kernel.cpython-311-x86_64-linux-gnu.so", "")
     wheels.require_kernel(wheel)
 
 

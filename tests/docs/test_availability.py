@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from msg_analysis.report.documents.availability import LAWS, MESSAGES, availability_table, experiment
+from msg_analysis.report.documents import LAWS, MESSAGES, availability_table, experiment
 from msg_analysis.twin.simulate import simulate
 
 

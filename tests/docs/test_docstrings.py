@@ -46,7 +46,7 @@ def test_there_is_something_to_look_at() -> None:
     "path",
     [
         "msg_analysis.api.Experiment",  # exported
-        "msg_analysis.model.experiment.experiment.ValidExperiment",  # its base
+        "msg_analysis.experiment.experiment.ValidExperiment",  # its base
         "msg_analysis.errors.BagError",  # exported, and in a module that docs/api.md names
     ],
 )
@@ -192,7 +192,7 @@ def test_it_finds_theory_without_a_source(folder: str, head: str, words: str, fo
         ("msg_analysis.model.made", 12, "x(k+1) = W x(k)", None),
         ("msg_analysis.model.made", 13, "x(k+1) = W x(k)", 12),
         ("msg_analysis.theory.solvers.made", 12, "End.", None),
-        ("msg_analysis.wire.made", 13, "End.", 12),
+        ("msg_analysis.messages.made", 13, "End.", 12),
         ("msg_analysis.wired.made", 12, "End.", 6),
         ("msg_analysis.public", 12, "End.", None),
     ],

@@ -13,7 +13,7 @@ import yaml
 from pages import EXPERIMENTS, ROOT
 from scipy.sparse.linalg import LinearOperator, cg
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 
 SMALL = sorted(EXPERIMENTS.glob("*.yaml"))

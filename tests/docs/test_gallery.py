@@ -11,7 +11,7 @@ import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
 GALLERY = sorted((DOCS / "gallery").glob("*.py"))
-LINE_RING = DOCS.parent / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
+LINE_RING = DOCS.parent / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"
 
 
 @pytest.fixture(autouse=True)

@@ -18,7 +18,7 @@ from pages import EXPERIMENTS, PAGES, PRINTING, ROOT, Shown, blocks, console, ex
 from msg_agents.cli.main import main as agents
 from msg_analysis.api import Experiment
 from msg_analysis.cli.main import main as analysis
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import simulate
 
 PROGRAMS: dict[str, click.Group] = {"msg-agents": agents, "msg-analysis": analysis}

@@ -29,15 +29,14 @@ from started_processes import started_processes
 
 pytest.importorskip("rclpy")
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.status_file import read_steps
-from msg_agents.running.run_folder import PREFIX
-from msg_agents.running.run_result import RunResult
-from msg_agents.running.runner import run_network
-from msg_agents.running.supervisor import STEPS
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.run.folder import PREFIX
+from msg_agents.run.result import RunResult, read_steps
+from msg_agents.run.runner import run_network
+from msg_agents.run.supervisor import STEPS
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
@@ -79,7 +78,7 @@ class Process:
     @property
     def kind(self) -> str:
         """Command of msg-agents that it runs: agent, switcher, recorder, run, ..., or node_server."""
-        if "msg_agents.cli.servers.node_server" in self.command:
+        if "msg_agents.cli.node_server" in self.command:
             return "node_server"
         for program in ("msg_agents", "msg-agents", str(PROGRAM)):
             if program in self.command:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.inference.verdict import compare
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 

@@ -15,8 +15,8 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from msg_agents.running.run_result import RunResult
-from msg_analysis.bags.reader import read_bag
+from msg_agents.run.result import RunResult
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.twin.simulate import simulate
 
 STEPS, AGENTS = 300, 5

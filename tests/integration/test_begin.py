@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from msg_analysis.bags.reader import read_record
+from msg_analysis.bags.reading import read_record
 
 SHORT = ("--duration", "2", "--processes", "1", "--no-analyse", "--json", "--out")
 

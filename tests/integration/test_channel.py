@@ -16,7 +16,7 @@ from scipy import stats
 from user_namespace import give_up_rights
 
 from msg_agents.channel.namespaces import open_hosts
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.errors import NotAvailableError
 
 THREE = {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}}

@@ -17,13 +17,13 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import NodeServer
-from msg_agents.processes.process_plan import plan_network
-from msg_agents.running.supervisor import Supervisor
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.model.run.trajectory import Trajectory
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
+from msg_agents.process_layout import plan_network
+from msg_agents.run.fork_server import NodeServer
+from msg_agents.run.supervisor import Supervisor
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.model.run import Trajectory
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record
 

@@ -15,7 +15,7 @@ import ill_machines
 import pytest
 
 from msg_agents.discovery.profiles import LOOPBACK_PROFILE
-from msg_agents.discovery.ros_domain import free_domain
+from msg_agents.discovery.rtps import free_domain
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 NAMES = [

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from programs import without_progress
 
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.twin.check import check
 
 RUN = {"processes": 2, "duration": 5}

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.twin.check import check
 
 PAUSE = 10.0  # s

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 from stranger import STEPS, Forgery, Refused, batch, graph, run_beside, states
 
-from msg_analysis.model.run.graph_path import sojourns
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.step.step_model import first_graph
+from msg_analysis.messages.cdr import encode_batch
+from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, encode_string
+from msg_analysis.model.graph_path import sojourns
+from msg_analysis.model.run_record import RunRecord
+from msg_analysis.model.step_model import first_graph
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record
-from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, encode_string
-from msg_analysis.wire.state_batches import encode_batch
 
 PACES = {"lockstep": {}, "realtime": {"pace": "realtime", "speed": 5}}
 MANY = 200  # messages of each kind, before the run and again while it goes on

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import node_environment
-from msg_agents.processes.status_file import read_steps
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
+from msg_agents.run.result import read_steps
 from msg_analysis.twin.simulate import new_record
 
 # Prints every DiagnosticArray of /diagnostics, level and values included, a line each; to stderr what agents report.

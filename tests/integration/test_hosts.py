@@ -22,7 +22,7 @@ from processors import another_processor
 from set_clock import SetClock
 
 from msg_agents.discovery.profiles import PROFILE_VARIABLES
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.twin.check import check
 
 PREFIX = "msga"

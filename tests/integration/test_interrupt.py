@@ -14,8 +14,8 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.runs.saved_result import read_result
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.runs import read_result
 from msg_analysis.twin.check import check
 
 NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}

@@ -15,9 +15,8 @@ import pytest
 from visitor import assert_delivery
 
 from msg_agents.discovery.profiles import FIRST_INTRODUCED
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.discovery.rtps import discovery_port
-from msg_agents.processes.environment import node_environment
+from msg_agents.discovery.rtps import discovery_port, free_domain
+from msg_agents.environment import node_environment
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.twin.check import check
 
 # 20,000 steps: no test waits for them; of states that are soon seen in the bag

@@ -16,8 +16,8 @@ import pytest
 from started_processes import started_processes
 from terminal import Terminal
 
-from msg_agents.running.run_folder import PREFIX
-from msg_analysis.bags.reader import read_bag
+from msg_agents.run.folder import PREFIX
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.twin.check import check
 
 NODES = {"agent", "switcher", "recorder", "player", "live"}

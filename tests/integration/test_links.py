@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.model.run import Trajectory
 from msg_analysis.twin.check import check
 
 LOCKSTEP: dict[str, Any] = {"duration": 15, "replicas": 4}  # 300 steps: more than one block of noise

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 from awaiting_network import BAG, failures_of, network_awaiting
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.inference.verdict.compare import compare
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.inference.verdict import compare
 from msg_analysis.twin.simulate import new_record, simulate
 
 LISTENER = """

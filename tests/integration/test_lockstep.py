@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from processors import another_processor
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.run import Trajectory
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 

@@ -12,8 +12,8 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_agents.discovery.rtps import free_domain
+from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.twin.simulate import simulate
 
 LISTENER = """

@@ -11,7 +11,7 @@ from typing import Any
 from mcap.writer import Writer
 from recorded import contents, mcap, texts
 
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.reading import read_bag
 
 
 def finished(process: subprocess.Popen[str], seconds: float = 60) -> str:

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 import yaml
 
-from msg_agents.processes import hung_process
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_agents.run import lifeline
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.verdict import compare
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
@@ -124,7 +124,7 @@ def test_a_protocol_that_ends_its_process(network: Any) -> None:
 @pytest.mark.parametrize("restarts", [3, 0])
 def test_a_protocol_that_hangs(network: Any, monkeypatch: pytest.MonkeyPatch, restarts: int) -> None:
     """Once: its process is ended and comes back. Without restarts the run ends. Nobody waits for ever."""
-    monkeypatch.setattr(hung_process, "HUNG", 3.0)
+    monkeypatch.setattr(lifeline, "HUNG", 3.0)
     packages = _install(network, HANGING)
     monkeypatch.syspath_prepend(packages)
     what = network.experiment(protocol={"name": "broken"}, run={"duration": 60, "start": "zero", "processes": 2})

@@ -13,12 +13,12 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from msg_agents.discovery.ros_domain import free_domain
+from msg_agents.discovery.rtps import free_domain
 from msg_analysis import Experiment
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
-LINE_RING = ROOT / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
+LINE_RING = ROOT / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"
 
 
 def test_what_the_page_says(tmp_path: Path) -> None:

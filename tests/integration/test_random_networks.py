@@ -12,9 +12,9 @@ from random_faults import plan_faults, run_random_network
 from random_networks import random_document
 
 from msg_agents.cli.nodes import load_record
-from msg_agents.recovery.checkpoint import Checkpoint, entry_size
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_agents.recovery import Checkpoint, entry_size
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.twin.check import check
 
 KILLED = 3468  # the process of an agent is killed before the first step

@@ -24,13 +24,13 @@ import pytest
 from set_clock import SetClock
 from started_processes import started_processes
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import node_environment
-from msg_agents.processes.status_file import read_steps
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.model.step.phases import phases
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
+from msg_agents.run.result import read_steps
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.phases import phases
+from msg_analysis.model.run import Trajectory
 from msg_analysis.twin.check import check
 
 # 100 steps a second for 4 s, and for 2 s where nobody is killed or stopped in the middle.

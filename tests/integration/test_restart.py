@@ -12,10 +12,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import node_environment
-from msg_agents.processes.status_file import read_steps
-from msg_agents.running.supervisor import STEPS
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
+from msg_agents.run.result import read_steps
+from msg_agents.run.supervisor import STEPS
 
 FAULTS = [["agent"], ["agent"] * 3, ["switcher"], ["agent", "switcher"]]
 RUN = {"duration": 1000, "replicas": 16, "processes": 3}  # long enough to be killed in the middle, of each fault

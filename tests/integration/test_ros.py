@@ -17,10 +17,9 @@ import yaml
 from mcap.reader import make_reader
 from waiting import participants
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.running.launch_arguments import NETWORK_ARGUMENTS
-from msg_agents.running.launch_support import ANALYSIS, LaunchedNetwork, environment
-from msg_analysis.bags.reader import read_bag
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.run.launch import ANALYSIS, NETWORK_ARGUMENTS, LaunchedNetwork, environment
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.twin.check import check
 
 BIN = Path(sys.executable).parent

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from visitor import watched_endpoints
 
-from msg_agents.processes.status_file import read_steps
-from msg_analysis.bags.reader import read_bag
+from msg_agents.run.result import read_steps
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.twin.check import check
 
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_analysis.bags.reader import read_bag
+from msg_agents.discovery.rtps import free_domain
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.twin.check import check
 
 

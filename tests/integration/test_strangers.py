@@ -14,13 +14,13 @@ from typing import Any
 
 from stranger import STEPS, Forgery, batch, graph, run_beside, states
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import node_environment
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.run.record import RunRecord
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
+from msg_analysis.inference.verdict import compare
+from msg_analysis.messages.messages import Progress, encode_string
+from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record
-from msg_analysis.wire.messages import Progress, encode_string
 
 
 def test_another_run_and_nonsense(network: Any) -> None:
@@ -125,11 +125,11 @@ import rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from msg_agents_interfaces.msg import ActiveGraph as GraphMsg, AgentState as StateMsg, Progress as ProgressMsg
 from msg_agents_interfaces.msg import StateBatch
-from msg_agents.nodes.ros.qos import ros_profile
-from msg_analysis.wire import topics
-from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, StateFrame
-from msg_analysis.wire.state_batches import encode_batch
-from msg_analysis.model.run.record import RunRecord
+from msg_agents.nodes.ros import ros_profile
+from msg_analysis.messages import topics
+from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, StateFrame
+from msg_analysis.messages.cdr import encode_batch
+from msg_analysis.model.run_record import RunRecord
 
 record = RunRecord.from_json(Path(sys.argv[1]).read_text(), "run.json")
 rng = random.Random(sys.argv[2])

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 import yaml
 
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.paper import emulation
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.verdict import compare
+from msg_analysis.paper import figures as emulation
 from msg_analysis.twin.simulate import simulate
 
 BIN = Path(sys.executable).parent
@@ -168,7 +168,7 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
         "from pathlib import Path",
         "from msg_analysis.cli.main import main",
         "from msg_analysis.paper import emulation, examples",
-        "from msg_analysis.paper.emulation import Run",
+        "from msg_analysis.paper.figures import Run",
         f"emulation.runs_of = lambda number: [run for run in {runs} if run.example == number]",
         "examples.EXAMPLES |= {k: partial(example, 3) for k, example in examples.EXAMPLES.items()}  # coarse curves",
         "for number in ('all', '1'):  # the second time, nothing runs",

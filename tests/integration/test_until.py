@@ -14,11 +14,12 @@ from typing import Any
 import pytest
 import yaml
 
-from msg_agents.running.run_result import RunResult, conclude
-from msg_agents.watching import early_end, run_observer
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.inference.online import running_errors, stopping
-from msg_analysis.model.run.until import Until
+from msg_agents.run.result import RunResult, conclude
+from msg_agents.watch import observer as early_end
+from msg_agents.watch import observer as run_observer
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.inference import online_errors
+from msg_analysis.model.run_record import Until
 from msg_analysis.twin.check import check
 
 LONG = {"duration": 2000, "replicas": 8, "processes": 2}  # 40,000 steps
@@ -189,7 +190,7 @@ def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch, error: Ex
     def fail(_: object) -> None:
         raise error
 
-    monkeypatch.setattr(running_errors.LiveEstimate, "report", fail)
+    monkeypatch.setattr(online_errors.LiveEstimate, "report", fail)
     notes: list[str] = []
     four_seconds = {"pace": "realtime", "duration": 40, "speed": 10.0}  # the errors are looked at once a second
     experiment = network.experiment(run=four_seconds | {"processes": 2})
@@ -205,7 +206,7 @@ def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch, error: Ex
 
 def test_too_late(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """In 40 steps, agents can be at the end before they know of an earlier one: the run stays whole."""
-    monkeypatch.setattr(stopping, "reached", lambda *_: "precision 50 % reached at step 1")
+    monkeypatch.setattr(online_errors, "reached", lambda *_: "precision 50 % reached at step 1")
     result = network.run(network.experiment(run={"duration": 2}), until=Until(0.5))
     complete(result)
     assert len(result.trajectory.modes) == 40

@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 from tests.support.watched_run import whole_sums
 
-from msg_agents.watching import early_end, run_observer
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.model.run.until import Until
+from msg_agents.watch import observer as early_end
+from msg_agents.watch import observer as run_observer
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run_record import Until
 from msg_analysis.theory.prediction import predict
 
 AIR = {"process": 1.0, "loss": 0.2, "link": 0.2, "broadcast": 0.2}

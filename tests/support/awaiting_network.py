@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import NodeServer
-from msg_agents.processes.process_plan import ProcessPlan, plan_network
-from msg_agents.running.supervisor import Supervisor
-from msg_analysis.model.run.record import RunRecord
+from msg_agents.environment import node_environment
+from msg_agents.process_layout import ProcessPlan, plan_network
+from msg_agents.run.fork_server import NodeServer
+from msg_agents.run.supervisor import Supervisor
+from msg_analysis.model.run_record import RunRecord
 
 BAG = "bag"  # what is recorded, in the directory of the network
 

@@ -24,7 +24,7 @@ API_MODULES = "msg_analysis", "msg_analysis.protocol", "msg_agents"  # with ``__
 API_NAME = re.compile(r"^::: ([\w.]+)", re.MULTILINE)
 THEORY = "msg_analysis.theory"
 FORMULAS = THEORY, "msg_analysis.inference"  # where functions that implement a formula have sections
-LONG = *FORMULAS, "msg_analysis.wire"  # where modules may have a long docstring without a formula in it
+LONG = *FORMULAS, "msg_analysis.messages"  # where modules may have a long docstring without a formula in it
 MOST_LINES = 3  # of a docstring inside; blank lines do not count
 MOST_MODULE_LINES, MOST_LONG_MODULE_LINES = 6, 12
 FORMULA = re.compile(r"^ *\S.* = \S", re.MULTILINE)

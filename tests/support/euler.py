@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.protocol import Heard, LinearProtocol, Protocol
-from msg_analysis.types import FloatArray
 
 DIRECTED = {"a": {"arcs": [[1, 2], [2, 3], [3, 4], [4, 5], [5, 1]]}, "b": {"path": [1, 2, 3, 4, 5]}}
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from waiting import state_of
 
-from msg_agents.processes.hung_process import SHOW_STACKS
+from msg_agents.run.lifeline import SHOW_STACKS
 
 ANSWER = 0.5  # s that they have to write their stacks
 LONGEST = 6000  # characters of a file

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 
 
 def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> ValidExperiment:

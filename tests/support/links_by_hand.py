@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.model.step.phases import phases
-from msg_analysis.model.step.step_model import StepModel
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.phases import phases
+from msg_analysis.model.run import Trajectory
+from msg_analysis.model.step_model import StepModel
 
 BLOCK = 256
 PROCESS, BROADCAST, LINK, LOSS = 3, 4, 5, 6  # numbers of the streams

@@ -11,9 +11,9 @@ import math
 import numpy as np
 import scipy.linalg
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.trajectory import Completeness, Trajectory
-from msg_analysis.model.step.phases import phases
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.phases import phases
+from msg_analysis.model.run import Completeness, Trajectory
 from msg_analysis.twin.simulate import new_record
 
 

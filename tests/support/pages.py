@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PRINTING = [page for page in PAGES if page.stem in {"README", "index", "quickstart", "tutorial", "examples", "leaders"}]
 """Pages whose terminals are compared with what the commands print."""
-EXPERIMENTS = ROOT / "analysis/msg_analysis/examples/experiments"
+EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"
 FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^\n)((?:^ {4,}\S.*\n|^\n(?= {4}))+)", re.MULTILINE)
 STAMP = re.compile(r"_\d{8}_\d{6}")  # of the directory of a run

@@ -13,15 +13,15 @@ from typing import Literal
 
 from random_networks import random_document
 
-from msg_agents.processes.environment import RESTARTS
-from msg_agents.processes.fork_server import Process
-from msg_agents.processes.process_plan import RECORDER, SWITCHER
-from msg_agents.running.run_result import RunResult
-from msg_agents.running.runner import run_network
-from msg_agents.watching.view import View
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_agents.environment import RESTARTS
+from msg_agents.process_layout import RECORDER, SWITCHER
+from msg_agents.run.fork_server import Process
+from msg_agents.run.result import RunResult
+from msg_agents.run.runner import run_network
+from msg_agents.watch.panel import View
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.messages.topics import agent_node_name
 from msg_analysis.twin.check import check
-from msg_analysis.wire.topics import agent_name
 
 LATEST = 0.7  # of the steps: later, the run might be over before the fault
 LONGEST_WAIT = 0.1  # s between a step and the fault: steps are reported ten times a second
@@ -62,7 +62,7 @@ class FaultPlan:
 def plan_faults(seed: int, agents: int, steps: int) -> FaultPlan:
     """The faults of the network of a seed."""
     draw = random.Random(f"faults {seed}")
-    peers = [SWITCHER, *(agent_name(agent) for agent in range(agents))]
+    peers = [SWITCHER, *(agent_node_name(agent) for agent in range(agents))]
     kills = draw.choices(range(RESTARTS + 1), [1, 3, 3, 2])[0]
     victims: list[tuple[str, float | None]] = [(draw.choice(peers), None) for _ in range(kills)]
     for _ in range(draw.choices(range(3), [2, 2, 1])[0]):

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from awaiting_network import BAG, failures_of, network_awaiting
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import node_environment
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.wire.messages import ActiveGraph, AgentState
-from msg_analysis.wire.state_batches import encode_batch
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.messages.cdr import encode_batch
+from msg_analysis.messages.messages import ActiveGraph, AgentState
+from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run_record import RunRecord
 
 STEPS = 300
 # Waits for every reader of the run, publishes, waits until they have everything, and only then appears as the node that
@@ -31,9 +31,9 @@ import rclpy
 from rclpy.duration import Duration
 from msg_agents_interfaces.msg import ActiveGraph, AgentState, Progress, StateBatch
 from std_msgs.msg import String
-from msg_agents.nodes.ros.qos import ros_profile
-from msg_agents.nodes.ros.rclpy_error import RCLError
-from msg_analysis.wire.topics import LATCHED, STREAM
+from msg_agents.nodes.ros import ros_profile
+from msg_agents.nodes.ros import RCLError
+from msg_analysis.messages.topics import LATCHED, STREAM
 
 AGENTS, PROCESSES, OF_BATCHES = int(sys.argv[3]), 2, int(sys.argv[4])
 latched, stream = ros_profile(LATCHED), ros_profile(STREAM)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.theory.moments import MomentSolver
 
 LINE_RING = {

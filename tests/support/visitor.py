@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 from started_processes import started_processes
 
-from msg_agents.processes.environment import node_environment
+from msg_agents.environment import node_environment
 
 Endpoints = Mapping[str, Sequence[Sequence[str]]]
 

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import random
 
-from msg_analysis.bags import trajectory_writer
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.online.running_errors import LiveEstimate, LiveReport
-from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
-from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.bags import run_writer
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.online_errors import LiveEstimate, LiveReport
+from msg_analysis.inference.sequential_sums import EvidenceSums
+from msg_analysis.messages.acceptance import state_frame
+from msg_analysis.messages.messages import ActiveGraph
+from msg_analysis.model.run import Trajectory
 from msg_analysis.theory.prediction import Prediction
-from msg_analysis.wire.messages import ActiveGraph
-from msg_analysis.wire.receiving import state_frame
 
 
 def messages_of(trajectory: Trajectory) -> list[tuple[str, bytes]]:
     """(topic, message) in the order of time, as a bag has them (``test_messages_are_those_of_the_bag``)."""
-    return [(topic, content) for topic, content, _, _ in trajectory_writer._messages(trajectory)]
+    return [(topic, content) for topic, content, _, _ in run_writer._messages(trajectory)]
 
 
 def watch(

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The messages of a bag, of any topics and types, in the order of time: what a player publishes.
 
@@ -31,11 +20,10 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from msg_analysis.bags.format.files import bag_files, stored_file
-from msg_analysis.bags.format.inventory import offered_profiles
-from msg_analysis.bags.format.mcap_chunks import CHUNK_TIMES, INDEX_HEAD, RECORD, DamageError
-from msg_analysis.bags.format.mcap_file import MAGIC, McapFile
-from msg_analysis.bags.format.stored_file import StoredFile
+from msg_analysis.bags.files import bag_files, offered_profiles, stored_file
+from msg_analysis.bags.mcap_chunks import CHUNK_TIMES, INDEX_HEAD, RECORD, DamageError
+from msg_analysis.bags.mcap_reading import MAGIC, McapFile
+from msg_analysis.bags.stored_file import StoredFile
 from msg_analysis.errors import BagError
 
 # Bytes of messages held to be put in order. A bag that needs more is played out of order rather than held in memory.

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Makes a bag out of what a killed recorder, a full disk or a power cut left behind.
 
@@ -31,21 +20,29 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.bags.format.files import bag_files, stored_file
-from msg_analysis.bags.format.inventory import FileInventory, channel_count
-from msg_analysis.bags.format.mcap_writer import McapWriter
-from msg_analysis.bags.format.metadata import (
+from msg_analysis.bags.files import (
     METADATA_FILE,
     ChannelCount,
     FileCount,
+    FileInventory,
+    bag_files,
     bag_information,
+    channel_count,
     dump,
+    stored_file,
     write_metadata,
 )
-from msg_analysis.bags.format.storage_options import SQLITE_SUFFIX, ZSTD_SUFFIX
-from msg_analysis.bags.format.stored_file import Batch, StoredFile
-from msg_analysis.bags.writer import RECORDING_MARKER, exists_already, recording_pid
-from msg_analysis.bags.written_file import CHUNK_SIZE, RECORD_NAME, ROSBAG2_RECORD
+from msg_analysis.bags.mcap_chunks import SQLITE_SUFFIX, ZSTD_SUFFIX
+from msg_analysis.bags.mcap_writing import McapWriter
+from msg_analysis.bags.stored_file import Batch, StoredFile
+from msg_analysis.bags.writing import (
+    CHUNK_SIZE,
+    RECORD_NAME,
+    RECORDING_MARKER,
+    ROSBAG2_RECORD,
+    exists_already,
+    recording_pid,
+)
 from msg_analysis.errors import BagError
 
 LONGEST_LIST = 500  # characters of what is said of torn files

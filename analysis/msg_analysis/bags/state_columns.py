@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """State messages as columns: those in the agents' own layout are decoded a batch at a time.
 
@@ -24,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.bags.format.mcap_chunks import gather
-from msg_analysis.bags.format.stored_file import Batch
-from msg_analysis.model.arithmetic.step_clock import SECOND
-from msg_analysis.types import AnyArray, BoolArray, FloatArray, IntArray
-from msg_analysis.wire.cdr_fields import LITTLE_ENDIAN, CdrError
-from msg_analysis.wire.messages import STATE_HEAD, STATE_SIZE, AgentState
+from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.bags.mcap_chunks import gather
+from msg_analysis.bags.stored_file import Batch
+from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from msg_analysis.messages.cdr import LITTLE_ENDIAN, CdrError
+from msg_analysis.messages.messages import STATE_HEAD, STATE_SIZE, AgentState
 
 _ENCAPSULATION = struct.unpack("<I", LITTLE_ENDIAN)[0]
 

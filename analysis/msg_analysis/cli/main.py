@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The command line ``msg-analysis``: each command parses, calls one function and prints.
 
@@ -26,7 +15,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from msg_analysis.cli import compare, runs, sweep, theory
+from msg_analysis.cli import runs, sweep, theory
+from msg_analysis.cli import runs as compare
 from msg_analysis.cli.console import CommandGroup, complain, examples, print_json, print_text, result_console
 from msg_analysis.cli.options import (
     BAG,
@@ -37,14 +27,15 @@ from msg_analysis.cli.options import (
     is_bag,
     json_option,
     seed_option,
+    storage,
+    storage_options,
 )
-from msg_analysis.cli.storage_options import storage, storage_options
 from msg_analysis.common.version import __version__
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
-    from msg_analysis.bags.format.storage_options import Compression
-    from msg_analysis.sweep.conduct import OtherSoftware
+    from msg_analysis.bags.mcap_chunks import Compression
+    from msg_analysis.sweep.results import OtherSoftware
 
 
 @click.group(cls=CommandGroup)
@@ -64,7 +55,7 @@ def predict(experiment: Path, as_json: bool) -> None:
     if as_json:
         print_json(document)
     else:
-        from msg_analysis.report.terminal.theory_text import print_prediction
+        from msg_analysis.report.theory_text import print_prediction
 
         print_prediction(document, result_console())
 
@@ -155,7 +146,7 @@ def leaders(
     The leaders that EXPERIMENT names are shown beside them.
     """
     from msg_analysis.api import Experiment
-    from msg_analysis.cli.progress import SolveProgress
+    from msg_analysis.cli.console import SolveProgress
 
     loaded = Experiment.load(experiment)
     with SolveProgress(loaded.name) as progress:
@@ -171,7 +162,7 @@ def leaders(
     if as_json:
         print_json(document)
     else:
-        from msg_analysis.report.terminal.theory_text import print_leaders
+        from msg_analysis.report.theory_text import print_leaders
 
         print_leaders(document, result_console())
 
@@ -236,14 +227,14 @@ def figures(
 @json_option
 def info(source: Path, as_json: bool) -> None:
     """Describe an experiment file, or the contents of a bag."""
-    from msg_analysis.model.experiment.experiment import ValidExperiment
-    from msg_analysis.report.documents.info import describe_bag, describe_experiment
-    from msg_analysis.report.terminal import bag_text, experiment_text
+    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.report import tables
+    from msg_analysis.report.documents import describe_bag, describe_experiment
 
     if is_bag(source):
-        document, show = describe_bag(source), bag_text.print_bag
+        document, show = describe_bag(source), tables.print_bag
     else:
-        document, show = describe_experiment(ValidExperiment.load(source)), experiment_text.print_experiment
+        document, show = describe_experiment(ValidExperiment.load(source)), tables.print_experiment
     if as_json:
         print_json(document)
     else:
@@ -260,13 +251,13 @@ def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
     BAG is not changed; OUT must not exist.
     """
     from msg_analysis.bags.salvage import salvage as salvage_bag
-    from msg_analysis.report.documents.info import describe_salvage
+    from msg_analysis.report.documents import describe_salvage
 
     document = describe_salvage(out, salvage_bag(bag, out))
     if as_json:
         print_json(document)
     else:
-        from msg_analysis.report.terminal.bag_text import print_salvage
+        from msg_analysis.report.tables import print_salvage
 
         print_salvage(document, result_console())
 
@@ -292,12 +283,11 @@ def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Pa
     import pyarrow.csv  # before the progress of the work begins
     import pyarrow.parquet  # noqa: F401
 
-    from msg_analysis.bags.reader import read_bag
-    from msg_analysis.cli.progress import WorkProgress
-    from msg_analysis.common.exit_codes import ExitCode
-    from msg_analysis.common.long_work import watched
-    from msg_analysis.report.export.export_files import FORMS, export_run
-    from msg_analysis.report.export.rerun_file import require_rerun
+    from msg_analysis.bags.reading import read_bag
+    from msg_analysis.cli.console import WorkProgress
+    from msg_analysis.common.resources import watched
+    from msg_analysis.errors import ExitCode
+    from msg_analysis.report.export import FORMS, export_run, require_rerun
 
     forms = [form for form, wanted in zip(FORMS, (csv, parquet, npz, rrd), strict=True) if wanted]
     if not forms:
@@ -338,7 +328,7 @@ def schema(what: str) -> None:
     if what == "sweep":
         from msg_analysis.sweep.sweep_file import json_schema
     else:
-        from msg_analysis.model.experiment.experiment import json_schema
+        from msg_analysis.experiment.experiment import json_schema
 
     print_json(json_schema(), indent=2)
 

@@ -1,18 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
-"""Arguments and options that commands share: one name, one metavar and one shell completion each."""
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 from __future__ import annotations
 
@@ -26,8 +13,47 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from msg_analysis.bags.format.storage_options import BAG_SUFFIXES
+from msg_analysis.bags.mcap_chunks import (
+    BAG_SUFFIXES,
+    COMPRESSIONS,
+    DEFAULT_STORAGE,
+    MEGABYTE,
+    SMALLEST_SPLIT,
+    Compression,
+    Storage,
+)
 from msg_analysis.common.files import RESULT_FILE
+from msg_analysis.errors import InputError
+
+
+def storage_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the arguments ``compression`` and ``split_size`` [MB, 10^6 bytes] to a command; see :func:`storage`."""
+    for option in (
+        click.option(
+            "--compression",
+            type=click.Choice(COMPRESSIONS),
+            default=DEFAULT_STORAGE.compression,
+            help="Compression of the chunks of the bag.",
+        ),
+        click.option(
+            "--split-size",
+            type=click.FloatRange(SMALLEST_SPLIT),
+            metavar="MB",
+            help="Start a new file of the bag after this many MB (10^6 bytes).",
+        ),
+    ):
+        command = option(command)
+    return command
+
+
+def storage(compression: Compression, split_size: float | None) -> Storage:
+    """The storage that these options ask for; ``split_size`` [MB, 10^6 bytes] is None for one file."""
+    try:
+        size = None if split_size is None else round(split_size * MEGABYTE)
+    except (ValueError, OverflowError) as error:  # nan, inf
+        raise InputError(f"--split-size: {split_size}: expected a number of MB") from error
+    return Storage(compression, size)
+
 
 _PLAIN = re.compile(r"[\w./~+,:@%=-]*")  # characters that a shell needs no quotes for
 
@@ -80,14 +106,14 @@ class ExperimentPath(InputPath):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """The path of the file, by the rule of ``bundled.find``; see click.ParamType."""
-        from msg_analysis.examples.bundled import find
+        from msg_analysis.experiment.examples import find
 
         word = os.fsdecode(super().convert(os.fspath(value), param, ctx))
         return Path(word) if Path(word).is_dir() and self._is_wanted(Path(word)) else find(word)
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         """Complete to files, then to names of examples; see click.ParamType."""
-        from msg_analysis.examples.bundled import names
+        from msg_analysis.experiment.examples import names
 
         files = super().shell_complete(ctx, param, incomplete)
         if any(item.type == "file" for item in files):

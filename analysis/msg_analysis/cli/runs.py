@@ -1,18 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
-"""Commands about saved runs: ``runs``, which is also one of ``msg-agents``, and ``diff``."""
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 from __future__ import annotations
 
@@ -21,11 +8,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from msg_analysis.cli.console import examples, print_json, result_console
-from msg_analysis.cli.options import FILE, PATH, SOURCE, is_bag, json_option, seed_option
+from msg_analysis.cli.console import examples, print_json, print_text, result_console
+from msg_analysis.cli.options import BAG, FILE, PATH, RESULT, SOURCE, is_bag, json_option, level_option, seed_option
+from msg_analysis.common.files import require_place
+from msg_analysis.common.resources import watched
 
 if TYPE_CHECKING:
-    from msg_analysis.runs.run_filter import SortKey
+    from msg_analysis.runs import SortKey
 
 
 @click.command(
@@ -79,8 +68,7 @@ def runs(
     from datetime import datetime
 
     from msg_analysis.common.files import require_place
-    from msg_analysis.runs.run_filter import RunFilter, moment
-    from msg_analysis.runs.run_list import list_runs
+    from msg_analysis.runs import RunFilter, list_runs, moment
 
     now = datetime.now().astimezone()
     wanted = RunFilter(
@@ -96,7 +84,7 @@ def runs(
     found = list_runs(folder)
     chosen = wanted.choose(found, sort)
     if page is not None:
-        from msg_analysis.report.html.runs_page import write_runs_page
+        from msg_analysis.report.list_pages import write_runs_page
 
         write_runs_page(chosen, folder, page)
     if as_json:
@@ -105,7 +93,7 @@ def runs(
     elif page is not None:
         click.echo(page)
     else:
-        from msg_analysis.report.terminal.runs_text import print_runs
+        from msg_analysis.report.tables import print_runs
 
         print_runs(chosen, folder, len(found), result_console())
     if shown and page is not None:
@@ -118,7 +106,7 @@ def _open(page: Path) -> None:
     import sys
     import webbrowser
 
-    from msg_analysis.common.text.notes import print_note
+    from msg_analysis.common.text import print_note
 
     address = page.absolute().as_uri()
     screen = sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
@@ -149,18 +137,18 @@ def diff(a: Path, b: Path, *, as_json: bool) -> None:
         bag, experiment = (a, b) if bags[0] else (b, a)
         raise InputError(f"{bag} is a bag, {experiment} an experiment: expected two bags or two experiment files")
     if bags[0]:
-        from msg_analysis.cli.progress import WorkProgress
-        from msg_analysis.common.long_work import watched
-        from msg_analysis.report.terminal.difference_text import print_bag_difference as show
-        from msg_analysis.runs.bag_difference import bag_difference
+        from msg_analysis.cli.console import WorkProgress
+        from msg_analysis.common.resources import watched
+        from msg_analysis.report.comparison_text import print_bag_difference as show
+        from msg_analysis.report.differences import bag_difference
 
         with WorkProgress() as work, watched(work):
             document = bag_difference(a, b)
     else:
-        from msg_analysis.cli.progress import SolveProgress
-        from msg_analysis.model.experiment.experiment import ValidExperiment
-        from msg_analysis.report.terminal.difference_text import print_experiment_difference as show
-        from msg_analysis.runs.experiment_difference import experiment_difference
+        from msg_analysis.cli.console import SolveProgress
+        from msg_analysis.experiment.experiment import ValidExperiment
+        from msg_analysis.report.comparison_text import print_experiment_difference as show
+        from msg_analysis.report.differences import experiment_difference
 
         one, other = (ValidExperiment.load(path) for path in (a, b))
         with SolveProgress("leaders") as search:
@@ -169,3 +157,75 @@ def diff(a: Path, b: Path, *, as_json: bool) -> None:
         print_json(document)
     else:
         show(document, result_console())
+
+
+@click.command(
+    epilog=examples(
+        "msg-analysis compare line_ring_twin",
+        "msg-analysis compare line_ring_twin --report report.html",
+        "msg-analysis compare runs/line_ring_* --level 0.001 --json > pooled.json",
+    )
+)
+@click.argument("bags", metavar="BAG...", nargs=-1, required=True, type=BAG)
+@level_option("Probability of a false 'disagrees', over all tests.")
+@click.option("--report", type=FILE, metavar="FILE", help="Also write an HTML report.")
+@json_option
+@click.pass_context
+def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, level: float, report: Path | None) -> None:
+    """Compare the run in BAG with its prediction.
+
+    Several bags, runs of one experiment with different seeds, get one joint verdict.
+
+    Exit code 0: agrees, 1: disagrees, 3: data incomplete, no verdict.
+    """
+    from msg_analysis import api
+    from msg_analysis.cli.console import WorkProgress
+
+    require_place(report)
+    with WorkProgress() as progress, watched(progress):
+        comparison = api.compare(*bags, level=level)
+        if report:
+            api.write_report(comparison, report)
+    if as_json:
+        print_json(comparison.to_json())
+    else:
+        from msg_analysis.report.comparison_text import print_comparison
+
+        print_comparison(comparison.to_json(), result_console())
+    context.exit(comparison.exit_code)
+
+
+@click.command(
+    epilog=examples(
+        "msg-analysis compare leader_1 --json > leader_1.json",
+        "msg-analysis tabulate leader_*.json",
+        "msg-analysis tabulate runs/*/result.json --format csv > runs.csv",
+    )
+)
+@click.argument("results", metavar="RESULT...", nargs=-1, required=True, type=RESULT)
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["table", "markdown", "csv", "json"]),
+    default="table",
+    help="The table also says which system errors differ significantly.",
+)
+@level_option("Probability of any false difference of two system errors.")
+@json_option
+def tabulate(results: tuple[Path, ...], form: str, level: float, as_json: bool) -> None:
+    """Show saved results side by side: files written by `compare --json` or `msg-agents run`.
+
+    A RESULT may also be the directory of a run. The runs are assumed to be independent (different seeds).
+    """
+    from msg_analysis.report import saved_results as saved
+    from msg_analysis.runs import read_result
+
+    rows = [read_result(path) for path in results]
+    if as_json or form == "json":
+        print_json(saved.to_json(rows, level))
+    elif form == "csv":
+        print_text(saved.to_csv(rows).removesuffix("\n"))
+    elif form == "markdown":
+        print_text(saved.to_markdown(rows).removesuffix("\n"))
+    else:
+        saved.print_results(rows, level, result_console())

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The command ``sweep`` of ``msg-analysis``, and the networks of ``figures --emulate``: many runs or predictions."""
 
@@ -26,16 +15,14 @@ import click
 
 from msg_analysis.cli.console import complain, examples, print_json, print_text, result_console
 from msg_analysis.cli.options import PATH, YAML, json_option
-from msg_analysis.common.exit_codes import ExitCode, killed_by
-from msg_analysis.common.text.json_numbers import finite
-from msg_analysis.common.text.notes import print_note
-from msg_analysis.errors import InputError
-from msg_analysis.sweep.jobs.software import require_libraries
+from msg_analysis.common.text import finite, print_note
+from msg_analysis.errors import ExitCode, InputError, killed_by
+from msg_analysis.sweep.points import require_libraries
 
 if TYPE_CHECKING:
-    from msg_analysis.sweep.conduct import Conducted, OtherSoftware
-    from msg_analysis.sweep.jobs.job import Job
-    from msg_analysis.sweep.outcome_store import OutcomeStore
+    from msg_analysis.sweep.points import Job
+    from msg_analysis.sweep.results import Conducted, OtherSoftware, OutcomeStore
+
 
 other_software = click.option(
     "--other-software",
@@ -93,9 +80,9 @@ def sweep(
     if workers and scheduler:
         raise InputError("--workers: not together with --scheduler, which has workers of its own: give one of them")
     require_libraries()
-    from msg_analysis.cli.progress import SweepProgress
-    from msg_analysis.sweep.jobs.workers import warm_up
-    from msg_analysis.sweep.plan import load_sweep
+    from msg_analysis.cli.console import SweepProgress
+    from msg_analysis.sweep.grid import load_sweep
+    from msg_analysis.sweep.workers import warm_up
 
     with SweepProgress("checking the points") as checking:
 
@@ -105,14 +92,12 @@ def sweep(
             checking.checked(done, total)
 
         plan = load_sweep(sweep_file, checked)
-    from msg_analysis.report.figures.sweep_figure import write_figure
-    from msg_analysis.report.html.sweep_page import write_sweep_page
-    from msg_analysis.report.terminal.sweep_text import describe_sweep, print_sweep, summary
-    from msg_analysis.sweep.conduct import judge_sweep
+    from msg_analysis.report.list_pages import write_sweep_page
+    from msg_analysis.report.sweep_figure import write_figure
+    from msg_analysis.report.tables import describe_sweep, print_sweep, summary
     from msg_analysis.sweep.figure_series import picture
-    from msg_analysis.sweep.jobs.network_run import options
-    from msg_analysis.sweep.outcome_store import OutcomeStore
-    from msg_analysis.sweep.table import rows_of, write_tables
+    from msg_analysis.sweep.points import options
+    from msg_analysis.sweep.results import OutcomeStore, judge_sweep, rows_of, write_tables
 
     directory = out or Path("sweeps") / plan.name
     network = options(directory, keep_bags, workers or 1) if plan.kind == "network" else None
@@ -155,7 +140,7 @@ class _EndedBySignal(KeyboardInterrupt):
 
 
 def _end(number: int, _: object) -> None:
-    from msg_analysis.sweep.jobs.workers import ENDING
+    from msg_analysis.sweep.workers import ENDING
 
     for each in ENDING:
         signal.signal(each, signal.SIG_IGN)
@@ -164,9 +149,9 @@ def _end(number: int, _: object) -> None:
 
 def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: OutcomeStore, **how: Any) -> Conducted:
     """Do all jobs, with progress on stderr; if interrupted, say what is kept and exit."""
-    from msg_analysis.cli.progress import SweepProgress
-    from msg_analysis.sweep.conduct import conduct
-    from msg_analysis.sweep.jobs.workers import ENDING, WorkersLostError
+    from msg_analysis.cli.console import SweepProgress
+    from msg_analysis.sweep.results import conduct
+    from msg_analysis.sweep.workers import ENDING, WorkersLostError
 
     if store.damaged:
         print_note(f"{store.directory}: {store.damaged} lines cannot be read: their points are computed again")
@@ -199,11 +184,9 @@ def emulate(
     as_json: bool,
 ) -> int:
     """``msg-analysis figures --emulate``: run the networks, write the figures; returns the exit code."""
-    from msg_analysis.paper.emulation import disagreeing, measured, runs_of, summary
-    from msg_analysis.paper.figures import write_figures
-    from msg_analysis.sweep.jobs.job import FAILED
-    from msg_analysis.sweep.jobs.network_run import options
-    from msg_analysis.sweep.outcome_store import OutcomeStore
+    from msg_analysis.paper.figures import disagreeing, measured, runs_of, summary, write_figures
+    from msg_analysis.sweep.points import FAILED, options
+    from msg_analysis.sweep.results import OutcomeStore
 
     require_libraries()
     runs = [run for number in numbers for run in runs_of(number)]

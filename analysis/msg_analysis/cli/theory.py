@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Commands of ``msg-analysis`` for theory beyond the steady state: ``transient``, ``facts``, ``plan``, ``spectrum``."""
 
@@ -27,7 +16,7 @@ from msg_analysis.common.files import require_place
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
-    from msg_analysis.types import FloatArray
+    from msg_analysis.common.arrays import FloatArray
 
 
 @click.command(
@@ -64,8 +53,8 @@ def transient(
     as_json: bool,
 ) -> None:
     """Predict the errors of EXPERIMENT over time, from its own start, exactly."""
-    from msg_analysis.model.experiment.experiment import ValidExperiment
-    from msg_analysis.report.documents.transient_and_facts import describe_transient, write_transient_csv
+    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.report.documents import describe_transient, write_transient_csv
 
     require_place(table)
     loaded = ValidExperiment.load(experiment)
@@ -83,7 +72,7 @@ def transient(
     if as_json:
         print_json(document)
     else:
-        from msg_analysis.report.terminal.theory_text import print_transient
+        from msg_analysis.report.theory_text import print_transient
 
         print_transient(document, result_console())
 
@@ -119,8 +108,8 @@ def _parse_times(text: str) -> FloatArray:
 @json_option
 def facts(experiment: Path, as_json: bool) -> None:
     """Check the paper's lemmas on EXPERIMENT; bounds, indices of its graphs, two graphs in closed form."""
-    from msg_analysis.model.experiment.experiment import ValidExperiment
-    from msg_analysis.report.documents.transient_and_facts import describe_facts
+    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.report.documents import describe_facts
 
     loaded = ValidExperiment.load(experiment)
     loaded.require_available("predict")
@@ -128,7 +117,7 @@ def facts(experiment: Path, as_json: bool) -> None:
     if as_json:
         print_json(document)
     else:
-        from msg_analysis.report.terminal.theory_text import print_facts
+        from msg_analysis.report.theory_text import print_facts
 
         print_facts(document, result_console())
 
@@ -173,7 +162,7 @@ def plan(
     if as_json:
         print_json(document)
     else:
-        from msg_analysis.report.terminal.theory_text import print_plan
+        from msg_analysis.report.theory_text import print_plan
 
         print_plan(document, result_console())
 
@@ -223,12 +212,12 @@ def spectrum(context: click.Context, source: Path, figure: Path | None, level: f
     Exit code 0: predicted, or agrees, 1: disagrees, 3: data incomplete.
     """
     from msg_analysis.api import Experiment
-    from msg_analysis.common.exit_codes import ExitCode
-    from msg_analysis.report.documents.spectrum import measure_spectrum, predicted_spectrum
+    from msg_analysis.errors import ExitCode
+    from msg_analysis.report.documents import measure_spectrum, predicted_spectrum
 
     require_place(figure)
     if figure:
-        from msg_analysis.report.figures.spectrum_figure import require_format, spectrum_figure, write_spectrum
+        from msg_analysis.report.figures import require_format, spectrum_figure, write_spectrum
 
         require_format(figure)
     found = measure_spectrum(source, level) if is_bag(source) else predicted_spectrum(Experiment.load(source))
@@ -237,7 +226,7 @@ def spectrum(context: click.Context, source: Path, figure: Path | None, level: f
     if as_json:
         print_json(found.to_json())
     else:
-        from msg_analysis.report.terminal.theory_text import print_spectrum
+        from msg_analysis.report.theory_text import print_spectrum
 
         print_spectrum(found.to_json(), result_console())
     if not found.complete:

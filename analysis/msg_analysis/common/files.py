@@ -1,26 +1,19 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
-"""Files written at the end of long work: checked before it, and never written in part."""
+"""Files: bounded input, and output that is written whole or not at all."""
 
 from __future__ import annotations
 
+import errno
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from msg_analysis.errors import InputError
 
@@ -78,3 +71,81 @@ def written_whole(path: Path) -> Iterator[Path]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+LONGEST_FILE = 64 << 20  # bytes
+PART = 1 << 20  # bytes
+DEEPEST = 50  # collections in collections; PyYAML's loader in C crashes at some thousands
+MOST_REPEATED = 1_000_000  # values that aliases repeat, each counted as often as it is repeated
+
+SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # in C, where PyYAML has it
+
+
+def read_text(path: Path, longest: int = LONGEST_FILE) -> str:
+    """The text of a file in UTF-8; errors as of ``read_bytes``."""
+    return read_bytes(path, longest).decode("utf-8")
+
+
+def read_bytes(path: Path, longest: int = LONGEST_FILE) -> bytes:
+    """The bytes of a file; OSError (EFBIG) where it has more than that, endless ones included."""
+    data = bytearray()
+    with path.open("rb") as stream:
+        while part := stream.read(PART):
+            data += part
+            if len(data) > longest:
+                raise OSError(errno.EFBIG, f"longer than {longest >> 20} MB")
+    return bytes(data)
+
+
+def load_yaml(text: str, loader: Any = SAFE_LOADER) -> Any:
+    """The document; YAMLError where it is nested too deeply, or where aliases make it too large."""
+    _Walk().check(text)
+    return yaml.load(text, loader)
+
+
+class _Walk:
+    """Sizes of what has an anchor, from the events of a document; nothing is built."""
+
+    def __init__(self) -> None:
+        self._anchors: dict[str, int | None] = {}  # values; None: not finished yet
+        self._open: list[tuple[str | None, int]] = []  # anchor and values so far of the collections around
+        self._repeated = 0
+
+    def check(self, text: str) -> None:
+        for event in yaml.parse(text, SAFE_LOADER):
+            if isinstance(event, yaml.CollectionStartEvent):
+                self._begin(event)
+            elif isinstance(event, yaml.CollectionEndEvent):
+                anchor, size = self._open.pop()
+                self._add(anchor, size + 1)
+            elif isinstance(event, yaml.ScalarEvent):
+                self._add(event.anchor, 1)
+            elif isinstance(event, yaml.AliasEvent):
+                self._repeat(event)
+
+    def _begin(self, event: yaml.CollectionStartEvent) -> None:
+        if len(self._open) >= DEEPEST:
+            raise _error(f"nested too deeply, more than {DEEPEST} levels", event)
+        if event.anchor:
+            self._anchors[event.anchor] = None
+        self._open.append((event.anchor, 0))
+
+    def _add(self, anchor: str | None, size: int) -> None:
+        if anchor:
+            self._anchors[anchor] = size
+        if self._open:
+            around, before = self._open[-1]
+            self._open[-1] = (around, before + size)
+
+    def _repeat(self, event: yaml.AliasEvent) -> None:
+        size = self._anchors.get(event.anchor or "", 0)  # one that is not there is for the loader to name
+        if size is None:
+            raise _error(f"alias '{event.anchor}' stands inside what it names", event)
+        self._repeated += size
+        if self._repeated > MOST_REPEATED:
+            raise _error(f"aliases repeat more than {MOST_REPEATED} values: write down what is needed", event)
+        self._add(None, size)
+
+
+def _error(problem: str, event: Any) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=event.start_mark)

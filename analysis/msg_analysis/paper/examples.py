@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The three numerical examples of the paper as numbers: certainty over the switching rates.
 
@@ -30,14 +19,14 @@ from typing import Any
 import numpy as np
 import scipy.optimize
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.network.graphs import Graph
-from msg_analysis.model.network.markov_chain import MarkovChain
-from msg_analysis.theory.leaders.selection import LeaderProblem
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.graphs import Graph
+from msg_analysis.experiment.markov_chain import MarkovChain
+from msg_analysis.theory import jump_system as systems
+from msg_analysis.theory.leaders import LeaderProblem
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import Moments
-from msg_analysis.theory.system import jump_system as systems
-from msg_analysis.types import FloatArray
 
 SYSTEM, NODE, CENTRALITY = "system certainty", "node certainty", "robustness centrality"
 

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """What a figure of a sweep shows: one column of its table over a swept key, for each value of the other keys.
 
@@ -24,12 +13,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from msg_analysis.common.intervals import HALF_WIDTH_95
+from msg_analysis.common.text import HALF_WIDTH_95
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.problems import show
-from msg_analysis.sweep.axis_names import key_words
-from msg_analysis.sweep.plan import Sweep
-from msg_analysis.sweep.table import Row, column_names, is_number
+from msg_analysis.experiment.problems import show
+from msg_analysis.sweep.grid import Sweep, key_words
+from msg_analysis.sweep.results import Row, column_names, is_number
 
 DEFAULT_COLUMN = "system_error"
 

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The sweep file as data: what is swept, over which values, and what is done at every point."""
 
@@ -23,9 +12,9 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.run.until import Until
-from msg_analysis.model.spec.values import Count, expected, is_number
-from msg_analysis.sweep.jobs.job import JobKind
+from msg_analysis.experiment.network_spec import Count, expected, is_number
+from msg_analysis.model.run_record import Until
+from msg_analysis.sweep.points import JobKind
 
 MOST_POINTS = 20_000  # of a sweep: the experiments of all are held in memory
 

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The paper's lemmas on eigenvalues, checked for one network: how many are at 0 (or 1), and where the others are.
 
@@ -26,12 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.linalg
 
+from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
-from msg_analysis.model.step.step_model import build_step_model
-from msg_analysis.types import FloatArray
+from msg_analysis.model.step_model import build_step_model
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import ValidExperiment
+
 
 MAX_UNKNOWNS = 1500  # largest n m^2: all eigenvalues of a matrix of this size take a few seconds
 

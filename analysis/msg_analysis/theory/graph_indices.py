@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Indices of single graphs, for comparison, and bounds of the system error that hold for all switching rates.
 
@@ -25,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.linalg
 
+from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
-from msg_analysis.model.network.graphs import Graph, hops
+from msg_analysis.experiment.graphs import Graph, hops
+from msg_analysis.theory import jump_system as systems
+from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.system import jump_system as systems
-from msg_analysis.theory.system.jump_system import JumpSystem
-from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
     from msg_analysis.theory.prediction import Prediction

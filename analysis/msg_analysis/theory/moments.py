@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Second moments of jump linear systems: steady, dual (adjoint) and transient.
 
@@ -25,13 +14,12 @@ from typing import Literal
 
 import numpy as np
 
+from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
-from msg_analysis.theory.solvers.dense import DenseSolver
-from msg_analysis.theory.solvers.iterative import IterativeSolver
-from msg_analysis.theory.solvers.solver_report import MAX_RELATIVE_ERROR, SolverReport
-from msg_analysis.theory.system import packed_symmetric
-from msg_analysis.theory.system.jump_system import JumpSystem
-from msg_analysis.types import FloatArray
+from msg_analysis.theory import packed_symmetric
+from msg_analysis.theory.coupled_equations import MAX_RELATIVE_ERROR, SolverReport
+from msg_analysis.theory.jump_system import JumpSystem
+from msg_analysis.theory.solvers import DenseSolver, IterativeSolver
 
 MARGIN = 8.0  # of the estimated effect of rounding, see docs/accuracy.md
 MAX_KEPT = 1_000_000  # numbers of adjoint solutions that a solver keeps, at most

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """What theory says about an experiment: in continuous time, for the run's steps, and without switching.
 
@@ -29,24 +18,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from msg_analysis.common.blas_threads import blas_threads, few_blas_threads, one_blas_thread
-from msg_analysis.common.text.agent_names import agent_text
-from msg_analysis.common.text.json_numbers import finite
-from msg_analysis.common.text.markdown import markdown_table
-from msg_analysis.common.text.number_words import number_text
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.resources import blas_threads, few_blas_threads, one_blas_thread
+from msg_analysis.common.text import agent_text, finite, markdown_table, number_text
 from msg_analysis.errors import InputError, NotAvailableError
-from msg_analysis.model.network.graphs import hops, widest_reaching
-from msg_analysis.model.step.sequential_law import StepLaw, build_run_model, step_law
-from msg_analysis.model.step.step_model import StepModel, build_step_model
+from msg_analysis.experiment.graphs import hops, widest_reaching
+from msg_analysis.model.step_model import StepLaw, StepModel, build_run_model, build_step_model, step_law
+from msg_analysis.theory import jump_system as systems
+from msg_analysis.theory.coupled_equations import SolverReport
+from msg_analysis.theory.fourth_moments import FourthMoment, fourth_moment
+from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.solvers.solver_report import SolverReport
-from msg_analysis.theory.system import jump_system as systems
-from msg_analysis.theory.system.jump_system import JumpSystem
-from msg_analysis.theory.tails.fourth_moments import FourthMoment, fourth_moment
-from msg_analysis.types import FloatArray
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import ValidExperiment
 
 
 ERROR_ROUNDING = 1e-14  # node errors below this, relative to the largest one, are rounding

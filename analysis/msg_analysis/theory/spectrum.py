@@ -1,17 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Autocovariance and power spectral density of the errors in the steady state, exact. Discrete time.
 
@@ -33,11 +21,11 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from msg_analysis.common.text.number_words import number_text
+from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.common.text import number_text
 from msg_analysis.errors import InputError
+from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.prediction import Prediction
-from msg_analysis.theory.system.jump_system import JumpSystem
-from msg_analysis.types import FloatArray, IntArray
 
 MAX_SIZE = 600  # graphs times coordinates, of the resolvent
 FADED = 0.01  # of the autocovariance at lag 0: where the default lags end

@@ -1,17 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Variance of the time mean of the system error over a run, before any run. Discrete time.
 
@@ -31,12 +19,12 @@ from typing import Protocol
 
 import numpy as np
 
+from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
+from msg_analysis.theory import packed_symmetric
+from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver, mode_potential
 from msg_analysis.theory.prediction import Prediction
-from msg_analysis.theory.system import packed_symmetric
-from msg_analysis.theory.system.jump_system import JumpSystem
-from msg_analysis.types import FloatArray
 
 MAX_WORK = 3e7  # n p^3 for p packed moments: up to it, M is followed along the path
 MAX_ROUNDS = 300  # in which what losses add is found

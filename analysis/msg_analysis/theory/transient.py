@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Transients: the law of the graph, means and second moments of every mode over time, from any start.
 
@@ -25,22 +14,22 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from msg_analysis.common.blas_threads import few_blas_threads
-from msg_analysis.common.text.markdown import markdown_table
-from msg_analysis.common.text.number_words import number_text
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.resources import few_blas_threads
+from msg_analysis.common.text import markdown_table, number_text
 from msg_analysis.errors import InputError
-from msg_analysis.model.step.sequential_law import build_run_model
+from msg_analysis.model.step_model import build_run_model
+from msg_analysis.theory import jump_system as systems
+from msg_analysis.theory import packed_symmetric
+from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.solvers.moment_operators import mean_propagator, second_moment_propagator
-from msg_analysis.theory.solvers.propagator import Flow
-from msg_analysis.theory.solvers.rational_krylov import RationalFlow, slowest_rate
-from msg_analysis.theory.system import jump_system as systems
-from msg_analysis.theory.system import packed_symmetric
-from msg_analysis.theory.system.jump_system import JumpSystem
-from msg_analysis.types import FloatArray
+from msg_analysis.theory.propagator import Flow
+from msg_analysis.theory.rational_krylov import RationalFlow, slowest_rate
+from msg_analysis.theory.solvers import mean_propagator, second_moment_propagator
 
 if TYPE_CHECKING:
-    from msg_analysis.model.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import ValidExperiment
+
 
 TransientLaw = Literal["emulated", "continuous"]
 

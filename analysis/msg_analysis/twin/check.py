@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The bit-for-bit check: whether a bag holds exactly what the law and the seed give."""
 
@@ -21,15 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.common.long_work import tell
-from msg_analysis.model.run.graph_path import mode_path
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.model.step.air import Air
-from msg_analysis.model.step.air_reception import by_sender_and_block
-from msg_analysis.model.step.neighbours import neighbour_tables
+from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.common.resources import tell
+from msg_analysis.model.graph_path import mode_path
+from msg_analysis.model.reception import Air, by_sender_and_block, neighbour_tables
+from msg_analysis.model.run import Trajectory
 from msg_analysis.twin.log_replay import replay
-from msg_analysis.twin.run_blocks import RunBlock, run_blocks
-from msg_analysis.types import BoolArray, FloatArray, IntArray
+from msg_analysis.twin.simulate import RunBlock, run_blocks
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The twin of a run in real time: from what every agent logged of each step, what must have come out of it."""
 
@@ -20,18 +9,15 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from msg_analysis.model.arithmetic.payload import from_payload, to_payload
-from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
-from msg_analysis.model.arithmetic.update_law import step as update
-from msg_analysis.model.run.agent_law import ProtocolLaw
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.model.step.air import NOTHING, Air
-from msg_analysis.model.step.air_reception import add_broadcast_noise, by_sender_and_block
-from msg_analysis.model.step.neighbours import neighbour_tables
-from msg_analysis.model.step.step_model import StepModel
-from msg_analysis.twin.network_steps import noise_of_all
-from msg_analysis.twin.run_blocks import RunBlock, from_start
-from msg_analysis.types import FloatArray, IntArray
+from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK
+from msg_analysis.arithmetic.update_law import from_payload, to_payload
+from msg_analysis.arithmetic.update_law import step as update
+from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.model.agent_law import ProtocolLaw
+from msg_analysis.model.reception import NOTHING, Air, add_broadcast_noise, by_sender_and_block, neighbour_tables
+from msg_analysis.model.run import Trajectory
+from msg_analysis.model.step_model import StepModel
+from msg_analysis.twin.simulate import RunBlock, from_start, noise_of_all
 
 
 def replay(trajectory: Trajectory) -> Iterator[RunBlock]:

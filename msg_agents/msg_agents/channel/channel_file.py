@@ -1,16 +1,6 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
 """The channel file: which agents are on which host, and what happens to the packets between two hosts."""
 
 from __future__ import annotations
@@ -24,15 +14,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from msg_agents.channel.link import LinkSettings, LossModel
+from msg_agents.channel.links import LinkSettings, LossModel
 from msg_agents.channel.namespaces import MOST_HOSTS
-from msg_agents.processes.hosts import agent_numbers, assignment_problems
-from msg_agents.processes.process_plan import process_name, split_agents
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.experiment.problems import ExperimentError, problem, translate
-from msg_analysis.model.experiment.yaml_document import read_yaml
-from msg_analysis.model.spec.values import expected, is_number
-from msg_analysis.types import BoolArray, FloatArray
+from msg_agents.process_layout import agent_numbers, assignment_problems, process_name, split_agents
+from msg_analysis.common.arrays import BoolArray, FloatArray
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.loading import read_yaml
+from msg_analysis.experiment.network_spec import expected, is_number
+from msg_analysis.experiment.problems import ExperimentError, problem, translate
 
 BASE = "base"
 """The host of recorder and switcher."""

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Commands to begin with: ``demo``, ``examples``, ``new``, ``schema``."""
 
@@ -28,11 +17,22 @@ from msg_analysis.cli.console import examples as example_lines
 from msg_analysis.cli.console import print_json, print_text, result_console
 from msg_analysis.cli.options import PATH, PositiveFloat, json_option
 from msg_analysis.errors import InputError
-from msg_analysis.examples.bundled import FOLDER, SUFFIX, names, shows, text_of
-from msg_analysis.examples.new_experiment import KINDS, MOST_AGENTS, Choices, experiment_name, experiment_text
+from msg_analysis.experiment.examples import (
+    FOLDER,
+    KINDS,
+    MOST_AGENTS,
+    SUFFIX,
+    Choices,
+    experiment_name,
+    experiment_text,
+    names,
+    shows,
+    text_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
 
 DEMO = "line_ring"
 DEFAULT = Choices()
@@ -161,8 +161,8 @@ def new(file: Path, *, as_json: bool, **given: Any) -> None:
 def _write(file: Path, chosen: Choices) -> str:
     """Check the experiment as a whole, write it, and give its name."""
     from msg_analysis.common.files import require_place, write_whole
-    from msg_analysis.model.experiment.experiment import ValidExperiment
-    from msg_analysis.model.experiment.yaml_document import parse_yaml
+    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.loading import parse_yaml
 
     require_place(file)
     name = experiment_name(file.stem)

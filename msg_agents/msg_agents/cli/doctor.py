@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The command ``doctor``."""
 
@@ -24,12 +13,13 @@ import click
 
 from msg_analysis.cli.console import examples, print_json, result_console
 from msg_analysis.cli.options import json_option
-from msg_analysis.common.exit_codes import ExitCode
+from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from msg_agents.doctor.check import Check
+    from msg_agents.doctor.checks import Check
+
 
 STYLES = {"ok": "green", "warning": "bold yellow", "error": "bold red"}
 
@@ -41,7 +31,7 @@ def doctor(*, as_json: bool) -> None:
 
     The last check runs two processes for a second. Exit code 2: a run cannot work; warnings do not change it.
     """
-    from msg_agents.doctor.examination import examine
+    from msg_agents.doctor.network_checks import examine
 
     console, found = result_console(), []
     for check in examine():

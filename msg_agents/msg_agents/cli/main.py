@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The command line ``msg-agents``.
 
@@ -29,9 +18,9 @@ import msg_agents
 from msg_agents.cli import begin, nodes, replay, watching
 from msg_agents.cli.doctor import doctor
 from msg_agents.cli.run_result import finish
-from msg_agents.cli.web_options import WebCommand, announce, page, web_options
-from msg_agents.processes.environment import LAST_DOMAIN, RESTARTS, USER_TIMEOUT
-from msg_agents.terminal.interruption import Interruption
+from msg_agents.cli.watching import WebCommand, announce, page, web_options
+from msg_agents.environment import LAST_DOMAIN, RESTARTS, USER_TIMEOUT
+from msg_agents.terminal import Interruption
 from msg_analysis.cli.console import CommandGroup, examples
 from msg_analysis.cli.options import (
     PATH,
@@ -42,14 +31,15 @@ from msg_analysis.cli.options import (
     experiment_argument,
     json_option,
     seed_option,
+    storage,
+    storage_options,
     suggest,
 )
 from msg_analysis.cli.runs import runs
-from msg_analysis.cli.storage_options import storage, storage_options
 
 if TYPE_CHECKING:
-    from msg_agents.running.run_result import ReportWhen
-    from msg_analysis.bags.format.storage_options import Compression
+    from msg_agents.run.result import ReportWhen
+    from msg_analysis.bags.mcap_chunks import Compression
 
 
 class _Commands(CommandGroup):
@@ -211,10 +201,10 @@ def run(
 
     On a terminal, a panel shows the progress; with --web, a page for browsers does, too.
     """
-    from msg_agents.running.experiment_overrides import load_with_overrides
-    from msg_agents.running.runner import run_network
-    from msg_agents.watching.run_view import RunView
-    from msg_analysis.model.run.until import Until
+    from msg_agents.run.folder import load_with_overrides
+    from msg_agents.run.runner import run_network
+    from msg_agents.watch.panel import RunView
+    from msg_analysis.model.run_record import Until
 
     interruption = _interruption()
     changes: dict[str, Any] = {"seed": seed, "duration": duration, "pace": pace, "speed": speed}
@@ -320,12 +310,12 @@ def host(
     Give all hosts the same RUN_RECORD (from `msg-agents prepare`) and HOSTS; start them in any order. The recorder's
     host compares the record with the theory, as `msg-agents run` does; the others end with the run.
     """
-    from msg_agents.processes.hosts import Hosts, this_host
-    from msg_agents.running.run_folder import workshop
-    from msg_agents.running.runner import run_network
-    from msg_agents.watching.run_view import RunView
-    from msg_analysis.common.text.agent_names import agent_name
-    from msg_analysis.model.experiment.problems import show
+    from msg_agents.process_layout import Hosts, this_host
+    from msg_agents.run.folder import workshop
+    from msg_agents.run.runner import run_network
+    from msg_agents.watch.panel import RunView
+    from msg_analysis.common.text import agent_name
+    from msg_analysis.experiment.problems import show
 
     interruption = _interruption()
     record = nodes.load_record(run_record)

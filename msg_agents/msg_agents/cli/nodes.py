@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Commands of ``msg-agents`` that run one process of a network: ``agent``, ``switcher``, ``recorder``; ``prepare``."""
 
@@ -27,19 +16,27 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
-from msg_agents.cli.ros_command import RosCommand
-from msg_agents.processes.environment import DISCOVERY_TIMEOUT
-from msg_agents.processes.lifeline import hold_pipe
+from msg_agents.cli.entry_points import RosCommand
+from msg_agents.environment import DISCOVERY_TIMEOUT
+from msg_agents.run.lifeline import hold_pipe
 from msg_analysis.cli.console import examples
-from msg_analysis.cli.options import PATH, RUN_RECORD, PositiveFloat, experiment_argument, suggest
-from msg_analysis.cli.storage_options import storage, storage_options
-from msg_analysis.common.exit_codes import ExitCode
+from msg_analysis.cli.options import (
+    PATH,
+    RUN_RECORD,
+    PositiveFloat,
+    experiment_argument,
+    storage,
+    storage_options,
+    suggest,
+)
+from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
-    from msg_agents.nodes.network_node import NetworkNode
-    from msg_agents.stepping.clock_offsets import ClockOffsets
-    from msg_analysis.bags.format.storage_options import Compression
-    from msg_analysis.model.run.record import RunRecord
+    from msg_agents.nodes.base import NetworkNode
+    from msg_agents.stepping.newest_values import ClockOffsets
+    from msg_analysis.bags.mcap_chunks import Compression
+    from msg_analysis.model.run_record import RunRecord
+
 
 use_sim_time = click.option(
     "--use-sim-time",
@@ -119,7 +116,7 @@ def _agents_of_record(context: click.Context, _option: click.Parameter, incomple
 @experiment_argument
 def prepare(experiment: Path) -> None:
     """Print the run record of a new run of EXPERIMENT: the file with which single nodes are started."""
-    from msg_analysis.model.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import ValidExperiment
     from msg_analysis.twin.simulate import new_record
 
     what = ValidExperiment.load(experiment)
@@ -158,14 +155,14 @@ def agent(
         raise InputError(f"--agent: {list(agents)}: expected each agent once")
 
     def nodes() -> list[NetworkNode]:
-        from msg_agents.nodes.agents.agent_group import AgentGroup
-        from msg_agents.nodes.node_process import store_participant
-        from msg_agents.recovery.takeover import take_over
-        from msg_analysis.wire.topics import agent_name
+        from msg_agents.nodes.agent_group import AgentGroup
+        from msg_agents.nodes.process import store_participant
+        from msg_agents.recovery import take_over
+        from msg_analysis.messages.topics import agent_node_name
 
         indices = [number - 1 for number in agents]
         model, directory = record.model, _make(checkpoint)
-        takeovers = take_over(directory, map(agent_name, indices))
+        takeovers = take_over(directory, map(agent_node_name, indices))
         group = AgentGroup(record=record, model=model, agents=indices, readers=readers, checkpoints=directory)
         store_participant(takeovers, group.nodes[0])
         return list(group.nodes)
@@ -196,13 +193,13 @@ def switcher(
     record = load_record(run_record)
 
     def report(reached: Sequence[int]) -> None:
-        from msg_agents.processes.status_file import write_steps
+        from msg_agents.run.result import write_steps
 
         if steps is not None:
             write_steps(steps, reached)
 
     def note_clocks(offsets: ClockOffsets, warning: str | None) -> None:
-        from msg_agents.processes.status_file import write_clocks
+        from msg_agents.run.result import write_clocks
 
         if clocks is not None:
             write_clocks(clocks, offsets.to_json(), warning)
@@ -210,15 +207,15 @@ def switcher(
     def tell_channel(file: Path | None) -> Callable[[int], None]:
         if file is None:
             return lambda _: None
-        from msg_agents.channel.active_graph import ActiveGraphFile
+        from msg_agents.channel.links import ActiveGraphFile
 
         return ActiveGraphFile(file).tell
 
     def nodes() -> list[NetworkNode]:
-        from msg_agents.nodes.network_node import ACK_TIMEOUT
-        from msg_agents.nodes.node_process import store_participant
+        from msg_agents.nodes.base import ACK_TIMEOUT
+        from msg_agents.nodes.process import store_participant
         from msg_agents.nodes.switcher import SWITCHERS
-        from msg_agents.recovery.takeover import take_over
+        from msg_agents.recovery import take_over
 
         model, directory = record.model, _make(checkpoint)
         takeovers = take_over(directory, ["switcher"])
@@ -287,7 +284,7 @@ def _run_nodes(
         enter(namespace)
     if lifeline is not None:
         hold_pipe(lifeline)
-    from msg_agents.nodes.node_process import run_nodes
+    from msg_agents.nodes.process import run_nodes
 
     executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")
     throughput = record.experiment.run.pace == "lockstep"
@@ -323,7 +320,7 @@ _read_ahead: dict[Path, RunRecord] = {}  # in a fork server, and in what it has 
 
 def load_record(path: Path) -> RunRecord:
     """Read a run record from ``msg-agents prepare``; InputError if it cannot be read or is not one."""
-    from msg_analysis.model.run.record import RunRecord
+    from msg_analysis.model.run_record import RunRecord
 
     return _read_ahead.get(path) or RunRecord.from_json(_text_of(path), str(path))
 
@@ -334,7 +331,7 @@ def read_record_ahead(path: Path) -> None:
     Not one with a protocol, whose code its user wrote: it is imported in the processes of the nodes only.
     """
     from msg_analysis.errors import InputError
-    from msg_analysis.model.run.record import RunRecord
+    from msg_analysis.model.run_record import RunRecord
 
     if path in _read_ahead:
         return
@@ -347,7 +344,7 @@ def read_record_ahead(path: Path) -> None:
 
 
 def _text_of(path: Path) -> str:
-    from msg_analysis.common.bounded_input import read_text
+    from msg_analysis.common.files import read_text
     from msg_analysis.errors import InputError
 
     try:
@@ -368,7 +365,7 @@ def record_of(bag: Path | None, run_record: Path | None) -> RunRecord | None:
         except InputError as error:
             raise InputError(f"--experiment: {error}: expected a run record, such as log/run.json of a run") from error
     if bag is not None:
-        from msg_analysis.bags.reader import read_record
+        from msg_analysis.bags.reading import read_record
 
         return read_record(bag)
     return None

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The commands ``play`` and ``check`` of ``msg-agents``: a recorded network again, by a player or by the twin."""
 
@@ -25,19 +14,19 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
-from msg_agents.cli.ros_command import RosCommand, domain_option, enter
+from msg_agents.cli.entry_points import RosCommand, domain_option, enter
 from msg_analysis.cli.console import examples, print_json, print_text
 from msg_analysis.cli.options import BAG, PositiveFloat, json_option
-from msg_analysis.common.exit_codes import ExitCode
-from msg_analysis.common.text.notes import print_note
+from msg_analysis.common.text import print_note
+from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
-    from msg_agents.nodes.replay.player import Played
+    from msg_agents.nodes.player import Played
 
 
 def _topics_of_bag(context: click.Context, _option: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Shell completion: the topics of the bag on the command line."""
-    from msg_analysis.bags.format.metadata import read_metadata
+    from msg_analysis.bags.files import read_metadata
     from msg_analysis.errors import InputError
 
     try:
@@ -53,7 +42,7 @@ class _Rate(click.types.FloatParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """See click.ParamType."""
-        from msg_agents.replay.bag_clock import parse_rate
+        from msg_agents.replay import parse_rate
 
         try:
             return parse_rate(value)
@@ -154,8 +143,8 @@ def play(
     On a terminal, space pauses and continues, s plays one message, the right arrow goes forward by 5 %, a number and
     enter to that time in seconds, up and down change the rate.
     """
-    from msg_agents.nodes.replay.player import PlayOptions
-    from msg_agents.nodes.replay.player import play as play_bag
+    from msg_agents.nodes.player import PlayOptions
+    from msg_agents.nodes.player import play as play_bag
 
     enter(domain)
     options = PlayOptions(
@@ -200,8 +189,8 @@ class PlayBar:
         from rich.progress import BarColumn, Progress, TextColumn
         from rich.text import Text
 
-        from msg_agents.nodes.replay.player import Played
-        from msg_analysis.common.text.safe_console import SafeConsole
+        from msg_agents.nodes.player import Played
+        from msg_analysis.common.text import SafeConsole
 
         class BarAndKeys(Progress):
             def get_renderables(self) -> Iterable[RenderableType]:
@@ -261,10 +250,10 @@ def check(bag: Path | None, *, as_json: bool) -> None:
 
     Without BAG, the newest bag below ./runs is checked.
     """
-    from msg_analysis.bags.reader import read_bag
-    from msg_analysis.cli.progress import WorkProgress
-    from msg_analysis.common.long_work import watched
-    from msg_analysis.common.text.agent_names import with_names
+    from msg_analysis.bags.reading import read_bag
+    from msg_analysis.cli.console import WorkProgress
+    from msg_analysis.common.resources import watched
+    from msg_analysis.common.text import with_names
     from msg_analysis.twin.check import check as check_trajectory
 
     path = bag or _newest_bag(Path("runs"))

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The end of a run on the command line: verdict, output, exit code."""
 
@@ -24,16 +13,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from msg_agents.terminal.interruption import Interruption
+from msg_agents.terminal import Interruption
 from msg_analysis.cli.console import complain, print_json, result_console
-from msg_analysis.common.exit_codes import ExitCode
 from msg_analysis.common.files import RESULT_FILE, write_whole
-from msg_analysis.common.long_work import watched
-from msg_analysis.common.text.json_numbers import json_text
+from msg_analysis.common.resources import watched
+from msg_analysis.common.text import json_text
+from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
-    from msg_agents.running.run_result import ReportWhen, RunResult
-    from msg_analysis.model.experiment.experiment import ValidExperiment
+    from msg_agents.run.result import ReportWhen, RunResult
+    from msg_analysis.experiment.experiment import ValidExperiment
 
 
 def finish(
@@ -53,8 +42,8 @@ def finish(
         complain(line, "failed:")
     if analyse and not result.interrupted:
         # While signals are kept: an exception in the middle of an import may become another one.
-        from msg_agents.running.run_result import conclude
-        from msg_analysis.cli.progress import WorkProgress
+        from msg_agents.run.result import conclude
+        from msg_analysis.cli.console import WorkProgress
 
         progress = WorkProgress()
         try:
@@ -114,7 +103,7 @@ def _show(result: RunResult, as_json: bool) -> None:
         print_json(document)
         return
     if result.comparison is not None:
-        from msg_analysis.report.terminal.comparison_text import print_comparison
+        from msg_analysis.report.comparison_text import print_comparison
 
         print_comparison(document, result_console())
     for line in (result.channel or {}).get("findings", []):
@@ -133,7 +122,7 @@ def _show(result: RunResult, as_json: bool) -> None:
 
 def _without_comparison(experiment: ValidExperiment) -> dict[str, Any]:
     """What `msg-analysis tabulate` reads of a result, without numbers."""
-    from msg_analysis.inference.errors.estimates import Estimate
+    from msg_analysis.inference.estimates import Estimate
 
     return {
         "experiment": experiment.name,

@@ -1,41 +1,93 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
-
-"""The commands ``live`` and ``markers`` of ``msg-agents``: networks, running or played, are watched."""
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from msg_agents.cli import nodes
-from msg_agents.cli.ros_command import RosCommand, domain_option, enter
-from msg_agents.cli.web_options import WebRosCommand, announce, page, web_options
+from msg_agents.cli.entry_points import RosCommand, domain_option, enter
 from msg_analysis.cli.console import examples, print_json, print_text, result_console
 from msg_analysis.cli.options import BAG, RUN_RECORD, PositiveFloat, json_option
-from msg_analysis.common.exit_codes import ExitCode
-from msg_analysis.common.text.notes import print_note
+from msg_analysis.common.text import print_note
+from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
-    from msg_agents.nodes.watching.live import Watched
-    from msg_agents.watching.display import Display
-    from msg_agents.watching.snapshot import SnapshotSource
+    from msg_agents.nodes.live import Watched
+    from msg_agents.watch.panel import Display
+    from msg_agents.watch.snapshot import SnapshotSource
+    from msg_agents.watch.web_server import WebServer
+
+
+PORT, HOST = 8421, "127.0.0.1"
+LOOPBACK = {"127.0.0.1", "localhost", "::1"}
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def web_options(function: Function) -> Function:
+    """Add the options ``--web`` and ``--web-host`` to a command."""
+    host = click.option(
+        "--web-host",
+        default=HOST,
+        show_default=True,
+        metavar="ADDRESS",
+        help="Address of the page of --web; 0.0.0.0: for all machines that can reach this one.",
+    )
+    web = click.option(
+        "--web",
+        type=click.IntRange(0, 65535),
+        metavar="[PORT]",
+        is_flag=False,
+        flag_value=PORT,
+        default=None,
+        help=f"Serve a live page for browsers on this port; {PORT} if none is given, 0: any free port.",
+    )
+    return web(host(function))
+
+
+def with_port(args: list[str]) -> list[str]:
+    """The arguments with the default port after every ``--web`` that no number follows."""
+    pairs = zip(args, [*args[1:], ""], strict=False)
+    return [f"--web={PORT}" if one == "--web" and not after.isdigit() else one for one, after in pairs]
+
+
+class WebCommand(click.Command):
+    """A command that takes ``--web`` with or without a port."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """See click.Command."""
+        return super().parse_args(ctx, with_port(args))
+
+
+class WebRosCommand(WebCommand, RosCommand):
+    """A command of a ROS 2 node that takes ``--web`` with or without a port."""
+
+
+@contextmanager
+def page(port: int | None, host: str) -> Iterator[WebServer | None]:
+    """Serve the live page inside the context (port 0: any free port); None without a port."""
+    if port is None:
+        yield None
+        return
+    from msg_agents.watch.web_server import WebServer
+
+    with WebServer(host, port) as web:
+        yield web
+
+
+def announce(web: WebServer, host: str, note: Callable[[str], None]) -> None:
+    """Note the address of the page, and that other machines can see it where that is so."""
+    note(f"live page at {web.address}")
+    if host not in LOOPBACK:
+        note("all machines that can reach this one can see the page; it is not encrypted and has no password")
+
 
 _timeout = click.option(
     "--timeout",
@@ -95,9 +147,9 @@ def live(
     It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The numbers are those of `msg-analysis
     compare`, also published on the topic `estimate`; they are not a verdict.
     """
-    from msg_agents.nodes.watching.live import watch
-    from msg_agents.watching.display import Display
-    from msg_analysis.report.terminal.live_text import live_document
+    from msg_agents.nodes.live import watch
+    from msg_agents.watch.panel import Display
+    from msg_analysis.report.comparison_text import live_document
 
     enter(domain)
     record = nodes.record_of(bag, run_record)
@@ -151,8 +203,8 @@ class LiveView:
 
     def show(self, watched: Watched, rate: float) -> None:
         """Show the newest report; ``rate`` in steps per second."""
-        from msg_agents.watching.snapshot import SnapshotSource
-        from msg_analysis.report.terminal.live_text import live_line
+        from msg_agents.watch.snapshot import SnapshotSource
+        from msg_analysis.report.comparison_text import live_line
 
         experiment, report = watched.record.experiment, watched.report
         if self._source is None:
@@ -189,7 +241,7 @@ def markers(*, rate: float, replica: int, frame: str, timeout: float | None, dom
     active graph. It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The network never waits
     for it.
     """
-    from msg_agents.nodes.watching.markers import show_markers
+    from msg_agents.nodes.markers import show_markers
 
     enter(domain)
     over = show_markers(rate=rate, replica=replica - 1, frame=frame, timeout=timeout, on_note=print_note)

@@ -1,29 +1,163 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
-"""Sockets of this machine, and its ROS domains."""
+"""Checks that start processes: discovery, a round trip, a small network."""
 
 from __future__ import annotations
 
 import os
 import socket
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
-from msg_agents.discovery.loopback import loopback_has_multicast, require_loopback
-from msg_agents.discovery.ros_domain import DOMAINS, domains_with_ports_in_use, free_domain, is_held
-from msg_agents.doctor.check import Check, refusal, warn_if
-from msg_agents.processes.environment import check_domain
+from msg_agents.discovery.profiles import PROFILE_VARIABLES
+from msg_agents.discovery.rtps import (
+    DOMAINS,
+    domains_with_ports_in_use,
+    free_domain,
+    is_held,
+    loopback_has_multicast,
+    require_loopback,
+)
+from msg_agents.doctor import checks
+from msg_agents.doctor.checks import Check, refusal, warn_if
+from msg_agents.environment import (
+    LOCALHOST_VARIABLE,
+    RANGE_VARIABLE,
+    SERVER_VARIABLE,
+    TRANSPORTS_VARIABLE,
+    check_domain,
+    node_environment,
+    require_discovery,
+)
+from msg_agents.process_layout import MOST_UNAIDED
+from msg_agents.run.runner import run_network
+from msg_agents.terminal import raise_for
+from msg_agents.watch.panel import View
 from msg_analysis.errors import InputError
+from msg_analysis.experiment.experiment import ValidExperiment
+
+LIMIT = 12.0  # s for both agents to make steps: long enough for a machine that is busy
+MEASURED = 0.5  # s of steps: some thousand
+PAIR = {
+    "name": "doctor",
+    "graphs": {"pair": {"path": [1, 2]}},
+    "run": {"dt": 0.01, "duration": 1000, "start": "zero", "processes": 2},
+}
+PER_ROUND_TRIP = 2  # steps: an agent waits in each for a message that the other one sent in the step before
+
+
+class _EnoughError(Exception):
+    """The run is to end now."""
+
+
+class _Stopwatch(View):
+    """Measures the steps of a run, and ends it."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda _: None, lambda _: None)
+        self._start = time.monotonic()
+        self._reports: list[tuple[float, int]] = []  # times at which the newest step was another one, and which
+        self.rate = 0.0  # steps/s
+
+    def look(self, steps: Sequence[int]) -> None:
+        """The newest step of every agent; _EnoughError when they have been measured, or will not come any more."""
+        now, reached = time.monotonic(), min(steps, default=-1)
+        if reached >= 0 and (not self._reports or reached > self._reports[-1][1]):
+            self._reports.append((now, reached))
+            (began, first), (then, last) = self._reports[0], self._reports[-1]
+            self.rate = (last - first) / (then - began) if then > began else 0.0
+            if then - began >= MEASURED:
+                raise _EnoughError
+        if now - self._start > LIMIT:
+            raise _EnoughError
+
+
+def check_round_trip() -> Check:
+    """Whether two processes of a run hear each other, and how long a message takes there and back."""
+    name, watch = "round_trip", _Stopwatch()
+    try:
+        result = run_network(ValidExperiment.parse(PAIR), None, restarts=0, view=watch)
+    except InputError as error:
+        return Check(name, "error", str(error))
+    except OSError as error:  # too few files or processes, a full disk
+        return Check(name, "error", f"two processes could not be started: {error}: raise that limit")
+    except _EnoughError:
+        failures = []
+    else:
+        raise_for(result.interrupted_by)
+        failures = result.failures
+    if failures or not watch.rate:
+        what = failures[0] if failures else f"not within {LIMIT:g} s"
+        remedy = "do what the warnings above say, and see docs/troubleshooting.md"
+        return Check(name, "error", f"two processes exchange messages: {what}: {remedy}")
+    duration = PER_ROUND_TRIP / watch.rate
+    return Check(name, "ok", f"{duration * 1e3:.2g} ms between two processes, computing included", duration)
+
+
+VARIABLES_FILE = "FASTDDS_ENVIRONMENT_FILE"
+NOT_USED = (TRANSPORTS_VARIABLE, "CYCLONEDDS_URI")  # with the run's own profile of Fast DDS
+PEERS_VARIABLE = "ROS_STATIC_PEERS"
+RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
+UNAIDED = f"its processes look for each other, at most {MOST_UNAIDED} with agents"
+
+
+def check_profiles() -> Check:
+    """Whether the run uses its own profile of Fast DDS."""
+    warning = None
+    if file := os.environ.get(VARIABLES_FILE):
+        warning = f"{VARIABLES_FILE}: {file}: Fast DDS takes variables from it that may keep nodes apart: unset it"
+    for name in PROFILE_VARIABLES:
+        if value := os.environ.get(name):
+            there = "instead of its own" if Path(value).is_file() else "instead of its own, and it is not there"
+            warning = f"{name}: {value}: a run uses this file {there}: {UNAIDED}: unset it"
+    others = ", ".join(f"{name}={value}" for name in NOT_USED if (value := os.environ.get(name)))
+    return warn_if("profiles", warning, "the run's own" + (f" (without effect on it: {others})" if others else ""))
+
+
+def check_range() -> Check:
+    """Where nodes look for others."""
+    name = "discovery_range"
+    if found := refusal(name, lambda: require_discovery(os.environ)):
+        return found
+    value, localhost = os.environ.get(RANGE_VARIABLE), os.environ.get(LOCALHOST_VARIABLE)
+    warning = None
+    if localhost == "1" and LOCALHOST_VARIABLE in node_environment(0):  # as with a profile or range of the user's
+        warning = (
+            f"{LOCALHOST_VARIABLE}: 1: replaced by {RANGE_VARIABLE} in ROS 2, but still stronger: nodes use "
+            "shared memory, of which a killed process leaves its part behind: unset it"
+        )
+    elif value and value not in RANGES:
+        warning = f"{RANGE_VARIABLE}: {value}: expected {', '.join(RANGES)}: unset it"
+    elif value and value != "LOCALHOST":
+        warning = f"{RANGE_VARIABLE}: {value}: a run keeps to it, perhaps beyond this machine: {UNAIDED}: unset it"
+    return warn_if(name, warning, "this machine" + (f" ({LOCALHOST_VARIABLE}={localhost})" if localhost else ""))
+
+
+def check_server() -> Check:
+    """Whether the user's other programs would see the run."""
+    server = os.environ.get(SERVER_VARIABLE)
+    warning = None
+    if SERVER_VARIABLE in node_environment(0):  # as with a profile or range of the user's
+        warning = f"{SERVER_VARIABLE}: {server}: the nodes of a run find each other only while it is there: unset it"
+    elif server:
+        warning = (
+            f"{SERVER_VARIABLE}: {server}: a run does not use it, and other programs in this shell, such as "
+            "`ros2 topic`, will not see the run: unset it"
+        )
+    return warn_if("discovery_server", warning, "none")
+
+
+def check_peers() -> Check:
+    """Other machines that are named."""
+    peers = os.environ.get(PEERS_VARIABLE)
+    alone = os.environ.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
+    warning = None
+    if peers and not alone:
+        warning = f"{PEERS_VARIABLE}: {peers}: nodes of a run contact these machines: unset it, or {RANGE_VARIABLE}"
+    return warn_if("static_peers", warning, f"{peers} (not used by a run on this machine)" if peers else "none")
+
 
 WANTED = 4 << 20  # bytes of a receive buffer, as in the profiles of Fast DDS
 LEAST = 212_992  # bytes, what Linux allows by default
@@ -104,3 +238,50 @@ def check_free_domains() -> Check:
     which = f"; taken: {', '.join(map(str, taken[:SHOWN]))}{more}" if taken else ""
     free = len(DOMAINS) - len(taken)
     return Check(name, "ok", f"{free} of {len(DOMAINS)}, with their UDP ports{which}", free)
+
+
+OF_SYSTEM = (
+    checks.check_python,
+    checks.check_cores,
+    checks.check_clock,
+    checks.check_open_files,
+    checks.check_processes,
+    checks.check_shared_memory,
+    checks.check_logs,
+    checks.check_temporary_directory,
+)
+OF_NETWORK = (
+    check_loopback,
+    check_multicast,
+    check_buffers,
+)
+OF_SHELL = (
+    checks.check_rclpy,
+    check_profiles,
+    check_range,
+    check_server,
+    check_peers,
+)
+LATER = (  # each with the checks that it needs to be without an error
+    ("middleware", checks.check_middleware, {"rclpy", "temporary_directory"}),
+    ("ros_domain_id", check_own_domain, {"temporary_directory"}),
+    ("free_domains", check_free_domains, {"temporary_directory"}),
+)
+
+
+def examine() -> Iterator[Check]:
+    """Make one check after the other; the last ones are not tried where an error before says more."""
+    failed: set[str] = set()
+    for check in (*OF_SYSTEM, *OF_NETWORK, *OF_SHELL):
+        found = check()
+        failed |= {found.name} if found.status == "error" else set()
+        yield found
+    for name, make, needed in LATER:
+        found = _not_tried(name) if needed & failed else make()
+        failed |= {found.name} if found.status == "error" else set()
+        yield found
+    yield _not_tried("round_trip") if failed else check_round_trip()
+
+
+def _not_tried(name: str) -> Check:
+    return Check(name, "warning", "not tried: correct the errors above first")

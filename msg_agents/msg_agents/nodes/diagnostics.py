@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Health of the nodes, on /diagnostics for any ROS 2 monitor and in the status file of the process."""
 
@@ -23,12 +12,10 @@ from pathlib import Path
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
-from msg_agents.nodes.ros.lean_node import LeanNode
-from msg_agents.nodes.ros.rclpy_error import until_shutdown
-from msg_agents.nodes.ros.timers import every
-from msg_agents.processes.status_file import write_account
-from msg_analysis.wire.refusals import Refusal
-from msg_analysis.wire.topics import DIAGNOSTICS
+from msg_agents.nodes.ros import LeanNode, every, until_shutdown
+from msg_agents.run.result import write_account
+from msg_analysis.messages.acceptance import Refusal
+from msg_analysis.messages.topics import DIAGNOSTICS
 
 DIAGNOSTICS_PERIOD = 1.0  # s
 CLOCK_BOUND = "clock ahead of the switcher's by at most [ms]"  # a value of agents in real time

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Actions of ``launch`` for the decisions of ``running/launch_support.py``. Only the launch files import this."""
 
@@ -39,8 +28,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.substitutions import ExecutableInPackage
 
-from msg_agents.running.launch_arguments import check_names, flag
-from msg_agents.running.launch_support import ANALYSIS, LaunchedProcesses, LaunchFailedError, environment
+from msg_agents.run.launch import ANALYSIS, LaunchedProcesses, LaunchFailedError, check_names, environment, flag
 
 GRACE = 20.0  # s that a process has to end
 

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The recorder node: writes every message of the run, unchanged, into an MCAP bag."""
 
@@ -25,17 +14,17 @@ from pathlib import Path
 
 import numpy as np
 
+from msg_agents.nodes.base import NOT_AN_AGENT, NetworkNode
 from msg_agents.nodes.diagnostics import Health
-from msg_agents.nodes.network_node import NOT_AN_AGENT, NetworkNode
-from msg_agents.nodes.ros.timers import every
+from msg_agents.nodes.ros import every
 from msg_agents.stepping.state_receiver import StateReceiver
-from msg_analysis.bags.format.storage_options import DEFAULT_STORAGE, Storage
-from msg_analysis.bags.writer import BagWriter
+from msg_analysis.bags.mcap_chunks import DEFAULT_STORAGE, Storage
+from msg_analysis.bags.writing import BagWriter
 from msg_analysis.errors import BagError
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.wire import topics
-from msg_analysis.wire.refusals import Refusal
-from msg_analysis.wire.topics import Topic, agent_name, network_topics
+from msg_analysis.messages import topics
+from msg_analysis.messages.acceptance import Refusal
+from msg_analysis.messages.topics import Topic, agent_node_name, network_topics
+from msg_analysis.model.run_record import RunRecord
 
 LEAST_WRITE, MOST_WRITE = 2**15, 2**20
 """Bytes of states after which they are written: 16 kB for each agent, within these bounds. Many at once cost a fraction
@@ -102,7 +91,7 @@ class Recorder(NetworkNode):
 
     def _look_for_others(self) -> None:
         """Read the agents' own topics, too, as soon as another node publishes there: a player has no batches."""
-        first = agent_name(0)
+        first = agent_node_name(0)
         for kind in () if self._reads_single else self._kinds:
             name = kind.of.of(0)
             if self.count_publishers(name):

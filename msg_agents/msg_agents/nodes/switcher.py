@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """The switcher node: publishes the experiment and the path of the active graph.
 
@@ -29,22 +18,21 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
+from msg_agents.nodes.base import ACK_TIMEOUT, NOT_AN_AGENT, NetworkNode
 from msg_agents.nodes.diagnostics import CLOCK_BOUND, Health
-from msg_agents.nodes.network_node import ACK_TIMEOUT, NOT_AN_AGENT, NetworkNode
-from msg_agents.nodes.ros.timers import DueTimer, every
-from msg_agents.processes.process_plan import RECORDER, SWITCHER
-from msg_agents.recovery.stop_files import StopFiles
-from msg_agents.stepping.clock_offsets import MILLISECOND, ClockOffsets
-from msg_agents.stepping.realtime_schedule import Schedule
+from msg_agents.nodes.ros import DueTimer, every
+from msg_agents.process_layout import RECORDER, SWITCHER
+from msg_agents.recovery import StopFiles
+from msg_agents.stepping.newest_values import MILLISECOND, ClockOffsets, Schedule
 from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW
-from msg_analysis.model.arithmetic.step_clock import SECOND
-from msg_analysis.model.run.graph_path import Sojourn, sojourns
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.step.step_model import Wiring
-from msg_analysis.wire import topics
-from msg_analysis.wire.messages import encode_string
-from msg_analysis.wire.refusals import Refusal
-from msg_analysis.wire.topics import agent_name
+from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.messages import topics
+from msg_analysis.messages.acceptance import Refusal
+from msg_analysis.messages.messages import encode_string
+from msg_analysis.messages.topics import agent_node_name
+from msg_analysis.model.graph_path import Sojourn, sojourns
+from msg_analysis.model.run_record import RunRecord
+from msg_analysis.model.step_model import Wiring
 
 MOST_AHEAD = 1000
 """Sojourns that are published before the slowest agent reaches them: enough that no agent waits for one; bounded, so
@@ -97,7 +85,7 @@ class Switcher(NetworkNode):
         self._mark = checkpoints and checkpoints / f"switcher.{record.run}"
         if self._mark and self._mark.exists():  # in the middle of a run, none of the user's nodes is awaited
             readers = [name for name in readers if name == RECORDER]
-        self._expected = [agent_name(i) for i in range(model.agents)] + readers
+        self._expected = [agent_node_name(i) for i in range(model.agents)] + readers
         self._experiment = self.publisher_of(topics.EXPERIMENT)
         self._graph = self.publisher_of(topics.GRAPH)
         self._end = self.publisher_of(topics.END)
@@ -121,7 +109,7 @@ class Switcher(NetworkNode):
         self._check_names()
         values = {"step of the slowest agent": str(self._slowest)}
         if self._slowest < 0:
-            silent = [agent_name(i) for i, step in enumerate(self._reached) if step < 0]
+            silent = [agent_node_name(i) for i, step in enumerate(self._reached) if step < 0]
             return Health(f"waiting for {', '.join(silent)}", waiting=True, values=values)
         return self._health(values)
 

@@ -1,18 +1,13 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
-"""What an agent uses in real time: the newest values it has. No ROS, no arithmetic, no clock.
+"""How far the clocks of other hosts are from ours, from the times of messages in both directions.
+
+A message sent at time s of its sender's clock and received at time r of ours has taken r - s plus how far the sender's
+clock is ahead, which is not negative: so r - s bounds the offset from one side, and the same of the other direction
+from the other. The fastest messages bound it best.
+
+What an agent uses in real time: the newest values it has. No ROS, no arithmetic, no clock.
 
 The agent makes each step when it is due: with the newest graph that it knows and the newest value that it has of every
 neighbour under that graph. Nothing waits, so nothing is buffered.
@@ -20,12 +15,114 @@ neighbour under that graph. Nothing waits, so nothing is buffered.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf
 from typing import Any
 
-from msg_agents.stepping.agent_inputs import NOTHING, AgentInputs, Value
-from msg_analysis.wire.refusals import Refusal
+from msg_agents.stepping.synchronizer import NOTHING, AgentInputs, Value
+from msg_analysis.arithmetic.step_clock import SECOND, StepClock
+from msg_analysis.messages.acceptance import Refusal
+
+MILLISECOND = 1e6  # ns
+
+
+@dataclass(slots=True)
+class Offset:
+    """How far another clock is ahead of ours is between these [ns]; infinite: no message in that direction yet."""
+
+    low: float = -inf
+    high: float = inf
+
+    @property
+    def least(self) -> float:
+        """The smallest distance of the clocks that is possible [ns]."""
+        return max(self.low, -self.high, 0.0)
+
+
+class ClockOffsets:
+    """Of the clocks of some nodes, by name."""
+
+    def __init__(self) -> None:
+        self._offsets: dict[str, Offset] = {}
+
+    def hear(self, node: str, sent: int, received: int, at_most: float = inf) -> None:
+        """A message that a node sent at ``sent`` of its clock came at ``received`` of ours.
+
+        ``at_most``: how far its clock is ahead at most, by what it has heard from here; all in ns.
+        """
+        offset = self._offsets.setdefault(node, Offset())
+        offset.low = max(offset.low, float(sent - received))
+        offset.high = min(offset.high, at_most)
+
+    def warning(self, limit: float) -> str | None:
+        """Which clocks are certainly more than ``limit`` [ns] from ours, and how far; None: none is."""
+        apart = {node: offset for node, offset in self._offsets.items() if offset.least > limit}
+        if not apart:
+            return None
+        worst = max(apart, key=lambda node: apart[node].least)
+        ahead = "ahead of" if apart[worst].low > 0 else "behind"
+        return (
+            f"the clocks of {', '.join(sorted(apart))} are not that of the switcher: {worst} is at least "
+            f"{apart[worst].least / MILLISECOND:.1f} ms {ahead} it, more than dt / speed = {limit / MILLISECOND:g} ms: "
+            "synchronise the hosts (NTP, PTP)"
+        )
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """How far each clock is ahead of ours [ms], for JSON; None: not bounded on that side."""
+        return [
+            {"node": node, "ahead_ms": [_milliseconds(offset.low), _milliseconds(offset.high)]}
+            for node, offset in sorted(self._offsets.items())
+        ]
+
+
+def _milliseconds(value: float) -> float | None:
+    return None if abs(value) == inf else value / MILLISECOND
+
+
+CLOCK_MARGIN = 1.0
+"""s of the clock by which the clock of another host, or a message from there, may be ahead of ours."""
+
+
+class Schedule:
+    """Simulated time on a clock, and the steps of one agent in it.
+
+    Step k, from x(k) to x(k+1), is due at simulated time (k + phase) dt, 0 <= phase < 1: see ``StepClock``.
+    """
+
+    def __init__(self, *, epoch: int, speed: float, step_length: float, phase: float = 0.0) -> None:
+        self.epoch = epoch  # time of the clock [ns] at which simulated time is 0
+        self._speed = speed  # units of simulated time per second of the clock
+        self._steps = StepClock(step_length, phase)
+        self._dt, self._phase = self._steps.step_ns, phase
+
+    def simulated(self, now: int) -> int:
+        """Simulated time [ns] when the clock says ``now`` [ns]; negative before the epoch."""
+        return math.floor((now - self.epoch) * self._speed)
+
+    def due(self, step: int) -> int:
+        """Simulated time [ns] at which a step is due."""
+        return self._steps.nanoseconds(step)
+
+    def clock_time(self, step: int) -> int:
+        """Time of the clock [ns] at which a step is due, rounded up."""
+        return self.epoch + math.ceil(self.due(step) / self._speed)
+
+    def next_step(self, now: int, *, after: int = 0) -> int:
+        """The first step, from ``after`` on, that is not yet due when the clock says ``now`` [ns]."""
+        simulated = self.simulated(now)
+        step = max(after, math.floor(simulated / self._dt - self._phase))
+        while step > after and self.due(step - 1) > simulated:  # rounding
+            step -= 1
+        while self.due(step) <= simulated:
+            step += 1
+        return step
+
+    def reach(self, now: int) -> int:
+        """Newest state that any agent can have when the clock says ``now`` [ns], if clocks agree to the margin."""
+        return max(0, math.floor(self.simulated(now + round(CLOCK_MARGIN * SECOND)) / self._dt) + 1)
 
 
 class NewestValues(AgentInputs[Value]):

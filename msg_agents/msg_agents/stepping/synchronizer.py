@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """When an agent may make its next step: the distributed lockstep. No ROS, no arithmetic.
 
@@ -22,14 +11,107 @@ the agent that is furthest behind is ahead of none, and all that it waits for ha
 
 from __future__ import annotations
 
+import time
+from array import array
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
-from typing import Any, Self
+from typing import Any, Generic, Protocol, Self, TypeVar
 
-from msg_agents.stepping.agent_inputs import AgentInputs, Value
-from msg_analysis.wire.refusals import Refusal
+import numpy as np
+
+from msg_analysis.common.arrays import IntArray
+from msg_analysis.messages.acceptance import Refusal
+
+Value = TypeVar("Value")
+NOTHING = -1  # in place of a step: no state received yet
+
+
+class AgentInputs(Generic[Value]):
+    """Steps count from 0; x(0) is the start, the run ends at x(steps). Agents count from 0, in texts from 1."""
+
+    def __init__(
+        self,
+        *,
+        agent: int,
+        steps: int,  # N
+        inputs: Sequence[Sequence[int]],  # per mode, the other agents that the agent's row uses, ascending
+        peers: Collection[int],  # every other agent that it ever hears or is heard by; includes ``inputs``
+        start: int = 0,  # the current step, after a takeover
+    ) -> None:
+        self.agent, self.step, self.steps = agent, start, steps
+        self._inputs = [tuple(row) for row in inputs]
+        self._newest = dict.fromkeys(sorted(peers), NOTHING)  # newest step received of each peer
+        missing = {j for row in inputs for j in row} - self._newest.keys()
+        if missing:
+            raise ValueError(f"agent {agent} uses {sorted(missing)}, which are not among its peers {sorted(peers)}")
+
+    def end_at(self, steps: int) -> None:
+        """The run ends early, at x(steps); not before the current step."""
+        self.steps = max(steps, self.step)
+
+    @property
+    def finished(self) -> bool:
+        """Whether x(steps) has been reached."""
+        return self.step >= self.steps
+
+
+TURN_SLICE = 0.02
+"""s of steps without a break, after which the executor gets its turn: messages, timers, signals."""
+
+
+class Member(Protocol):
+    """What takes turns."""
+
+    def advance(self) -> None:
+        """Make every step that can be made now."""
+
+
+class TurnQueue:
+    """Gives turns in the order in which they were asked for, once all ``members`` (a number) have joined.
+
+    A step of one agent lets others step, and theirs others again: the queue replaces nested calls, which would go as
+    deep as the run is long.
+    """
+
+    def __init__(
+        self,
+        members: int,
+        defer: Callable[[Callable[[], None]], object],  # runs a callback after what is already waiting in the executor
+        after: Callable[[], None] = lambda: None,  # is called when turns have been given
+    ) -> None:
+        self._absent = members
+        self._defer = defer
+        self._after = after
+        self._queue: deque[Member] = deque()
+        self._given = True  # turns are being given, or will be: ``ask`` need not start that
+
+    def join(self, member: Member) -> None:
+        """Add a member, which gets a turn as soon as all have joined: before, some may not be ready for messages."""
+        self._absent -= 1
+        self._queue.append(member)
+        if not self._absent:
+            self._give()
+
+    def ask(self, member: Member) -> None:
+        """Get a turn: now, or after the members that asked before."""
+        self._queue.append(member)
+        if not self._given:
+            self._give()
+
+    def _give(self) -> None:
+        self._given = True
+        queue, until = self._queue, time.monotonic() + TURN_SLICE
+        while queue:
+            queue.popleft().advance()
+            if time.monotonic() > until and queue:
+                self._after()
+                self._defer(self._give)
+                return
+        self._after()
+        self._given = False
+
 
 LOCKSTEP_WINDOW = 64
 """Steps that an agent may be ahead of a peer; small enough for a burst to fit a socket's receive buffer."""
@@ -225,3 +307,84 @@ class Synchronizer(AgentInputs[Value]):
         """Most values held of any one peer for steps to come; never more than window + 2."""
         to_come = [self._row(self.step + ahead) for ahead in range(self._window + 2)]
         return max((sum(value is not None for value in values) for values in zip(*to_come, strict=True)), default=0)
+
+
+_MASK = 0x3FFFFFFF  # of the bits of a content that are in its mark
+CONSECUTIVE = 64
+"""Steps in a row after which those before them are taken for lost: the reader came late, for example."""
+
+
+def marks_of(contents: IntArray) -> array[int]:
+    """Marks of so many contents: numbers of 30 bits, not 0."""
+    return array("i", ((contents & _MASK) + 1).astype(np.int32).tobytes())
+
+
+class ReceivedSteps:
+    """The steps 0 to ``last`` of one agent, in any order: after a restart some come again.
+
+    A mark of 4 bytes per step tells whether a repeated one is the same, up to RESEND_LIMIT steps before and after
+    ``row``, the newest step up to which none is to come any more.
+    """
+
+    def __init__(self, last: int) -> None:
+        self.row = -1
+        self._last = last
+        self._chain = (0, 0)  # the step that would continue the newest ones beyond ``row``, and how many these are
+        # 0: not received. Negative: two different ones were.
+        self._marks = array("i", bytes(4 * min(2 * RESEND_LIMIT, last + 1)))
+
+    def take(self, step: int, content: int) -> str | None:
+        """Take a step with a hash of its content; None if it is new, else a ``Refusal``.
+
+        Of two different ones of one step, the second is a contradiction; further ones count as repeated.
+        """
+        if step > self._last:
+            return Refusal.OUT_OF_RANGE
+        if step <= self.row - RESEND_LIMIT:
+            return Refusal.TOO_OLD
+        if step > self.row + 1:
+            following, count = self._chain
+            self._chain = (step + 1, count + 1 if step == following else 1)
+            if self._chain[1] >= CONSECUTIVE:
+                self._move(step - 1)
+        if step > self.row + RESEND_LIMIT:
+            return Refusal.TOO_NEW
+        slot, mark = step % len(self._marks), (content & _MASK) + 1
+        known = self._marks[slot]
+        if not known:
+            self._marks[slot] = mark
+            while self.row < self._last and self._marks[(self.row + 1) % len(self._marks)]:
+                self._move(self.row + 1)
+            return None
+        if known == mark or known < 0:
+            return Refusal.REPEATED
+        self._marks[slot] = -known
+        return Refusal.CONTRADICTION
+
+    def take_row(self, first: int, marks: array[int]) -> bool:
+        """Take the steps from ``first`` on at once, if they follow ``row`` and all are new; else False, and none."""
+        size, last = len(self._marks), first + len(marks) - 1
+        slot = first % size
+        end = slot + len(marks)
+        if first != self.row + 1 or last > self._last or end > size or any(self._marks[slot:end]):
+            return False
+        self._marks[slot:end] = marks
+        self._move(last)
+        while self.row < self._last and self._marks[(self.row + 1) % size]:
+            self._move(self.row + 1)
+        return True
+
+    def _move(self, row: int) -> None:
+        """Set ``row``; the steps that are then within reach take the places of old ones."""
+        size = len(self._marks)
+        step = max(self.row, row - size) + RESEND_LIMIT + 1
+        end = min(row + RESEND_LIMIT, self._last) + 1
+        if end - step == 1:  # in order, one after the other
+            self._marks[step % size] = 0
+            step = end
+        while step < end:
+            slot = step % size
+            count = min(end - step, size - slot)
+            self._marks[slot : slot + count] = array("i", bytes(4 * count))
+            step += count
+        self.row = row

@@ -13,7 +13,7 @@ import yaml
 
 from msg_agents.channel.channel_file import BASE, Channel, ChannelSpec, PairSpec, TwoStates, json_schema
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
 
 ROOT = Path(__file__).parents[3]
 TWO = {"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}}

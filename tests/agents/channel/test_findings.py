@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from msg_agents.channel.findings import channel_findings
-from msg_analysis.inference.realtime.unheard import UnheardMessages
+from msg_agents.channel.process import channel_findings
+from msg_analysis.inference.messages import UnheardMessages
 
 
 def pair(sender: str, receiver: str, **changes: Any) -> dict[str, Any]:

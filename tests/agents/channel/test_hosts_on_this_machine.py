@@ -14,11 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_agents.channel.active_graph import ActiveGraphFile
 from msg_agents.channel.channel_file import Channel
-from msg_agents.channel.counts import read_counts
-from msg_agents.channel.forwarding import destinations
-from msg_agents.channel.link import LinkSettings, LossModel
+from msg_agents.channel.links import ActiveGraphFile, LinkSettings, LossModel, destinations, read_counts
 from msg_agents.channel.namespaces import Host, enter, host_address, open_hosts
 from msg_agents.channel.process import hand_over, serve
 from msg_analysis.errors import NotAvailableError

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from msg_agents.channel.link import Fate, Link, LinkSettings, LossModel
+from msg_agents.channel.links import Fate, Link, LinkSettings, LossModel
 
 PACKETS = 100_000
 LEVEL = 1e-6  # false-alarm rate of each statistical test; the seeds are fixed, so it does not change from run to run

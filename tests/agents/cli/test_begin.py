@@ -16,8 +16,8 @@ from terminal import Terminal
 pytest.importorskip("rclpy")
 
 from msg_agents.cli.main import main
-from msg_analysis.examples.bundled import names, text_of
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.examples import names, text_of
+from msg_analysis.experiment.experiment import ValidExperiment
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 

@@ -21,8 +21,8 @@ pytest.importorskip("rclpy")
 
 
 from msg_agents.cli.main import main
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import new_record, simulate
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")

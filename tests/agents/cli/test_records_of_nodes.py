@@ -11,7 +11,7 @@ import pytest
 from msg_agents.cli import nodes
 from msg_agents.cli.nodes import load_record, read_record_ahead
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import new_record
 
 

@@ -13,11 +13,10 @@ from contextlib import ExitStack
 
 import pytest
 
-from msg_agents.discovery import introducer
-from msg_agents.discovery.introducer import Introducer, write_introduction
+from msg_agents.discovery import relay
 from msg_agents.discovery.profiles import FIRST_INTRODUCED
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.discovery.rtps import discovery_port, disposal_message, read_announcement
+from msg_agents.discovery.relay import Introducer, write_introduction
+from msg_agents.discovery.rtps import discovery_port, disposal_message, free_domain, read_announcement
 
 QUIET = 0.2  # s in which nothing comes
 PARTNERS = {"agent_1": {"agent_2", "switcher"}, "agent_2": {"agent_1", "switcher"}, "agent_3": {"switcher"}}
@@ -144,7 +143,7 @@ def test_visitors_are_introduced_to_all(meeting: Introducer, crowd: list[Partici
 
 def test_visitors_are_asked_to_announce_themselves(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Again and again, until the run ends, by a participant of the same machine that listens where processes do."""
-    monkeypatch.setattr(introducer, "PERIOD", 0.0)
+    monkeypatch.setattr(relay, "PERIOD", 0.0)
     with ExitStack() as stack:
         with Introducer(domain) as meeting:
             meeting.introduce(PARTNERS)
@@ -195,7 +194,7 @@ def test_strangers_among_the_numbers_of_the_run(
     report(meeting, "agent_1", one)
     stranger.announce()
     one.hears()
-    monkeypatch.setattr(introducer, "PATIENCE", 0.0)
+    monkeypatch.setattr(relay, "PATIENCE", 0.0)
     stranger.announce()
     one.hears(stranger)
 
@@ -212,7 +211,7 @@ def test_announcements_are_repeated(
     one.hears(two)
     two.announce()
     one.hears()
-    monkeypatch.setattr(introducer, "REPEAT", 0.0)
+    monkeypatch.setattr(relay, "REPEAT", 0.0)
     two.announce()
     one.hears(two)
 
@@ -232,8 +231,8 @@ def test_the_dead_are_not_introduced(
     visitor.announce()
     three.hears(visitor)
     two.hears()
-    monkeypatch.setattr(introducer, "FRESH", 0.0)
-    monkeypatch.setattr(introducer, "REPEAT", 0.0)
+    monkeypatch.setattr(relay, "FRESH", 0.0)
+    monkeypatch.setattr(relay, "REPEAT", 0.0)
     visitor.announce()
     three.hears()
     visitor.socket.close()
@@ -254,7 +253,7 @@ def test_noise_does_no_harm(meeting: Introducer, crowd: list[Participant], noise
 def test_not_more_is_remembered_than_needed(
     meeting: Introducer, crowd: list[Participant], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(introducer, "MOST_KNOWN", 2)
+    monkeypatch.setattr(relay, "MOST_KNOWN", 2)
     for each in crowd:
         each.announce()
     wanted, end = {each.prefix for each in crowd[2:]}, time.monotonic() + 10

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from msg_agents.discovery.multicast import LOOPBACK_INTERFACES, announce_here
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.discovery.rtps import GROUP, multicast_port
+from msg_agents.discovery.rtps import GROUP, LOOPBACK_INTERFACES, announce_here, free_domain, multicast_port
 
 IP_RECVTTL = 12  # Linux
 

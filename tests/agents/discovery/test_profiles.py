@@ -21,9 +21,9 @@ from msg_agents.discovery.profiles import (
     has_profile_for,
     profile_for_hosts,
 )
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import node_environment, profile_variables
-from msg_analysis.wire.topics import STATES, TRUTHS
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment, profile_variables
+from msg_analysis.messages.topics import STATES, TRUTHS
 
 OLD, NEW = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
 FOLDER = Path(profiles.__file__).parent
@@ -150,7 +150,7 @@ def test_so_many_batches_wait_for_a_reader_that_takes_none(monkeypatch: pytest.M
             reader.stdout.readline()
             writer = subprocess.run([*command, "writer"], env=environment, capture_output=True, text=True, check=True)
             reader.stdin.close()
-    from msg_agents.nodes.agents.state_batches import BATCH_SIZE
+    from msg_agents.nodes.agent_group import BATCH_SIZE
 
     kept = int(writer.stdout)
     assert kept == 2 * 680

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from msg_agents.discovery import ros_domain
-from msg_agents.discovery.ros_domain import PORT_BASE, PORTS_PER_DOMAIN, free_domain, held_domains
+from msg_agents.discovery import rtps
+from msg_agents.discovery.rtps import PORT_BASE, PORTS_PER_DOMAIN, free_domain, held_domains
 from msg_analysis.errors import InputError
 
 HOLD = """
@@ -53,7 +53,7 @@ def holder(domains: range, directory: Path) -> Iterator[tuple[subprocess.Popen[s
 
 def test_holders_get_different_domains(reserved: range, monkeypatch: pytest.MonkeyPatch) -> None:
     domains = reserved[:3]
-    monkeypatch.setattr(ros_domain, "DOMAINS", domains)
+    monkeypatch.setattr(rtps, "DOMAINS", domains)
     with ExitStack() as stack:
         assert {stack.enter_context(free_domain()) for _ in domains} == set(domains)
         with pytest.raises(InputError, match="--domain"), free_domain():
@@ -66,7 +66,7 @@ def test_a_killed_holder_gives_its_domain_back(
     reserved: range, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     domains = reserved[:1]
-    monkeypatch.setattr(ros_domain, "DOMAINS", domains)
+    monkeypatch.setattr(rtps, "DOMAINS", domains)
     with holder(domains, tmp_path) as (process, held):
         assert held == domains[0]
         with pytest.raises(InputError), free_domain():
@@ -85,7 +85,7 @@ def test_a_domain_whose_ports_are_in_use_is_left_alone(
     reserved: range, monkeypatch: pytest.MonkeyPatch, family: socket.AddressFamily
 ) -> None:
     domains = reserved[:2]
-    monkeypatch.setattr(ros_domain, "DOMAINS", domains)
+    monkeypatch.setattr(rtps, "DOMAINS", domains)
     with socket.socket(family, socket.SOCK_DGRAM) as somebody:
         try:
             somebody.bind(("::1" if family == socket.AF_INET6 else "127.0.0.1", _port(domains[0], 11)))
@@ -97,7 +97,7 @@ def test_a_domain_whose_ports_are_in_use_is_left_alone(
 
 
 def test_the_lock_is_released_when_the_run_fails(reserved: range, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ros_domain, "DOMAINS", reserved[:1])
+    monkeypatch.setattr(rtps, "DOMAINS", reserved[:1])
     for _ in range(2):
         with pytest.raises(RuntimeError, match="the run failed"), free_domain():
             raise RuntimeError("the run failed")
@@ -110,7 +110,7 @@ def test_lock_files_of_another_user_do_not_use_up_the_domains(
     shared = Path(tempfile.mkdtemp(dir="/tmp"))  # pytest's own directories are closed to others
     request.addfinalizer(lambda: shutil.rmtree(shared))
     monkeypatch.setattr(tempfile, "gettempdir", lambda: str(shared))
-    monkeypatch.setattr(ros_domain, "DOMAINS", reserved[:1])
+    monkeypatch.setattr(rtps, "DOMAINS", reserved[:1])
     shared.chmod(0o1777)  # as /tmp is; Linux guards files of others in such directories
     with free_domain() as held:
         pass

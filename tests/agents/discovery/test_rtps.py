@@ -17,18 +17,20 @@ from hypothesis import strategies as st
 pytest.importorskip("rclpy")
 
 from msg_agents.discovery.profiles import FIRST_INTRODUCED, INTRODUCED_PROFILE, MOST_INTRODUCED, domains_for
-from msg_agents.discovery.ros_domain import PORT_BASE, PORTS_PER_DOMAIN, free_domain
 from msg_agents.discovery.rtps import (
     PEERS_VARIABLE,
+    PORT_BASE,
+    PORTS_PER_DOMAIN,
     Announcement,
     announcement_message,
     discovery_port,
     discovery_ports,
     disposal_message,
+    free_domain,
     read_announcement,
     remove_participant,
 )
-from msg_agents.processes.environment import LAST_DOMAIN, node_environment
+from msg_agents.environment import LAST_DOMAIN, node_environment
 
 PREFIX = bytes(range(1, 13))
 HEADER = bytes.fromhex("52545053 0203 010f 0102030405060708090a0b0c")

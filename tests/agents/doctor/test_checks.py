@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from msg_agents.discovery.ros_domain import PORT_BASE, PORTS_PER_DOMAIN, free_domain
-from msg_agents.doctor import discovery_checks, network_checks, ros_checks, system_checks
-from msg_agents.doctor.check import Check
-from msg_agents.processes.shared_memory import require_shared_memory
+from msg_agents.discovery.rtps import PORT_BASE, PORTS_PER_DOMAIN, free_domain
+from msg_agents.doctor import checks, network_checks
+from msg_agents.doctor import network_checks as discovery_checks
+from msg_agents.doctor.checks import Check
+from msg_agents.environment import require_shared_memory
 
 VARIABLES = (
     *discovery_checks.PROFILE_VARIABLES,
@@ -116,7 +117,7 @@ def test_open_files(limit: int, status: str) -> None:
         pytest.skip(f"this machine: at most {before[1]} open files")
     resource.setrlimit(resource.RLIMIT_NOFILE, (limit, before[1]))
     try:
-        found = system_checks.check_open_files()
+        found = checks.check_open_files()
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
     assert (found.status, found.value) == (status, limit)
@@ -125,21 +126,21 @@ def test_open_files(limit: int, status: str) -> None:
 
 def test_no_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert system_checks.check_logs().status == "ok"
+    assert checks.check_logs().status == "ok"
     monkeypatch.setenv("HOME", "/dev/null/home")
-    assert system_checks.check_logs().status == "warning"
+    assert checks.check_logs().status == "warning"
     monkeypatch.delenv("HOME")
-    assert "HOME: not set" in system_checks.check_logs().text
+    assert "HOME: not set" in checks.check_logs().text
     monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
-    assert system_checks.check_logs().status == "warning"
+    assert checks.check_logs().status == "warning"
 
 
 def test_no_rclpy() -> None:
     """In a Python that finds none, the error is that of a run."""
     code = (
         "import sys\n"
-        "from msg_agents.doctor.ros_checks import check_rclpy\n"
-        "from msg_agents.processes.middleware_check import require_middleware\n"
+        "from msg_agents.doctor.checks import check_rclpy\n"
+        "from msg_agents.environment import require_middleware\n"
         "sys.path[:] = []\n"
         "print(check_rclpy().status)\n"
         "print(check_rclpy().text)\n"
@@ -175,12 +176,12 @@ def test_another_rclpy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Of a sourced ROS that does not win."""
     pytest.importorskip("rclpy")
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
-    before = ros_checks.check_rclpy().text
+    before = checks.check_rclpy().text
     package = tmp_path / "lib/python3.9/site-packages/rclpy"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text("raise ImportError")
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"/nowhere:{tmp_path}")
-    found = ros_checks.check_rclpy()
+    found = checks.check_rclpy()
     assert found.status == "warning"
     assert str(package.resolve()) in found.text
     assert str(package.resolve()) not in before

@@ -14,11 +14,11 @@ import pytest
 from random_faults import Fault, FaultInjection, FaultPlan, Verdict, judge, plan_faults
 from waiting import state_of, wait_for
 
-from msg_agents.processes.environment import RESTARTS
-from msg_agents.running.run_result import RunResult
-from msg_agents.terminal.interruption import Interruption
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.trajectory import Trajectory
+from msg_agents.environment import RESTARTS
+from msg_agents.run.result import RunResult
+from msg_agents.terminal import Interruption
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.run import Trajectory
 from msg_analysis.twin.simulate import simulate
 
 AGENTS, STEPS = 3, 1000

@@ -10,7 +10,7 @@ import networkx as nx
 import pytest
 from random_networks import GRAPH_NAMES, MOST_AGENTS, random_document
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 
 SEEDS = range(300)
 

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from msg_agents.nodes.exit_timer import exit_after
+from msg_agents.nodes.base import exit_after
 
 HANGS = "ctypes.PyDLL(None).pause()"  # with the interpreter's lock held
 BEGIN = f"import atexit, ctypes, sys, time; from {exit_after.__module__} import exit_after; print('done');"

@@ -17,7 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from msg_agents_interfaces.msg import ActiveGraph, AgentState, Estimate
 from visualization_msgs.msg import MarkerArray
 
-from msg_analysis.wire import topics
+from msg_analysis.messages import topics
 
 LAYOUT = Path(__file__).parents[3] / "ros_ws/src/msg_agents_bringup/foxglove/five_agents.json"
 TOPICS: dict[str, Any] = {

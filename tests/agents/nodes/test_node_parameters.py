@@ -17,12 +17,12 @@ pytest.importorskip("rclpy")
 
 import click
 
+from msg_agents.cli.entry_points import RosCommand, split_arguments
 from msg_agents.cli.main import main
-from msg_agents.cli.ros_command import RosCommand, split_arguments
-from msg_agents.cli.servers.node_server import MODULES as NODE_MODULES
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.nodes.ros.node_parameters import describe, name_of, options_of
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_agents.cli.node_server import MODULES as NODE_MODULES
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.nodes.parameters import describe, name_of, options_of
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import new_record
 
 BIN = Path(sys.executable).parent
@@ -161,11 +161,11 @@ def test_nodes_keep_their_names(run_file: Path, tmp_path: Path, rule: str) -> No
 QOS = """
 import sys
 import rclpy
-from msg_agents.nodes.ros.node_parameters import PROCESS
-from msg_agents.nodes.ros.qos import ros_profile
-from msg_agents.nodes.ros.lean_node import LeanNode
+from msg_agents.nodes.parameters import PROCESS
+from msg_agents.nodes.ros import ros_profile
+from msg_agents.nodes.ros import LeanNode
 from msg_analysis.errors import InputError
-from msg_analysis.wire import topics
+from msg_analysis.messages import topics
 from std_msgs.msg import String
 rclpy.init(args=sys.argv)
 PROCESS.qos_overrides = True

@@ -13,11 +13,10 @@ import rclpy
 from rclpy.node import Node
 from waiting import record_of_two, wait_for
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.nodes.network_node import NetworkNode
-from msg_agents.nodes.peer_presence import PeerPresence, PeersLostError
-from msg_agents.processes.environment import node_environment
-from msg_analysis.model.run.record import RunRecord
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
+from msg_agents.nodes.base import NetworkNode, PeerPresence, PeersLostError
+from msg_analysis.model.run_record import RunRecord
 
 pytestmark = pytest.mark.filterwarnings("ignore:module .sre_:DeprecationWarning")  # of a package that rclpy imports
 

@@ -18,18 +18,17 @@ pytest.importorskip("rclpy")
 
 import rclpy
 
-from msg_agents.discovery.ros_domain import free_domain
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
 from msg_agents.nodes.recorder import Recorder, write_size
-from msg_agents.processes.environment import node_environment
-from msg_agents.stepping.received_steps import ReceivedSteps
 from msg_agents.stepping.state_receiver import StateReceiver
-from msg_agents.stepping.synchronizer import RESEND_LIMIT
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.graph_path import Sojourn
+from msg_agents.stepping.synchronizer import RESEND_LIMIT, ReceivedSteps
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.messages.acceptance import Refusal
+from msg_analysis.messages.cdr import encode_batch
+from msg_analysis.messages.messages import StateCodec
+from msg_analysis.model.graph_path import Sojourn
 from msg_analysis.twin.simulate import new_record
-from msg_analysis.wire.messages import StateCodec
-from msg_analysis.wire.refusals import Refusal
-from msg_analysis.wire.state_batches import encode_batch
 
 pytestmark = pytest.mark.filterwarnings("ignore:module .sre_:DeprecationWarning")  # of a package that rclpy imports
 AGENTS, DT = 2, 0.05

@@ -10,9 +10,8 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_agents.processes.core_pinning import keep_to, place
-from msg_agents.processes.process_plan import RECORDER, SWITCHER, ProcessPlan
-from msg_analysis.common.cores import available_cores
+from msg_agents.process_layout import RECORDER, SWITCHER, ProcessPlan, keep_to, place
+from msg_analysis.common.resources import available_cores
 
 
 def plans(agents: int, processes: int, *, recorder: bool) -> list[ProcessPlan]:

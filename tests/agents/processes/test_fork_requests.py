@@ -8,7 +8,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_agents.processes.fork_server import LONGEST, MOST_DESCRIPTORS, NodeStart, _messages
+from msg_agents.run.fork_server import LONGEST, MOST_DESCRIPTORS, NodeStart, _messages
 
 NODES = st.lists(
     st.tuples(st.integers(0, 9000), st.lists(st.integers(3, 400), unique=True, min_size=1, max_size=5)), max_size=80

@@ -16,11 +16,10 @@ pytest.importorskip("rclpy")
 
 from waiting import gone, participants, record_of_two, wait_for
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import LONGEST_TITLE, ForkedProcess, NodeServer, NodeStart
-from msg_agents.processes.middleware_check import require_middleware
-from msg_analysis.common.cores import available_cores
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment, require_middleware
+from msg_agents.run.fork_server import LONGEST_TITLE, ForkedProcess, NodeServer, NodeStart
+from msg_analysis.common.resources import available_cores
 from msg_analysis.errors import InputError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="this machine: not Linux")
@@ -163,8 +162,8 @@ def test_a_fork_server_that_cannot_import(tmp_path: Path) -> None:
 PARENT = """
 import sys, time
 from pathlib import Path
-from msg_agents.processes.environment import node_environment
-from msg_agents.processes.fork_server import NodeServer, NodeStart
+from msg_agents.environment import node_environment
+from msg_agents.run.fork_server import NodeServer, NodeStart
 log = Path(sys.argv[1])
 with NodeServer(node_environment(0), log / "server.log") as server, (log / "log").open("w") as output:
     (process,) = server.fork_nodes([NodeStart(["agent", "--help"], {}, output.fileno(), None)])
@@ -191,7 +190,7 @@ def run():
     %s
 """
 FORKED = """
-from msg_agents.processes.fork_server import run_and_end
+from msg_agents.run.fork_server import run_and_end
 if hasattr(ctypes.CDLL(None), "on_exit"):  # the C library of GNU
     ctypes.CDLL(None).on_exit(ctypes.CDLL(None).abort, None)  # as a library that crashes at its end
 pid = os.fork()

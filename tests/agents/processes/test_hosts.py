@@ -11,10 +11,9 @@ import pytest
 
 from msg_agents.discovery.profiles import PROFILE_VARIABLES
 from msg_agents.discovery.rtps import PEERS_VARIABLE
-from msg_agents.processes.hosts import Hosts
-from msg_agents.processes.process_plan import Share, plan_network
+from msg_agents.process_layout import Hosts, Share, plan_network
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 
 
 def experiment(agents: int = 5, processes: Any = "auto") -> ValidExperiment:

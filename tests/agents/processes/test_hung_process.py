@@ -13,8 +13,8 @@ import pytest
 from started_processes import started_processes
 from waiting import state_of, wait_for
 
-from msg_agents.processes import hung_process
-from msg_agents.processes.hung_process import LONGEST_LOOK, HungDetector
+from msg_agents.run import lifeline
+from msg_agents.run.lifeline import LONGEST_LOOK, HungDetector
 
 BLOCKED = "import threading; lock = threading.Lock(); lock.acquire(); print(flush=True); lock.acquire()"
 HELPED = (
@@ -44,7 +44,7 @@ def start() -> Iterator[Callable[[str], subprocess.Popen[str]]]:
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hung_process, "HUNG", HUNG)
+    monkeypatch.setattr(lifeline, "HUNG", HUNG)
 
 
 def looks(detector: HungDetector, seconds: float) -> bool:
@@ -80,10 +80,10 @@ def test_stopped_and_gone(start: Callable[[str], subprocess.Popen[str]]) -> None
 def test_neither_a_sleep_of_ours_nor_a_clock_that_is_set_back_counts(
     start: Callable[[str], subprocess.Popen[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hung_process, "HUNG", 60.0)
+    monkeypatch.setattr(lifeline, "HUNG", 60.0)
     clock = SimpleNamespace(now=100.0, wall=1e9)
     times = SimpleNamespace(monotonic=lambda: clock.now, time=lambda: clock.wall)
-    monkeypatch.setattr(hung_process, "time", times)
+    monkeypatch.setattr(lifeline, "time", times)
     process = start(BLOCKED)
     wait_for(lambda: state_of(process.pid) == "S")  # on a busy machine it may still run
     detector = HungDetector(process.pid)

@@ -13,19 +13,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_agents.processes.core_pinning import place
-from msg_agents.processes.environment import DISCOVERY_TIMEOUT
-from msg_agents.processes.process_plan import (
+from msg_agents.environment import DISCOVERY_TIMEOUT
+from msg_agents.process_layout import (
     MOST_PROCESSES,
     MOST_UNAIDED,
     RECORDER,
     ProcessPlan,
     count_processes,
     partners,
+    place,
     plan_network,
 )
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 
 
 def experiment(agents: int, processes: Any) -> ValidExperiment:

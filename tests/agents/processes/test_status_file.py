@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from msg_agents.processes.status_file import read_accounts, write_account
+from msg_agents.run.result import read_accounts, write_account
 
 
 def test_counts_add_up_and_the_latest_word_on_waiting_counts(tmp_path: Path) -> None:

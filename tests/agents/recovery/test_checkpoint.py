@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from waiting import wait_for
 
-from msg_agents.recovery.checkpoint import LEAST_KEPT, MARK, Checkpoint
+from msg_agents.recovery import LEAST_KEPT, MARK, Checkpoint
 from msg_analysis.errors import InputError
 
 LARGE = 100_000  # bytes of a message, so that the ring has its least length
@@ -60,7 +60,7 @@ def test_another_size_is_another_run(tmp_path: Path) -> None:
 WRITERS = """
 import os, sys
 from pathlib import Path
-from msg_agents.recovery.checkpoint import Checkpoint
+from msg_agents.recovery import Checkpoint
 for file in sys.argv[1:]:
     writer = os.fork()
     if writer:
@@ -94,7 +94,7 @@ def test_killed_in_the_middle_of_it(tmp_path: Path) -> None:
 def test_read_while_it_is_written(tmp_path: Path) -> None:
     """By another process, as the live panel does: a step whose mark stands before and after is whole."""
     code = (
-        "import sys; from pathlib import Path; from msg_agents.recovery.checkpoint import Checkpoint\n"
+        "import sys; from pathlib import Path; from msg_agents.recovery import Checkpoint\n"
         f"ring, step = Checkpoint(Path(sys.argv[1]), {LARGE}), 0\n"
         f"while True: ring.write(step, step.to_bytes(8, 'little') * ({LARGE} // 8)); step += 1"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import uuid
 from pathlib import Path
 
-from msg_agents.recovery.stop_files import StopFiles
+from msg_agents.recovery import StopFiles
 
 
 def test_a_request_and_its_answer_outlive_processes(tmp_path: Path) -> None:

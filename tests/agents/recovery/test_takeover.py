@@ -10,8 +10,8 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from msg_agents.recovery import takeover
-from msg_agents.recovery.takeover import take_over
+from msg_agents import recovery
+from msg_agents.recovery import take_over
 from msg_analysis.errors import InputError
 
 PREFIX = bytes(range(1, 13))
@@ -25,7 +25,7 @@ def run_and_die(directory: Path) -> None:
 
 def test_a_takeover_removes_the_process_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     removed: list[tuple[bytes, int]] = []
-    monkeypatch.setattr(takeover, "remove_participant", lambda prefix, domain: removed.append((prefix, domain)))
+    monkeypatch.setattr(recovery, "remove_participant", lambda prefix, domain: removed.append((prefix, domain)))
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
     before = multiprocessing.get_context("fork").Process(target=run_and_die, args=(tmp_path,))
     before.start()

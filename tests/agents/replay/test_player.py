@@ -6,10 +6,9 @@ import math
 
 import pytest
 
-from msg_agents.replay.bag_clock import BagClock
-from msg_agents.replay.topic_selection import parse_remaps, select_topics
+from msg_agents.replay import BagClock, parse_remaps, select_topics
+from msg_analysis.arithmetic.step_clock import SECOND
 from msg_analysis.errors import InputError
-from msg_analysis.model.arithmetic.step_clock import SECOND
 
 TOPICS = ["/experiment", "/graph", "/agent_1/state", "/agent_2/state", "/lab/agent_1/state"]
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from msg_agents.processes.status_file import Account
-from msg_agents.running.event_log import EventLog
+from msg_agents.run.result import Account, EventLog
 
 
 def test_events() -> None:

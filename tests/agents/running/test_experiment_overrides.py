@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from msg_agents.running.experiment_overrides import load_with_overrides
+from msg_agents.run.folder import load_with_overrides
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 
-FILE = Path(__file__).parents[3] / "analysis/msg_analysis/examples/experiments/line_ring.yaml"
+FILE = Path(__file__).parents[3] / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"
 
 
 def _changed(directory: Path, run: str) -> Path:

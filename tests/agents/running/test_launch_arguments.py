@@ -10,14 +10,14 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from msg_agents.running.launch_arguments import (
+from msg_agents.run.launch import (
     NETWORK_ARGUMENTS,
     REPLAY_ARGUMENTS,
+    LaunchedNetwork,
     bag_storage,
     check_names,
     player_options,
 )
-from msg_agents.running.launch_support import LaunchedNetwork
 from msg_analysis.errors import InputError
 
 BRINGUP = Path(__file__).parents[3] / "ros_ws/src/msg_agents_bringup"

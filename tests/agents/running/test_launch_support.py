@@ -10,11 +10,10 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from msg_agents.processes.process_plan import plan_network
-from msg_agents.running.launch_arguments import NETWORK_ARGUMENTS, REPLAY_ARGUMENTS
-from msg_agents.running.launch_support import ANALYSIS, LaunchedNetwork, LaunchedReplay
-from msg_agents.running.run_folder import PREFIX
-from msg_analysis.model.run.record import RunRecord
+from msg_agents.process_layout import plan_network
+from msg_agents.run.folder import PREFIX
+from msg_agents.run.launch import ANALYSIS, NETWORK_ARGUMENTS, REPLAY_ARGUMENTS, LaunchedNetwork, LaunchedReplay
+from msg_analysis.model.run_record import RunRecord
 
 DEFAULTS = {name: default for name, (default, _) in NETWORK_ARGUMENTS.items()}
 

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from msg_agents.channel.channel_file import Channel
-from msg_agents.running.run_channel import predicted_errors
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_agents.run.run_channel import predicted_errors
+from msg_analysis.experiment.experiment import ValidExperiment
 
 TWO_HOSTS = {"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}}
 

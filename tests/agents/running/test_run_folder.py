@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from msg_agents.running import run_folder as module
-from msg_agents.running.run_folder import PREFIX, YOUTH, workshop
+from msg_agents.run import folder as module
+from msg_agents.run.folder import PREFIX, YOUTH, workshop
 
 HOLD = """
 import sys, time
-from msg_agents.running.run_folder import workshop
+from msg_agents.run.folder import workshop
 with workshop() as folder:
     (folder / "run.json").write_text("{}")
     print(folder, flush=True)

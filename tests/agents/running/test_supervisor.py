@@ -17,12 +17,12 @@ pytest.importorskip("rclpy")
 
 from waiting import gone, participants, record_of_two, wait_for
 
-from msg_agents.discovery.ros_domain import free_domain
-from msg_agents.processes.environment import node_environment
-from msg_agents.processes.process_plan import ProcessPlan
-from msg_agents.running import supervisor as module
-from msg_agents.running.supervisor import Child, Supervisor
-from msg_analysis.common.exit_codes import ExitCode
+from msg_agents.discovery.rtps import free_domain
+from msg_agents.environment import node_environment
+from msg_agents.process_layout import ProcessPlan
+from msg_agents.run import supervisor as module
+from msg_agents.run.supervisor import Child, Supervisor
+from msg_analysis.errors import ExitCode
 
 STUBBORN = """
 import signal, time
@@ -43,7 +43,7 @@ REPORTER = """
 import json, os, sys
 from pathlib import Path
 sys.path.remove(os.environ["PYTHONPATH"])
-from msg_agents.processes.status_file import write_steps
+from msg_agents.run.result import write_steps
 for line in open(sys.argv[2]):
     write_steps(Path(sys.argv[sys.argv.index("--steps") + 1]), json.loads(line))
     print("written", flush=True)
@@ -248,9 +248,9 @@ def run_file(tmp_path: Path) -> Path:
 PARENT = """
 import sys, time
 from pathlib import Path
-from msg_agents.processes.process_plan import ProcessPlan
-from msg_agents.processes.environment import node_environment
-from msg_agents.running.supervisor import Supervisor
+from msg_agents.process_layout import ProcessPlan
+from msg_agents.environment import node_environment
+from msg_agents.run.supervisor import Supervisor
 directory = Path(sys.argv[1])
 run_file = str(directory / "run.json")
 plans = [

@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from msg_agents.stepping.look_back import LookBackSynchronizer
+from msg_agents.stepping.state_receiver import LookBackSynchronizer
 from msg_agents.stepping.synchronizer import KEPT_AFTER_USE
-from msg_analysis.wire.refusals import Refusal
+from msg_analysis.messages.acceptance import Refusal
 
 PRIME = 2**61 - 1
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_agents.stepping.agent_inputs import NOTHING
 from msg_agents.stepping.newest_values import NewestOnAir, NewestValues
-from msg_analysis.wire.refusals import Refusal
+from msg_agents.stepping.synchronizer import NOTHING
+from msg_analysis.messages.acceptance import Refusal
 
 STEPS = 40
 INPUTS = [[1, 3], [3], []]

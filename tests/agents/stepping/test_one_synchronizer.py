@@ -7,7 +7,7 @@ import copy
 import pytest
 
 from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, RESEND_LIMIT, Synchronizer
-from msg_analysis.wire.refusals import Refusal
+from msg_analysis.messages.acceptance import Refusal
 
 
 def make_step(node: Synchronizer[str]) -> tuple[int, list[str]]:

@@ -9,9 +9,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_agents.stepping.received_steps import CONSECUTIVE, ReceivedSteps, marks_of
-from msg_agents.stepping.synchronizer import RESEND_LIMIT
-from msg_analysis.wire.refusals import Refusal
+from msg_agents.stepping.synchronizer import CONSECUTIVE, RESEND_LIMIT, ReceivedSteps, marks_of
+from msg_analysis.messages.acceptance import Refusal
 
 LONG = 50_000
 

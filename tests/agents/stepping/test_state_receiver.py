@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from msg_agents.stepping.state_receiver import StateReceiver
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.messages.acceptance import Refusal
+from msg_analysis.messages.cdr import encode_batch
+from msg_analysis.messages.messages import AgentState
+from msg_analysis.messages.topics import STATE, STATES, TRUTH, TRUTHS
+from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.simulate import new_record
-from msg_analysis.wire.messages import AgentState
-from msg_analysis.wire.refusals import Refusal
-from msg_analysis.wire.state_batches import encode_batch
-from msg_analysis.wire.topics import STATE, STATES, TRUTH, TRUTHS
 
 STEPS = 200
 

@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_agents.stepping.synchronizer import Synchronizer, _Uses
-from msg_analysis.wire.refusals import Refusal
+from msg_analysis.messages.acceptance import Refusal
 
 PRIME = 2**61 - 1
 Sojourn = tuple[int, int, int, int]  # sequence, mode, first step, last step

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from msg_agents.stepping import turn_queue
-from msg_agents.stepping.turn_queue import TurnQueue
+from msg_agents.stepping import synchronizer
+from msg_agents.stepping.synchronizer import TurnQueue
 
 
 class Player:
@@ -51,7 +51,7 @@ def test_nobody_before_all_have_joined() -> None:
 
 def test_as_long_as_it_takes_without_nesting(monkeypatch: pytest.MonkeyPatch) -> None:
     """Many more turns than Python allows nested calls."""
-    monkeypatch.setattr(turn_queue, "TURN_SLICE", 1e9)
+    monkeypatch.setattr(synchronizer, "TURN_SLICE", 1e9)
     game = Game(3, 50_000)
     for player in game.players:
         game.turns.join(player)
@@ -61,7 +61,7 @@ def test_as_long_as_it_takes_without_nesting(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_the_middleware_gets_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     """A slice that is over at once: one turn, then everything else; whoever asks meanwhile waits for his."""
-    monkeypatch.setattr(turn_queue, "TURN_SLICE", -1.0)
+    monkeypatch.setattr(synchronizer, "TURN_SLICE", -1.0)
     game = Game(2, 6)
     for player in game.players:
         game.turns.join(player)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from msg_agents.terminal.interruption import SIGNALS, Interruption
+from msg_agents.terminal import SIGNALS, Interruption
 
 
 @pytest.fixture(autouse=True)

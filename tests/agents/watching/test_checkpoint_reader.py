@@ -8,20 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_agents.recovery.checkpoint import Checkpoint, entry_size
-from msg_agents.watching.checkpoint_reader import BLOCK, CheckpointReader
-from msg_agents.watching.run_observer import RunObserver
-from msg_analysis.inference.online.logged_states import StateLog
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.arithmetic.payload import to_payload
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.model.step.air import LOST
-from msg_analysis.model.step.neighbours import neighbour_tables
+from msg_agents.recovery import Checkpoint, entry_size
+from msg_agents.watch.observer import BLOCK, CheckpointReader, RunObserver
+from msg_analysis.arithmetic.update_law import to_payload
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.online_steps import StateLog
+from msg_analysis.inference.verdict import compare
+from msg_analysis.messages.messages import StateCodec
+from msg_analysis.messages.topics import agent_node_name
+from msg_analysis.model.reception import LOST, neighbour_tables
+from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.simulate import simulate
-from msg_analysis.wire.messages import StateCodec
-from msg_analysis.wire.topics import agent_name
 
 
 def _experiment(duration: float = 20, **changes: Any) -> ValidExperiment:
@@ -42,7 +40,7 @@ class Writers:
         experiment, run = self.record.experiment, self.record.run.bytes
         size = entry_size(self.record)
         self._trajectory, self._done = trajectory, -1
-        self._files = [Checkpoint(directory / f"{agent_name(i)}.states", size) for i in range(experiment.agents)]
+        self._files = [Checkpoint(directory / f"{agent_node_name(i)}.states", size) for i in range(experiment.agents)]
         self._codecs = [
             StateCodec(run, i + 1, experiment.width, experiment.step_length) for i in range(experiment.agents)
         ]

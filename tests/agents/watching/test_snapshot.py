@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from msg_agents.watching import snapshot
-from msg_agents.watching.snapshot import SnapshotSource, snapshot_document
-from msg_analysis.inference.errors.estimates import Estimate
-from msg_analysis.inference.online.recent_steps import WINDOW
-from msg_analysis.inference.online.running_errors import LiveEstimate, LiveReport
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_agents.watch import snapshot
+from msg_agents.watch.snapshot import SnapshotSource, snapshot_document
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.estimates import Estimate
+from msg_analysis.inference.online_errors import LiveEstimate, LiveReport
+from msg_analysis.inference.online_steps import WINDOW
 from msg_analysis.twin.simulate import simulate
 
 

@@ -10,8 +10,9 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from msg_agents.watching import snapshot
-from msg_agents.watching.snapshot import (
+from msg_agents.watch import snapshot
+from msg_agents.watch.panel import gauge, panel_of, plain_line
+from msg_agents.watch.snapshot import (
     Snapshot,
     SnapshotSource,
     SojournFinder,
@@ -19,11 +20,10 @@ from msg_agents.watching.snapshot import (
     run_description,
     snapshot_document,
 )
-from msg_agents.watching.terminal_panel import gauge, panel_of, plain_line
-from msg_analysis.inference.errors.estimates import Estimate
-from msg_analysis.inference.online.running_errors import LiveReport
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.graph_path import Sojourn
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.estimates import Estimate
+from msg_analysis.inference.online_errors import LiveReport
+from msg_analysis.model.graph_path import Sojourn
 from msg_analysis.twin.simulate import simulate
 
 

@@ -19,8 +19,8 @@ from click.testing import CliRunner
 from waiting import wait_for
 
 from msg_agents.cli.main import main
-from msg_agents.cli.web_options import WebCommand, web_options
-from msg_agents.watching.web_server import MOST_BROWSERS, MOST_CONNECTIONS, WebServer
+from msg_agents.cli.watching import WebCommand, web_options
+from msg_agents.watch.web_server import MOST_BROWSERS, MOST_CONNECTIONS, WebServer
 from msg_analysis.errors import InputError
 
 MOMENT = {"system": {"measured": 1.5, "predicted": 1.4, "standard_error": 0.1}, "values_step": 7, "reached": 8}
@@ -229,7 +229,7 @@ def test_errors_have_the_headers_of_the_page(idle: WebServer, request_line: byte
 
 def test_dripping_requests(web: WebServer, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice as many as there may be, which send a byte now and then: few stay open, and not for long."""
-    monkeypatch.setattr("msg_agents.watching.web_server.REQUEST_TIME", 0.5)
+    monkeypatch.setattr("msg_agents.watch.web_server.REQUEST_TIME", 0.5)
     before = len(list(Path("/proc/self/fd").iterdir()))
     dripping = [_dial(web) for _ in range(2 * MOST_CONNECTIONS)]
     for _ in range(3):

@@ -11,9 +11,9 @@ import pytest
 from rosbags.highlevel import anyreader
 from rosbags.rosbag2 import storage_mcap
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.run.trajectory import Completeness, Trajectory
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run_record import RunRecord
 
 _QOS = functools.cache(storage_mcap.get_qos)
 _TYPES = functools.cache(anyreader.get_types_from_msg)

@@ -10,8 +10,8 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 
-from msg_analysis.bags.format.inventory import Inventory
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.files import Inventory
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.salvage import salvage, salvage_in_place
 from msg_analysis.errors import BagError
 

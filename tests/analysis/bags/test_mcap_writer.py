@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 from mcap.records import Attachment
 from mcap.writer import CompressionType, Writer
 
-from msg_analysis.bags.format import mcap_writer
-from msg_analysis.bags.format.mcap_chunks import MESSAGE_HEAD
-from msg_analysis.bags.format.mcap_writer import McapWriter
-from msg_analysis.bags.format.storage_options import Compression
+from msg_analysis.bags import mcap_writing
+from msg_analysis.bags.mcap_chunks import MESSAGE_HEAD, Compression
+from msg_analysis.bags.mcap_writing import McapWriter
 
 TYPES = {"none": CompressionType.NONE, "zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4}
 MESSAGES = st.lists(
@@ -33,7 +32,7 @@ MESSAGES = st.lists(
 @pytest.fixture(scope="module", autouse=True)
 def _same_level() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mcap.writer.zstandard, "compress", partial(zstandard.compress, level=mcap_writer.ZSTD_LEVEL))
+        patch.setattr(mcap.writer.zstandard, "compress", partial(zstandard.compress, level=mcap_writing.ZSTD_LEVEL))
         yield
 
 
@@ -132,7 +131,7 @@ def test_many_messages_at_once(actions: list[list[tuple[int, int, int, int, byte
 
 
 def test_more_indexes_than_the_memory_is_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mcap_writer, "INDEXES_IN_MEMORY", 1000)
+    monkeypatch.setattr(mcap_writing, "INDEXES_IN_MEMORY", 1000)
     ours, theirs = io.BytesIO(), io.BytesIO()
     writer = McapWriter(ours, chunk_size=50, compression="none")
     library = Writer(theirs, chunk_size=50, compression=CompressionType.NONE)

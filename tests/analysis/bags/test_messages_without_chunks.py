@@ -12,8 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from msg_analysis.bags.format import mcap_file
-from msg_analysis.bags.format.mcap_file import MAGIC, McapFile
+from msg_analysis.bags import mcap_reading
+from msg_analysis.bags.mcap_reading import MAGIC, McapFile
 
 MESSAGE, METADATA_INDEX, FOOTER, HEAD = 5, 13, 2, 22
 
@@ -62,7 +62,7 @@ def test_runs_of_any_lengths(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, runs: list[tuple[int, int, int]], cut: int, block: int
 ) -> None:
     """Cut off anywhere, and whatever the size of the blocks in which the file is read."""
-    monkeypatch.setattr(mcap_file, "_LOOSE", block)
+    monkeypatch.setattr(mcap_reading, "_LOOSE", block)
     records = [(opcode, size, number) for opcode, size, count in runs for number in range(count)]
     contents = [(opcode, bytes(HEAD)[:size] + bytes([number] * (size - HEAD))) for opcode, size, number in records]
     path = tmp_path / "x.mcap"

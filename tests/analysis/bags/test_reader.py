@@ -16,15 +16,15 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import BagError, InputError
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.model.step.step_model import build_model
+from msg_analysis.inference.verdict import compare
+from msg_analysis.messages.messages import ActiveGraph, AgentState, encode_string
+from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
+from msg_analysis.model.run import Trajectory
+from msg_analysis.model.step_model import build_model
 from msg_analysis.twin.check import check
-from msg_analysis.wire.messages import ActiveGraph, AgentState, encode_string
-from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
 
 Message = tuple[str, str, bytes, int]  # topic, type, data, time
 MakeRun = Callable[..., Trajectory]

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.model.run.until import Until
-from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, encode_string
-from msg_analysis.wire.refusals import Refusal
-from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE, PROGRESS, STRING
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.messages.acceptance import Refusal
+from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, encode_string
+from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, PROGRESS, STRING
+from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run_record import Until
 
 MakeRun = Callable[..., Trajectory]
 STEP = 50_000_000  # ns

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.bags.salvage import salvage
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.run.trajectory import Completeness, Trajectory
-from msg_analysis.wire.messages import ActiveGraph, AgentState, encode_string
-from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING, MessageType
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.messages.messages import ActiveGraph, AgentState, encode_string
+from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING, MessageType
+from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run_record import RunRecord
 
 STEPS, LOST = 40, 2**64 - 1
 NEIGHBOURS = ({1: [2], 2: [1, 3], 3: [2]}, {1: [2, 3], 2: [1], 3: [1]})  # of line and star, agents from 1

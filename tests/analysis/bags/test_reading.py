@@ -25,16 +25,16 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from msg_analysis.bags.format import mcap_chunks
-from msg_analysis.bags.format.mcap_chunks import DamageError, locate, unpack
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.wire.cdr_fields import CdrError
-from msg_analysis.wire.messages import ActiveGraph, AgentState, encode_string
-from msg_analysis.wire.schemas import AGENT_STATE, STRING
+from msg_analysis.bags import mcap_chunks
+from msg_analysis.bags.mcap_chunks import DamageError, locate, unpack
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.messages.cdr import CdrError
+from msg_analysis.messages.messages import ActiveGraph, AgentState, encode_string
+from msg_analysis.messages.schemas import AGENT_STATE, STRING
+from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run_record import RunRecord
 
 STEPS, AGENTS, WIDTH, LOST = 5, 3, 2, 2**64 - 1
 NEIGHBOURS = ([0, 0, 0], [1, 2, 1], [2, 1, 1])  # how many: no graph, line, star

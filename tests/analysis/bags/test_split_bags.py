@@ -18,15 +18,15 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from msg_analysis.bags.format.storage_options import Storage
+from msg_analysis.bags.mcap_chunks import Storage
 from msg_analysis.bags.playback import Playback
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.bags.salvage import salvage_in_place
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.bags.writer import BagWriter
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.wire.messages import ActiveGraph, stamp_ns
-from msg_analysis.wire.topics import network_topics
+from msg_analysis.bags.writing import BagWriter
+from msg_analysis.messages.messages import ActiveGraph, stamp_ns
+from msg_analysis.messages.topics import network_topics
+from msg_analysis.model.run import Trajectory
 
 MakeRun = Callable[..., Trajectory]
 AGENTS, STEPS, STEP = 4, 400, 50_000_000

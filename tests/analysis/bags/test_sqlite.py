@@ -19,13 +19,13 @@ from click.testing import CliRunner
 from rosbags.highlevel import AnyReader
 
 from msg_analysis.bags.playback import Playback
-from msg_analysis.bags.reader import read_bag
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.bags.salvage import salvage
-from msg_analysis.bags.trajectory_writer import write_trajectory
 from msg_analysis.cli.main import main
 from msg_analysis.errors import BagError
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.report.documents.info import describe_bag
+from msg_analysis.model.run import Trajectory
+from msg_analysis.report.documents import describe_bag
 
 MakeRun = Callable[..., Trajectory]
 Message = tuple[str, str, int, bytes]  # topic, type, time, data

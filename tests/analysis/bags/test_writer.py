@@ -17,13 +17,13 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
-from msg_analysis.bags.format.storage_options import Storage
+from msg_analysis.bags.mcap_chunks import Storage
 from msg_analysis.bags.salvage import salvage_in_place
-from msg_analysis.bags.writer import BagWriter, recording_pid
+from msg_analysis.bags.writing import BagWriter, recording_pid
 from msg_analysis.errors import BagError
-from msg_analysis.report.documents.info import describe_bag
-from msg_analysis.wire.messages import StateCodec, encode_string, stamp_ns
-from msg_analysis.wire.topics import network_topics
+from msg_analysis.messages.messages import StateCodec, encode_string, stamp_ns
+from msg_analysis.messages.topics import network_topics
+from msg_analysis.report.documents import describe_bag
 
 RUN = bytes(range(16))
 

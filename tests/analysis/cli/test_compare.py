@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 
 from msg_analysis.cli.main import main
 
-EXPERIMENT = Path(__file__).parents[3] / "analysis/msg_analysis/examples/experiments/leader_smallest.yaml"
+EXPERIMENT = Path(__file__).parents[3] / "analysis/msg_analysis/experiment/bundled/leader_smallest.yaml"
 
 
 def call(*arguments: object) -> Result:

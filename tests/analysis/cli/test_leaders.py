@@ -11,12 +11,12 @@ import pytest
 from click.testing import CliRunner, Result
 
 from msg_analysis.api import Experiment
+from msg_analysis.cli import console
 from msg_analysis.cli import main as cli
-from msg_analysis.cli import progress
 from msg_analysis.paper import examples
 
 ROOT = Path(__file__).parents[3]
-EXPERIMENTS = ROOT / "analysis/msg_analysis/examples/experiments"
+EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"
 LINE_RING = EXPERIMENTS / "line_ring.yaml"
 
 
@@ -121,7 +121,7 @@ def test_bad_usage(options: list[str], message: str) -> None:
 
 
 def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress, "_LINE_PERIOD", 0.0)
+    monkeypatch.setattr(console, "_LINE_PERIOD", 0.0)
     result = call("leaders", LINE_RING, "--count", "2", "--method", "swap", "--json")
     assert json.loads(result.stdout)["sets"]
     assert "line_ring: greedy: 1 of 10, smallest system error" in result.stderr

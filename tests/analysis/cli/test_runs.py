@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 from msg_agents.cli.main import main as agents
 from msg_analysis import Experiment
 from msg_analysis.cli.main import main
-from msg_analysis.common.text.json_numbers import json_text
+from msg_analysis.common.text import json_text
 
 DOCUMENT = {
     "name": "pair",

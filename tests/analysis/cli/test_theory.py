@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from msg_analysis import Experiment, Run, read_bag
 from msg_analysis.cli import main as cli
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 
 GOLDEN = Path(__file__).parents[2] / "data/golden"

@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg  # its library of linear algebra is another one than that of numpy
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from msg_analysis.common.blas_threads import LARGE, few_blas_threads
+from msg_analysis.common.resources import LARGE, few_blas_threads
 
 
 @dataclass

@@ -8,7 +8,7 @@ import many_commands
 import pytest
 import yaml
 
-from msg_analysis.common.bounded_input import DEEPEST, MOST_REPEATED, load_yaml, read_text
+from msg_analysis.common.files import DEEPEST, MOST_REPEATED, load_yaml, read_text
 
 
 def bomb(levels: int) -> str:

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.bags import trajectory_builder
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.common import large_arrays
-from msg_analysis.common.large_arrays import LARGE, LargeRows, in_file, large_zeros, release
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.bags import run_builder
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.common import arrays
+from msg_analysis.common.arrays import LARGE, LargeRows, in_file, large_zeros, release
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.verdict import compare
 from msg_analysis.twin.simulate import simulate
 
 
@@ -31,7 +31,7 @@ def test_small_ones_are_in_memory() -> None:
 
 def test_large_ones_keep_their_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Released and read again; views know that they are in a file; nothing is left in the folder."""
-    monkeypatch.setattr(large_arrays.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(arrays.tempfile, "tempdir", str(tmp_path))
     array = large_zeros((1000, 40), np.float64, total=LARGE)
     assert not array.any()
     assert list(tmp_path.iterdir()) == []
@@ -49,7 +49,7 @@ def test_released_memory_is_free() -> None:
     """Of 200 MB that have been written, none is resident afterwards."""
     script = """
 import numpy as np
-from msg_analysis.common.large_arrays import large_zeros, release
+from msg_analysis.common.arrays import large_zeros, release
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * 4096
 before = resident()
@@ -70,7 +70,7 @@ def test_without_room_on_the_disk() -> None:
     """Files of this process may have 1 MB: the array is in memory instead, and can be used."""
     script = """
 import numpy as np
-from msg_analysis.common.large_arrays import in_file, large_zeros
+from msg_analysis.common.arrays import in_file, large_zeros
 array = large_zeros((300_000,), np.float64, total=10**9)
 assert not in_file(array)
 array[:] = 1.0
@@ -103,9 +103,9 @@ def test_a_run_that_is_read_into_files(
     run.states[1500, 1] = np.nan
     write_trajectory(run, tmp_path / "bag")
     one = read_bag(tmp_path / "bag")
-    monkeypatch.setattr(large_arrays, "LARGE", 1)
-    monkeypatch.setattr(trajectory_builder, "RELEASED_AT_ONCE", 100)
-    monkeypatch.setattr(trajectory_builder, "_CELLS", 7)
+    monkeypatch.setattr(arrays, "LARGE", 1)
+    monkeypatch.setattr(run_builder, "RELEASED_AT_ONCE", 100)
+    monkeypatch.setattr(run_builder, "_CELLS", 7)
     other = read_bag(tmp_path / "bag")
     assert in_file(other.states)
     assert not in_file(one.states)
@@ -123,7 +123,7 @@ def test_a_run_that_is_read_into_files(
 @pytest.mark.parametrize("limit", [None, 1, 900, 10**6])
 def test_rows_one_part_after_the_other(limit: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """In memory, in a file from some size on, or all in a file; none at all, too."""
-    monkeypatch.setattr(large_arrays, "LARGE", LARGE if limit is None else 8 * limit)
+    monkeypatch.setattr(arrays, "LARGE", LARGE if limit is None else 8 * limit)
     random = np.random.default_rng(4)
     rows, parts = LargeRows(3, np.int32), [random.integers(-9, 9, (count, 3)) for count in (4, 0, 50, 1, 300)]
     assert [rows.append(part) for part in parts] == [0, 4, 4, 54, 55]

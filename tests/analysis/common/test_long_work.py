@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.cli.progress import SweepProgress, WorkProgress
-from msg_analysis.common.long_work import tell, watched
-from msg_analysis.common.text.number_words import duration_text
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.cli.console import SweepProgress, WorkProgress
+from msg_analysis.common.resources import tell, watched
+from msg_analysis.common.text import duration_text
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.verdict import compare
 from msg_analysis.twin.simulate import simulate
 
 
@@ -50,7 +50,7 @@ def test_short_work_shows_nothing(capfd: pytest.CaptureFixture[str]) -> None:
 def test_long_work_says_how_far_it_is(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """A line every ten seconds where there is no terminal."""
     now = [100.0]
-    monkeypatch.setattr("msg_analysis.cli.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("msg_analysis.cli.console.time.monotonic", lambda: now[0])
     with WorkProgress() as progress, watched(progress):
         for second in range(25):
             now[0] = 100.0 + second
@@ -61,7 +61,7 @@ def test_long_work_says_how_far_it_is(capfd: pytest.CaptureFixture[str], monkeyp
 def test_a_sweep_says_what_is_left(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """At the mean speed of what is new: 40 of 100 points were there before, each takes a second and a half."""
     now = [100.0]
-    monkeypatch.setattr("msg_analysis.cli.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("msg_analysis.cli.console.time.monotonic", lambda: now[0])
     with SweepProgress("sweep") as progress:
         progress.done(40, 100, 0)
         for done in range(41, 101):

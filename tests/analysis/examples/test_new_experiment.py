@@ -12,8 +12,8 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from msg_analysis.examples.new_experiment import KINDS, Choices, experiment_name, experiment_text
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.examples import KINDS, Choices, experiment_name, experiment_text
+from msg_analysis.experiment.experiment import ValidExperiment
 
 GRAPHS = {
     "line": nx.path_graph,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from msg_analysis.inference.verdict import compare, pool
+from msg_analysis.inference import pool, verdict
 from msg_analysis.theory.prediction import predict
 
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "late_timers.py"
@@ -39,5 +39,5 @@ def predicted_once(monkeypatch):
             assert known[key].fourth_moment  # computed once, as what the copies keep
         return known[key].for_run(experiment)
 
-    for module in (compare, pool):
+    for module in (verdict, pool):
         monkeypatch.setattr(module, "predict", prediction)

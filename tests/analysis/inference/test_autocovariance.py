@@ -9,10 +9,10 @@ import pytest
 import scipy.stats
 
 from msg_analysis import Experiment
-from msg_analysis.inference.errors import autocovariance
-from msg_analysis.inference.errors.autocovariance import LoggedAutocovariance, logged_autocovariance, why_not_tested
-from msg_analysis.inference.errors.given_path import means_given_path
-from msg_analysis.inference.observed.observation import Observation
+from msg_analysis.inference import autocovariance
+from msg_analysis.inference.autocovariance import LoggedAutocovariance, logged_autocovariance, why_not_tested
+from msg_analysis.inference.given_path import means_given_path
+from msg_analysis.inference.observation import Observation
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.twin.simulate import simulate
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from msg_analysis.inference.statistics.batch_means import batch_interval
+from msg_analysis.inference.statistics import batch_interval
 
 
 def test_is_students_interval_of_the_batch_means():

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from msg_analysis.inference.blame.switching_rates import find_rates
-from msg_analysis.inference.statistics.forward_selection import Candidate, select
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.network.markov_chain import MarkovChain
-from msg_analysis.model.run.record import RunRecord
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.markov_chain import MarkovChain
+from msg_analysis.inference.candidates import Candidate, find_rates, select
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.simulate import new_record, simulate
 
 PAIRS = {"line": [(1, 2), (2, 3), (3, 4)], "ring": [(1, 2), (2, 3), (3, 4), (4, 1)]}

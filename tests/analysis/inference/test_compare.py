@@ -12,10 +12,10 @@ import scipy.linalg
 from scipy import stats
 from tests.support.p_values import kolmogorov_smirnov
 
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.run.trajectory import Completeness, Trajectory
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -269,7 +269,7 @@ def test_document(short_run):
 def test_many_agents_get_no_joint_test_but_all_numbers(short_run, monkeypatch):
     all_ = compare(short_run)
     work = 500 * 4**2 * (5**2 + 5 * 5 * 4)
-    monkeypatch.setattr("msg_analysis.inference.errors.given_path.MAX_WORK", work)  # of five node errors
+    monkeypatch.setattr("msg_analysis.inference.given_path.MAX_WORK", work)  # of five node errors
     few = compare(short_run)
     assert (few.covariance.chi2, few.covariance.dof, few.covariance.p) == (None, None, None)
     assert "too many agents" in few.covariance.note

@@ -14,22 +14,17 @@ import pytest
 from scipy import stats
 from tests.support.switching_systems import LINE_RING
 
-from msg_analysis.inference.departures.departure import Departure, Law
-from msg_analysis.inference.departures.largest_innovation import LargestInnovation
-from msg_analysis.inference.departures.long_lags import LongLags
-from msg_analysis.inference.departures.noise_by_graph import NoiseByGraph
-from msg_analysis.inference.departures.noise_over_time import NoiseOverTime
-from msg_analysis.inference.departures.sojourns import PARTS, Sojourns
-from msg_analysis.inference.departures.stale_values import StaleValues
-from msg_analysis.inference.departures.standing_still import StandingStill
-from msg_analysis.inference.departures.swapped_graphs import SwappedGraphs
-from msg_analysis.inference.evidence.looks import Looks
-from msg_analysis.inference.evidence.mixture_evidence import variance_evidence
-from msg_analysis.inference.evidence.windows import WindowEvidence, Windows
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.dependence import LongLags, StandingStill
+from msg_analysis.inference.diagnostics import Departure, Law
+from msg_analysis.inference.e_values import Looks, WindowEvidence, Windows, variance_evidence
+from msg_analysis.inference.messages import StaleValues
+from msg_analysis.inference.noise_diagnostics import NoiseByGraph, NoiseOverTime
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.residuals import LargestInnovation
+from msg_analysis.inference.sequential_sums import EvidenceSums
+from msg_analysis.inference.switching import PARTS, Sojourns, SwappedGraphs
+from msg_analysis.inference.verdict import compare
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 

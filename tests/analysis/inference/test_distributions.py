@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from msg_analysis.inference.statistics import distributions as ours
+from msg_analysis.inference import statistics as ours
 
 Z = np.array([-40.0, -9.0, -1.5, 0.0, 0.3, 2.0, 7.0, 38.0])
 X = np.array([0.0, 1e-3, 0.7, 3.0, 40.0, 900.0])

@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 from tests.support.line_and_ring import experiment
 
-from msg_analysis.inference.observed.observation import Observation, spaced_steps
-from msg_analysis.inference.sequential.error_martingale import ErrorMartingale
-from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
-from msg_analysis.inference.sequential.law_questions import kind_weights
-from msg_analysis.inference.sequential.watched_evidence import WatchedEvidence, any_time_evidence
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.inference.verdict.evidence import Evidence, usual_looks
-from msg_analysis.inference.verdict.pool import compare_pooled
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.evidence import Evidence, usual_looks
+from msg_analysis.inference.observation import Observation, spaced_steps
+from msg_analysis.inference.pool import compare_pooled
+from msg_analysis.inference.sequential_questions import ErrorMartingale, kind_weights
+from msg_analysis.inference.sequential_sums import EvidenceSums, WatchedEvidence, any_time_evidence
+from msg_analysis.inference.verdict import compare
+from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.system import packed_symmetric
 from msg_analysis.twin.simulate import simulate
 
 

@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from msg_analysis.inference.errors import given_path as module
-from msg_analysis.inference.errors.estimates import covariance_test, estimates
-from msg_analysis.inference.errors.given_path import GivenPath, means_given_path
-from msg_analysis.inference.errors.time_means import time_means
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference import given_path as module
+from msg_analysis.inference.estimates import covariance_test, estimates
+from msg_analysis.inference.given_path import GivenPath, means_given_path
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.time_means import time_means
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 

@@ -11,11 +11,11 @@ from mcap.reader import make_reader
 from tests.support import line_and_ring
 from tests.support.watched_run import messages_of, watch, watched, whole_sums
 
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.inference.online import heard_evidence, running_errors
-from msg_analysis.inference.online.heard_evidence import NetworkPath
-from msg_analysis.inference.online.running_errors import LiveEstimate
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference import online_errors, online_evidence
+from msg_analysis.inference.online_errors import LiveEstimate
+from msg_analysis.inference.online_evidence import NetworkPath
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -115,8 +115,8 @@ def test_steps_that_were_not_seen(name: str) -> None:
 
 def test_values_older_than_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which agents are left out depends on losses only, so that the evidence stays fair, and losses all count."""
-    monkeypatch.setattr(heard_evidence, "LEAST_KEPT", 8)
-    monkeypatch.setattr(heard_evidence, "MOST_KEPT", 8)
+    monkeypatch.setattr(online_evidence, "LEAST_KEPT", 8)
+    monkeypatch.setattr(online_evidence, "MOST_KEPT", 8)
     run = simulate(law(duration=200.0, noise={"loss": 0.7, "on_loss": "hold"}))
     live, wanted = watched(run), whole_sums(run, predict(run.record.experiment))
     assert live.evidence is not None
@@ -189,7 +189,7 @@ def test_a_contradiction_in_the_path() -> None:
 def test_correct_runs_seldom_pass_at_any_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 40 watchers that miss steps, at level 10 %: more than 10 pass with probability 0.2 %."""
     prediction = predict(law(duration=25.0, **LAWS["hold"]))
-    monkeypatch.setattr(running_errors, "predict", lambda *_: prediction)
+    monkeypatch.setattr(online_errors, "predict", lambda *_: prediction)
     passed = 0
     for seed in range(40):
         run = simulate(law(duration=25.0, seed=200 + seed, **LAWS["hold"]))

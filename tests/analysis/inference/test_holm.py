@@ -1,6 +1,6 @@
 import numpy as np
 
-from msg_analysis.inference.statistics.holm import holm
+from msg_analysis.inference.statistics import holm
 
 
 def test_by_hand():

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from msg_analysis.inference.hypothesis_tests import innovations as module
-from msg_analysis.inference.hypothesis_tests.gain_regression import regressors
-from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums, innovations
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference import residuals as module
+from msg_analysis.inference.gains import regressors
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.residuals import InnovationSums, innovations
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -103,7 +103,7 @@ def test_gain_is_the_score_test_written_out(observation):
 
 def test_blocks_change_nothing(observation, monkeypatch):
     whole = InnovationSums(observation).tests()
-    monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 40)
+    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 40)
     split = InnovationSums(observation).tests()
     assert split.p_covariance == pytest.approx(whole.p_covariance, rel=1e-9)
     assert split.p_whiteness == pytest.approx(whole.p_whiteness, rel=1e-9)

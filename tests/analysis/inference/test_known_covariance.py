@@ -5,7 +5,7 @@ import pytest
 import scipy.linalg
 from scipy import stats
 
-from msg_analysis.inference.statistics.known_covariance import direction_p, pseudo_inverse, quadratic_form
+from msg_analysis.inference.statistics import direction_p, pseudo_inverse, quadratic_form
 
 RANDOM = np.random.default_rng(1)
 ROOT = RANDOM.standard_normal((3, 3))

@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from msg_analysis.common import large_arrays
-from msg_analysis.common.large_arrays import in_file
-from msg_analysis.inference.errors.estimates import covariance_test, estimates
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.realtime import logged_pattern as module
-from msg_analysis.inference.realtime.event_order import EventOrder, newest_steps, order_events, sampled
-from msg_analysis.inference.realtime.logged_pattern import PatternUnavailableError, pattern_means
-from msg_analysis.inference.realtime.pattern_events import Periods
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.common import arrays
+from msg_analysis.common.arrays import in_file
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference import realtime_laws as module
+from msg_analysis.inference.estimates import covariance_test, estimates
+from msg_analysis.inference.event_order import EventOrder, newest_steps, order_events, sampled
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.pattern_events import Periods
+from msg_analysis.inference.realtime_laws import PatternUnavailableError, pattern_means
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -214,10 +214,10 @@ def test_blocks_change_nothing(late_timers, monkeypatch):
     observation = observe(late_timers.run(CASES["correlated"], **timing(late_timers, "all")))
     order = order_events(observation)
     whole = pattern_means(observation, order)
-    monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 40)
-    monkeypatch.setattr("msg_analysis.inference.realtime.pattern_events.CACHED_NUMBERS", 50)
-    monkeypatch.setattr("msg_analysis.inference.realtime.logged_pattern.math.isqrt", lambda _: 7)
-    monkeypatch.setattr(large_arrays, "LARGE", 1)
+    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 40)
+    monkeypatch.setattr("msg_analysis.inference.pattern_events.CACHED_NUMBERS", 50)
+    monkeypatch.setattr("msg_analysis.inference.realtime_laws.math.isqrt", lambda _: 7)
+    monkeypatch.setattr(arrays, "LARGE", 1)
     split = pattern_means(observation, order)
     for name in ("measured", "predicted", "covariance", "system_series", "system_variances"):
         np.testing.assert_allclose(getattr(split, name), getattr(whole, name), rtol=1e-9, atol=1e-14)
@@ -264,9 +264,9 @@ def test_order_in_blocks_and_in_files(late_timers, monkeypatch):
         for d, j in enumerate(observation.step.neighbours(int(observation.timers.graphs[k, i]), i).tolist()):
             if used[k, i, d] > 0:
                 assert whole.position[used[k, i, d] - 1, j] < whole.position[k, i]
-    monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 90)
-    monkeypatch.setattr("msg_analysis.inference.realtime.event_order.TIES_AT_ONCE", 2)
-    monkeypatch.setattr(large_arrays, "LARGE", 1)
+    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 90)
+    monkeypatch.setattr("msg_analysis.inference.event_order.TIES_AT_ONCE", 2)
+    monkeypatch.setattr(arrays, "LARGE", 1)
     split = order_events(observation)
     assert in_file(split.position)
     assert np.array_equal(split.position, whole.position)

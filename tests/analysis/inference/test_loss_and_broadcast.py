@@ -8,15 +8,14 @@ import pytest
 from scipy import stats
 from tests.support.p_values import kolmogorov_smirnov
 
-from msg_analysis.inference.hypothesis_tests.broadcast import BroadcastSums
-from msg_analysis.inference.hypothesis_tests.heard_gain_regression import HeardRegression
-from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums, innovations
-from msg_analysis.inference.hypothesis_tests.losses import loss_test
-from msg_analysis.inference.observed.heard_values import HeardValues
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.gains import HeardRegression
+from msg_analysis.inference.messages import loss_test
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.received_values import HeardValues
+from msg_analysis.inference.residuals import BroadcastSums, InnovationSums, innovations
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -185,7 +184,7 @@ def test_regression_against_a_loop(most):
 def test_blocks_change_nothing(monkeypatch):
     observation = observe(CASES["correlated"])
     whole = InnovationSums(observation).tests(), loss_test(observation), BroadcastSums(observation).p_value()
-    monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 70)
+    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 70)
     split = InnovationSums(observation).tests(), loss_test(observation), BroadcastSums(observation).p_value()
     for one, other in zip(whole[:2], split[:2], strict=True):
         for ours, theirs in zip(dataclasses.astuple(other), dataclasses.astuple(one), strict=True):

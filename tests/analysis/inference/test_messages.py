@@ -13,19 +13,18 @@ import pytest
 from tests.support.message_runs import message_run
 from tests.support.switching_systems import LINE_RING
 
-from msg_analysis.common import large_arrays
-from msg_analysis.common.large_arrays import in_file
-from msg_analysis.inference.hypothesis_tests.innovations import innovations
-from msg_analysis.inference.hypothesis_tests.losses import LossTally, loss_test
-from msg_analysis.inference.observed.heard_values import HeardValues
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.observed.repeated_noise import RepeatedNoise
-from msg_analysis.inference.realtime import pattern_events
-from msg_analysis.inference.realtime.event_order import newest_steps, order_events
-from msg_analysis.inference.realtime.logged_pattern import means_in_lockstep, pattern_means
-from msg_analysis.inference.realtime.period_tables import period_tables
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.common import arrays
+from msg_analysis.common.arrays import in_file
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference import pattern_events
+from msg_analysis.inference.event_order import newest_steps, order_events
+from msg_analysis.inference.messages import LossTally, loss_test
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.period_tables import period_tables
+from msg_analysis.inference.realtime_laws import means_in_lockstep, pattern_means
+from msg_analysis.inference.received_values import HeardValues, RepeatedNoise
+from msg_analysis.inference.residuals import innovations
+from msg_analysis.inference.verdict import compare
 from msg_analysis.theory.prediction import predict
 
 AIR = {"broadcast": 0.4, "link": 0.6}
@@ -303,8 +302,8 @@ def test_values_in_use_in_blocks_and_in_files(case, monkeypatch):
     observation = observed(case, duration=60)
     timed = observation if observation.timers else observation.as_timed()
     whole = period_tables(timed, order_events(timed))
-    monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 300)
-    monkeypatch.setattr(large_arrays, "LARGE", 1)
+    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 300)
+    monkeypatch.setattr(arrays, "LARGE", 1)
     again = observation if observation.timers else observation.as_timed()
     split = period_tables(again, order_events(again))
     assert in_file(split.events)

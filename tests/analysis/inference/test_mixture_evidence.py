@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import integrate, special, stats
 
-from msg_analysis.inference.evidence.mixture_evidence import (
+from msg_analysis.inference.e_values import (
     PROPORTION_STRENGTHS,
     ROW_STRENGTHS,
     SHARES,
@@ -18,7 +18,7 @@ from msg_analysis.inference.evidence.mixture_evidence import (
     row_evidence,
     variance_evidence,
 )
-from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width
+from msg_analysis.inference.statistics import simultaneous_half_width
 
 
 def test_variances_are_mixed_with_the_inverse_gamma_law() -> None:

@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 from tests.support.p_values import kolmogorov_smirnov
 
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.verdict import compare
 from msg_analysis.twin.simulate import simulate
 
 SEEDS = range(40)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from msg_analysis.inference.statistics import order_statistics
-from msg_analysis.inference.statistics.order_statistics import extent, quantiles
-from msg_analysis.types import AnyArray
+from msg_analysis.common.arrays import AnyArray
+from msg_analysis.inference import timing
+from msg_analysis.inference.timing import extent, quantiles
 
 RANDOM = np.random.default_rng(3)
 NUMBERS = {
@@ -25,8 +25,8 @@ NUMBERS = {
 @pytest.mark.parametrize("name", NUMBERS)
 @pytest.mark.parametrize("at_once", [1, 100, 10_000])
 def test_as_of_all_at_once(name: str, at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(order_statistics, "AT_ONCE", at_once)
-    monkeypatch.setattr(order_statistics, "BINS", 16)
+    monkeypatch.setattr(timing, "AT_ONCE", at_once)
+    monkeypatch.setattr(timing, "BINS", 16)
     numbers, shares = NUMBERS[name], (0.0, 0.01, 0.5, 0.95, 0.99, 1.0)
 
     def pieces() -> list[AnyArray]:

@@ -9,15 +9,15 @@ from scipy import stats
 from tests.support.p_values import kolmogorov_smirnov
 
 from msg_analysis.errors import InputError
-from msg_analysis.inference.hypothesis_tests.innovations import innovations
-from msg_analysis.inference.hypothesis_tests.switching import Transitions
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.statistics.known_covariance import quadratic_form
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.inference.verdict.evidence import Evidence
-from msg_analysis.inference.verdict.pool import compare_pooled
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.trajectory import Completeness
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.evidence import Evidence
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.pool import compare_pooled
+from msg_analysis.inference.residuals import innovations
+from msg_analysis.inference.statistics import quadratic_form
+from msg_analysis.inference.switching import Transitions
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.run import Completeness
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from msg_analysis.inference.errors.ranking import rank_estimates
+from msg_analysis.inference.estimates import rank_estimates
 
 
 def test_pairs_by_hand():

@@ -8,19 +8,19 @@ import pytest
 from scipy import stats
 from tests.support.p_values import kolmogorov_smirnov
 
-from msg_analysis.common.text.number_words import percent
+from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
+from msg_analysis.common.text import percent
 from msg_analysis.errors import InputError
-from msg_analysis.inference.hypothesis_tests.heard_gain_regression import HeardRegression
-from msg_analysis.inference.hypothesis_tests.innovations import InnovationSums, innovations
-from msg_analysis.inference.observed.heard_values import HeardValues, process_noise
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.realtime.event_order import order_events
-from msg_analysis.inference.realtime.timing import measure_timing
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.trajectory import Completeness
-from msg_analysis.model.step.phases import phases
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.event_order import order_events
+from msg_analysis.inference.gains import HeardRegression
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.received_values import HeardValues, process_noise
+from msg_analysis.inference.residuals import InnovationSums, innovations
+from msg_analysis.inference.timing import measure_timing
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.phases import phases
+from msg_analysis.model.run import Completeness
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 

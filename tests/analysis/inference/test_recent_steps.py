@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from msg_analysis.inference.online.recent_steps import WINDOW, Lateness, RecentSteps
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.phases import phases
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.online_steps import WINDOW, Lateness, RecentSteps
+from msg_analysis.model.phases import phases
 
 
 def test_the_newest_steps_are_kept_in_order() -> None:

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.inference.errors.estimates import Estimate, estimates
-from msg_analysis.inference.errors.time_means import time_means
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.online.running_errors import LiveEstimate, RunningErrors
-from msg_analysis.inference.online.step_collector import StepCollector
-from msg_analysis.model.arithmetic.payload import to_payload
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.arithmetic.update_law import to_payload
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.estimates import Estimate, estimates
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.online_errors import LiveEstimate, RunningErrors
+from msg_analysis.inference.online_steps import StepCollector
+from msg_analysis.inference.time_means import time_means
+from msg_analysis.model.run import Trajectory
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -157,7 +157,7 @@ def test_many_agents() -> None:
 
 
 def test_too_many_agents_for_standard_errors_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("msg_analysis.inference.online.running_errors.MOST_BYTES", 100)
+    monkeypatch.setattr("msg_analysis.inference.online_errors.MOST_BYTES", 100)
     trajectory = simulate(experiment())
     live = LiveEstimate(trajectory.record)
     for message in messages(trajectory):

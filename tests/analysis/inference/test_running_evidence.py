@@ -9,20 +9,16 @@ import numpy as np
 import pytest
 from tests.support import line_and_ring
 
-from msg_analysis.inference.errors.estimates import Estimate
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.online import running_errors, running_evidence
-from msg_analysis.inference.online.heard_evidence import HeardEvidence
-from msg_analysis.inference.online.running_errors import LiveEstimate, LiveReport
-from msg_analysis.inference.online.running_evidence import AnyTime, RunningEvidence, supports
-from msg_analysis.inference.online.stopping import precision_words, reached
-from msg_analysis.inference.sequential.evidence_sums import EvidenceSums
-from msg_analysis.inference.statistics.batch_means import RunningBatches
-from msg_analysis.inference.statistics.confidence_sequence import simultaneous_half_width, steps_to_half_width
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.run.until import Until
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference import online_errors, online_evidence
+from msg_analysis.inference.estimates import Estimate
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.online_errors import LiveEstimate, LiveReport, precision_words, reached
+from msg_analysis.inference.online_evidence import AnyTime, HeardEvidence, RunningEvidence, supports
+from msg_analysis.inference.sequential_sums import EvidenceSums
+from msg_analysis.inference.statistics import RunningBatches, simultaneous_half_width, steps_to_half_width
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -68,7 +64,7 @@ def test_what_the_states_alone_do_not_give() -> None:
 @pytest.mark.parametrize("changes", [{}, {"noise": {"loss": 0.1}}], ids=["plain", "loss"])
 def test_too_many_agents(changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     """They have their errors, and no evidence."""
-    monkeypatch.setattr(running_evidence, "MOST_BYTES", 100)
+    monkeypatch.setattr(online_evidence, "MOST_BYTES", 100)
     law = experiment(duration=10, **changes)
     assert not supports(predict(law))
     live = LiveEstimate(record_of(law, None)[0])
@@ -127,7 +123,7 @@ def test_the_interval_is_that_of_the_comparison() -> None:
 def test_intervals_hold_at_all_times(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 40 runs, looked at every 50 steps, at most 5 ever miss: more do with probability 0.014 at a level of 5 %."""
     law = predict(experiment())
-    monkeypatch.setattr(running_errors, "predict", lambda experiment, _: replace(law, experiment=experiment))
+    monkeypatch.setattr(online_errors, "predict", lambda experiment, _: replace(law, experiment=experiment))
     missed = 0
     for seed in range(40):
         record, run = record_of(experiment(seed=seed), Until(0.2))

@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from msg_analysis.inference.errors.time_means import expected_mean, time_means
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.time_means import expected_mean, time_means
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
@@ -122,7 +122,7 @@ def test_expected_switches(observation):
 
 def test_blocks_change_nothing(observation, monkeypatch):
     whole = time_means(observation)
-    monkeypatch.setattr("msg_analysis.inference.observed.observation.BLOCK_NUMBERS", 50)
+    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 50)
     split = time_means(observation)
     for field in dataclasses.fields(whole):
         np.testing.assert_allclose(getattr(split, field.name), getattr(whole, field.name), rtol=1e-11)

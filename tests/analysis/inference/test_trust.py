@@ -1,27 +1,16 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Which errors of a run the verdict says to trust: with infinite fourth moments, few sojourns, and without either."""
 
 import pytest
 from tests.analysis.theory.tails.test_fourth_moments import HEAVY, LOSSY
 
-from msg_analysis.inference.online.running_errors import LiveEstimate
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.inference.verdict.pool import compare_pooled
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.report.documents.comparison_words import trust_words
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.online_errors import LiveEstimate
+from msg_analysis.inference.pool import compare_pooled
+from msg_analysis.inference.verdict import compare
+from msg_analysis.report.wording import trust_words
 from msg_analysis.twin.simulate import new_record, simulate
 
 LINE_RING = {

@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from msg_analysis.inference.observed.observation import Observation
-from msg_analysis.inference.realtime.timing import measure_timing
-from msg_analysis.inference.realtime.unheard import unheard_messages
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.losses import Losses
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.messages import unheard_messages
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.timing import measure_timing
+from msg_analysis.model.reception import Losses
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 

@@ -14,13 +14,13 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError, NotAvailableError
-from msg_analysis.model.experiment.experiment import ExperimentError, ValidExperiment, json_schema
-from msg_analysis.model.spec.document import ExperimentSpec
-from msg_analysis.types import FloatArray
+from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment, json_schema
+from msg_analysis.experiment.spec import ExperimentSpec
 
 ROOT = Path(__file__).parents[3]
-EXPERIMENTS = ROOT / "analysis/msg_analysis/examples/experiments"
+EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"
 
 SMALL: dict[str, Any] = {"name": "small", "graphs": {"line": {"path": [1, 2, 3]}}}
 

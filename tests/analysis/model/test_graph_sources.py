@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from msg_analysis.api import Experiment
-from msg_analysis.inference.verdict.law_identity import law_identity
-from msg_analysis.model.experiment.experiment import ExperimentError, ValidExperiment
-from msg_analysis.model.run.record import RunRecord
+from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.inference.comparison import law_identity
+from msg_analysis.model.run_record import RunRecord
 
 TOWNS = ["Ulm", "Bonn", "Kiel", "Jena"]
 

@@ -10,9 +10,8 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_analysis.model.experiment.experiment import ExperimentError, ValidExperiment
-from msg_analysis.model.step.air import NOTHING, Air
-from msg_analysis.model.step.losses import Losses, loss_probabilities
+from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.model.reception import NOTHING, Air, Losses, loss_probabilities
 
 BLOCK = 256
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_analysis.model.arithmetic import _kernel, many_steps
-from msg_analysis.model.arithmetic.many_steps import ManySteps, Reception, Round
+from msg_analysis.arithmetic import _kernel, update_law
+from msg_analysis.arithmetic.update_law import ManySteps, Reception, Round
 
 Row = tuple[int, list[tuple[int, float]]]  # an agent, and its terms: row of [x(k); x(k+1)] and weight
 
@@ -111,11 +111,11 @@ def test_equal_to_the_last_bit(network: tuple[int, list[list[list[Row]]]], data:
     modes = data.draw(st.lists(st.integers(0, len(graphs) - 1), min_size=1, max_size=6))
     random = np.random.default_rng(data.draw(st.integers(0, 1000)))
     start, drives = random.normal(size=(1, m, replicas)), random.normal(size=(len(modes), m, replicas))
-    assert many_steps.COMPILED
+    assert update_law.COMPILED
     expected = by_hand(graphs, modes, start, drives)
     for compiled in (True, False):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(many_steps, "COMPILED", compiled)
+            patch.setattr(update_law, "COMPILED", compiled)
             states = ManySteps([rounds_of(graph) for graph in graphs]).advance(np.array(modes), start, drives)
         np.testing.assert_array_equal(states, expected)
 
@@ -160,7 +160,7 @@ def test_with_noise_loss_and_delay_on_the_air(m: int, data: st.DataObject) -> No
         own = None if held is None else held.copy()
         heard = dataclasses.replace(reception, held=own)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(many_steps, "COMPILED", compiled)
+            patch.setattr(update_law, "COMPILED", compiled)
             states = ManySteps([rounds_of(graph) for graph in graphs]).advance(np.array(modes), past, drives, heard)
         np.testing.assert_array_equal(states, expected)
         if own is not None and last is not None:

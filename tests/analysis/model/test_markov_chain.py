@@ -14,12 +14,12 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.experiment.validation import connection_problems
-from msg_analysis.model.network.graphs import Graph, hops
-from msg_analysis.model.network.markov_chain import MarkovChain, stationary_law
-from msg_analysis.model.run.graph_path import mode_path, sojourns
-from msg_analysis.model.step.step_model import build_step_model
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.graphs import Graph, hops
+from msg_analysis.experiment.markov_chain import MarkovChain, stationary_law
+from msg_analysis.experiment.validation import connection_problems
+from msg_analysis.model.graph_path import mode_path, sojourns
+from msg_analysis.model.step_model import build_step_model
 
 
 def generator_of(seed: int, n: int) -> np.ndarray:

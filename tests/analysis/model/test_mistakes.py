@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from msg_analysis.model.experiment import memory
-from msg_analysis.model.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.experiment import loading
+from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
 
 GOOD: dict[str, Any] = {
     "name": "good",
@@ -378,12 +378,12 @@ def test_keys_that_are_no_text() -> None:
 
 
 def test_memory_is_compared_with_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
-    needed = sum(memory.memory_needed(agents=5, modes=2, steps=8000, replicas=1))
-    monkeypatch.setattr(memory, "available_memory", lambda: needed)
+    needed = sum(loading.memory_needed(agents=5, modes=2, steps=8000, replicas=1))
+    monkeypatch.setattr(loading, "available_memory", lambda: needed)
     ValidExperiment.parse(GOOD)
-    monkeypatch.setattr(memory, "available_memory", lambda: needed - 1)
+    monkeypatch.setattr(loading, "available_memory", lambda: needed - 1)
     assert "need 320 kB: expected at most 323 kB, the memory available" in problems_of({})[0]
 
 
 def test_available_memory_is_a_plausible_number_of_bytes() -> None:
-    assert 2**20 < memory.available_memory() < 2**60
+    assert 2**20 < loading.available_memory() < 2**60

@@ -15,13 +15,13 @@ from click.testing import CliRunner
 from euler import DIRECTED, Euler, EulerSteps, document, experiment
 
 from msg_analysis.cli.main import main
+from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment import protocol_binding
-from msg_analysis.model.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.experiment import protocols
+from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
 from msg_analysis.protocol import Heard, LinearProtocol, Parameters, Protocol
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
-from msg_analysis.types import FloatArray
 
 SATURATED, METROPOLIS = {"name": "saturated"}, {"name": "metropolis"}
 MISTAKES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
@@ -230,7 +230,7 @@ def test_processes_that_a_protocol_forks_end_as_ever() -> None:
             os._exit(7)
         return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
-    with protocol_binding._KeptAlive():
+    with protocols._KeptAlive():
         assert fork() == 7
         with pytest.raises(SystemExit, match=r"os\._exit\(0\)"):
             os._exit(0)
@@ -240,14 +240,14 @@ def test_processes_that_a_protocol_forks_end_as_ever() -> None:
 def test_a_package_that_is_installed_meanwhile_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And one that is removed is not: what packages offer is kept only as long as no directory of them changes."""
     monkeypatch.syspath_prepend(tmp_path)
-    before = set(protocol_binding.installed_protocols())
+    before = set(protocols.installed_protocols())
     assert "saturated" in before
     info = tmp_path / "later-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: later\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[msg_agents.protocols]\nlater = later:Later\n")
     os.utime(tmp_path, ns=(1, 1))  # file systems count in ticks, of which this may be the same
-    assert set(protocol_binding.installed_protocols()) == before | {"later"}
+    assert set(protocols.installed_protocols()) == before | {"later"}
     info.rename(tmp_path / "gone")
     os.utime(tmp_path, ns=(2, 2))
-    assert set(protocol_binding.installed_protocols()) == before
+    assert set(protocols.installed_protocols()) == before

@@ -12,13 +12,13 @@ import pytest
 from euler import Euler, EulerSteps, experiment
 from pydantic import Field
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.errors import InputError
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.run.record import RunRecord
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.run_record import RunRecord
 from msg_analysis.protocol import Parameters
-from msg_analysis.report.documents.info import describe_bag
+from msg_analysis.report.documents import describe_bag
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record, simulate
 

@@ -15,25 +15,24 @@ import scipy.linalg
 import yaml
 from euler import DIRECTED, Euler, EulerSteps, experiment
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
-from msg_analysis.inference.observed.measurement import transient_length
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.agent_law import agent_law
-from msg_analysis.model.run.graph_path import mode_path
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.step.step_model import build_model, build_step_model
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.observation import transient_length
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.agent_law import agent_law
+from msg_analysis.model.graph_path import mode_path
+from msg_analysis.model.run_record import RunRecord
+from msg_analysis.model.step_model import build_model, build_step_model
 from msg_analysis.protocol import Heard, LinearProtocol, Network, Protocol
-from msg_analysis.report.documents.info import describe_experiment
-from msg_analysis.report.documents.transient_and_facts import describe_facts, describe_transient
-from msg_analysis.report.html.report_page import render
-from msg_analysis.theory.leaders.selection import select_leaders
+from msg_analysis.report.documents import describe_experiment, describe_facts, describe_transient
+from msg_analysis.report.page import render
+from msg_analysis.theory.leaders import select_leaders
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record, simulate
-from msg_analysis.types import FloatArray
 
 AIR = {"process": 0.3, "broadcast": 0.2, "link": 0.1, "loss": 0.25}
 

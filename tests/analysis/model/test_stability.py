@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
-from msg_analysis.model.experiment import validation
-from msg_analysis.model.network.graphs import Graph
-from msg_analysis.types import FloatArray
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.experiment import validation
+from msg_analysis.experiment.graphs import Graph
 
 
 def contracts(laplacian: FloatArray, dt: float) -> bool:

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.run.until import Until
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.twin.simulate import new_record, simulate
 
 

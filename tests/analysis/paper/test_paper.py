@@ -23,13 +23,13 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.paper import examples as paper
 from msg_analysis.paper import figures
 from msg_analysis.paper.examples import CENTRALITY, NODE, SYSTEM, Curve, Example
 
 ROOT = Path(__file__).parents[3]
-EXPERIMENTS = ROOT / "analysis/msg_analysis/examples/experiments"
+EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"
 
 GRAPHS = {
     "line_ring": (["12", "23", "34", "45"], ["12", "23", "34", "45", "15"]),

@@ -8,14 +8,13 @@ import re
 import numpy as np
 import pytest
 
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.inference.verdict.comparison import Comparison
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.report.html.interval_bars import interval_bars, plus_minus
-from msg_analysis.report.html.network_drawings import chain_drawing, graph_drawings
-from msg_analysis.report.html.plots.accused import Accused
-from msg_analysis.report.html.plots.covariance_plots import covariances
-from msg_analysis.report.html.report_page import render
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.comparison import Comparison
+from msg_analysis.inference.verdict import compare
+from msg_analysis.report.drawings import chain_drawing, graph_drawings, interval_bars, plus_minus
+from msg_analysis.report.error_plots import covariances
+from msg_analysis.report.page import render
+from msg_analysis.report.plot_style import Accused
 from msg_analysis.twin.simulate import simulate
 
 DOCUMENT = {

@@ -10,9 +10,8 @@ from click.testing import CliRunner
 
 from msg_analysis.api import Experiment, Run, write_report
 from msg_analysis.cli.main import main
-from msg_analysis.common.text.agent_names import agent_name, agent_text, with_names
-from msg_analysis.sweep.axis_names import axis_name, column_words
-from msg_analysis.sweep.plan import load_sweep
+from msg_analysis.common.text import agent_name, agent_text, with_names
+from msg_analysis.sweep.grid import axis_name, column_words, load_sweep
 
 NAMES = ["Ulm", "Bonn", "Kiel"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from msg_analysis.report.html.plots import colours
+from msg_analysis.report import plot_style
 
 
 def _light(colour: str) -> float:
@@ -21,19 +21,24 @@ def _contrast(one: str, other: str) -> float:
 
 @pytest.mark.parametrize("dark", [False, True])
 def test_contrast(dark: bool) -> None:
-    seen = colours.DARK if dark else {colour: colour for colour in colours.DARK}
-    page = seen[colours.PAGE]
-    assert _contrast(seen[colours.INK], page) >= 4.5
-    for colour in {*colours.LINES, *colours.GRAPHS, colours.GREY}:
+    seen = plot_style.DARK if dark else {colour: colour for colour in plot_style.DARK}
+    page = seen[plot_style.PAGE]
+    assert _contrast(seen[plot_style.INK], page) >= 4.5
+    for colour in {*plot_style.LINES, *plot_style.GRAPHS, plot_style.GREY}:
         assert _contrast(seen[colour], page) >= 3.0, colour
 
 
 def test_numbers_are_read_on_the_scale() -> None:
-    for scale, ink in ((colours.SCALE, colours.BLACK), (colours.DARK_SCALE, colours.DARK[colours.BLACK])):
+    for scale, ink in (
+        (plot_style.SCALE, plot_style.BLACK),
+        (plot_style.DARK_SCALE, plot_style.DARK[plot_style.BLACK]),
+    ):
         assert min(_contrast(colour, ink) for colour in scale) >= 4.5
 
 
 def test_every_colour_has_its_own_in_the_dark() -> None:
-    assert len(set(colours.DARK.values())) == len(colours.DARK)
-    assert {*colours.LINES, *colours.GRAPHS, colours.INK, colours.GREY, colours.PALE} <= set(colours.DARK)
-    assert set(colours.LINES) == set(colours.GRAPHS)
+    assert len(set(plot_style.DARK.values())) == len(plot_style.DARK)
+    assert {*plot_style.LINES, *plot_style.GRAPHS, plot_style.INK, plot_style.GREY, plot_style.PALE} <= set(
+        plot_style.DARK
+    )
+    assert set(plot_style.LINES) == set(plot_style.GRAPHS)

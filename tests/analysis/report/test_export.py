@@ -18,8 +18,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from msg_analysis.api import Experiment, InputError, NotAvailableError, Run, read_bag
 from msg_analysis.cli.main import main
-from msg_analysis.report.export import export_files, run_tables
-from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE
+from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE
+from msg_analysis.report import export as export_files
+from msg_analysis.report import export as run_tables
 
 DOCUMENT: dict[str, Any] = {
     "name": "net",

@@ -15,17 +15,17 @@ import numpy as np
 import pytest
 
 from msg_analysis.errors import InputError
-from msg_analysis.inference.errors.estimates import CovarianceTest, Estimate
-from msg_analysis.inference.hypothesis_tests.innovations import InnovationTests
-from msg_analysis.inference.hypothesis_tests.switching import SwitchingTest
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.inference.verdict.comparison import Comparison
-from msg_analysis.inference.verdict.comparison import Test as FamilyTest
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.run.trajectory import Completeness, Trajectory
-from msg_analysis.report.html import report_page
-from msg_analysis.report.html.report_page import render, write_report
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.comparison import Comparison
+from msg_analysis.inference.comparison import Test as FamilyTest
+from msg_analysis.inference.estimates import CovarianceTest, Estimate
+from msg_analysis.inference.residuals import InnovationTests
+from msg_analysis.inference.switching import SwitchingTest
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run_record import RunRecord
+from msg_analysis.report import page as report_page
+from msg_analysis.report.page import render, write_report
 from msg_analysis.twin.simulate import simulate
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}

@@ -16,12 +16,12 @@ import pytest
 from browser import CUT, FAINT, Log, Tab
 from PIL import Image
 
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.inference.verdict.pool import compare_pooled
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.trajectory import Completeness, Trajectory
-from msg_analysis.report.html.plots.colours import BLUE, DARK
-from msg_analysis.report.html.report_page import write_report
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.pool import compare_pooled
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.report.page import write_report
+from msg_analysis.report.plot_style import BLUE, DARK
 from msg_analysis.twin.simulate import simulate
 
 # Not stationary: a run of 100 agents from their stationary law has a long past to be simulated.

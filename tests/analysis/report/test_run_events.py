@@ -7,12 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from msg_analysis.common import large_arrays
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.trajectory import Completeness, Trajectory
-from msg_analysis.report.html.plots import run_events as events_module
-from msg_analysis.report.html.plots.run_events import run_events
-from msg_analysis.report.html.plots.trajectory_plots import trajectory_plots
+from msg_analysis.common import arrays
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.report import run_plots as events_module
+from msg_analysis.report.run_plots import run_events, trajectory_plots
 from msg_analysis.twin.simulate import simulate
 
 PERIOD = 50_000_000  # ns of simulated time
@@ -29,7 +28,7 @@ def _run(**run: object) -> Trajectory:
 
 @pytest.mark.parametrize("block", [6, 10**6])  # numbers that are looked at together
 def test_late_steps(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(large_arrays, "BLOCK_NUMBERS", block)
+    monkeypatch.setattr(arrays, "BLOCK_NUMBERS", block)
     trajectory = _run(pace="realtime", speed=5)
     assert trajectory.made is not None
     assert run_events(trajectory) == ([], 0)

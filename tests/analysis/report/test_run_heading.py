@@ -8,12 +8,12 @@ import datetime
 import pytest
 
 from msg_analysis.errors import InputError
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.inference.verdict.pool import compare_pooled
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.report.html.run_heading import page_title, run_facts
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.pool import compare_pooled
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run_record import RunRecord
+from msg_analysis.report.page import page_title, run_facts
 from msg_analysis.twin.simulate import new_record, simulate
 
 DOCUMENT = {

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from msg_analysis import Experiment, InputError
-from msg_analysis.report.html.runs_page import render_runs, write_runs_page
-from msg_analysis.runs.run_list import RunEntry, list_runs
+from msg_analysis.report.list_pages import render_runs, write_runs_page
+from msg_analysis.runs import RunEntry, list_runs
 
 DAY = datetime(2026, 11, 25, 12, tzinfo=UTC)
 EVIL = "</script><img src=http://x onerror=alert(1)>"

@@ -11,8 +11,8 @@ import pytest
 from browser import FAINT, Log, Tab
 
 from msg_analysis import Experiment
-from msg_analysis.report.html.runs_page import write_runs_page
-from msg_analysis.runs.run_list import RunEntry
+from msg_analysis.report.list_pages import write_runs_page
+from msg_analysis.runs import RunEntry
 
 DOCUMENT = {
     "name": "line",

@@ -10,10 +10,9 @@ import pytest
 import yaml
 from browser import CUT, FAINT, Tab
 
-from msg_analysis.report.figures.sideways import shifted
-from msg_analysis.report.html.sweep_page import write_sweep_page
-from msg_analysis.sweep.axis_names import axis_name, column_words
-from msg_analysis.sweep.plan import load_sweep
+from msg_analysis.report.figures import shifted
+from msg_analysis.report.list_pages import write_sweep_page
+from msg_analysis.sweep.grid import axis_name, column_words, load_sweep
 
 EXPERIMENT = {
     "name": "made_up",

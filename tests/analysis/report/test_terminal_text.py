@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.experiment.protocol_binding import ProtocolInfo
-from msg_analysis.report.documents.explanation import explain
-from msg_analysis.report.documents.info import describe_experiment
-from msg_analysis.report.terminal import bag_text, comparison_text, experiment_text, theory_text
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.protocols import ProtocolInfo
+from msg_analysis.report import comparison_text, tables, theory_text
+from msg_analysis.report.documents import describe_experiment
+from msg_analysis.report.wording import explain
 from msg_analysis.theory.graph_indices import algebraic_connectivity
 
 
@@ -158,7 +158,7 @@ def test_experiment_explained() -> None:
     shares = [1, 0.25, 0.125]  # detailed balance: share times rate is equal both ways
     assert [graph["stationary"] for graph in document["graphs"]] == pytest.approx([s / sum(shares) for s in shares])
     assert document["memory"]["states"] == 1001 * 4 * 2 * 8
-    output = shown(experiment_text.print_experiment, document)
+    output = shown(tables.print_experiment, document)
     for part in (
         "tracking of 4 agents in continuous time",
         "gain inf",
@@ -173,7 +173,7 @@ def test_experiment_that_cannot_be_run_here() -> None:
     """One of a bag, whose protocol is not installed."""
     used = ProtocolInfo("mine", "pack", "1.2", linear=True)
     what = ValidExperiment.parse(DOCUMENT | {"protocol": {"name": "mine"}}, recorded=used)
-    text = shown(experiment_text.print_experiment, describe_experiment(what))
+    text = shown(tables.print_experiment, describe_experiment(what))
     assert 'protocol.name: "mine": expected an available protocol' in text
 
 
@@ -183,7 +183,7 @@ def test_noise_by_graph_and_delay_explained() -> None:
     document = describe_experiment(ValidExperiment.parse(DOCUMENT | {"noise": {"process": gains, "delay": 2}}))
     assert document["stability_limit"] is None
     assert document["predicted_system_error"] > 0
-    output = " ".join(shown(experiment_text.print_experiment, document).split())
+    output = " ".join(shown(tables.print_experiment, document).split())
     assert "line: 1.0; ring: [0.5, 1.0, 1.0, 2.0]; arcs: matrix 4 x 4" in output
     assert "delay 2" in output
 
@@ -236,7 +236,7 @@ def test_bag() -> None:
         ],
         "versions": {"numpy": "2.0"},
     }
-    output = " ".join(shown(bag_text.print_bag, document).split())
+    output = " ".join(shown(tables.print_bag, document).split())
     for part in (
         *("[bold]bag", "d3ba43f6", "incomplete: 3 of 4, 1 missing", "5: other run", "1.23 MB", "2.0"),
         *(
@@ -254,7 +254,7 @@ def test_bag() -> None:
         "files": [],
         "versions": {},
     }
-    assert "no [run]" in shown(bag_text.print_bag, nothing)
+    assert "no [run]" in shown(tables.print_bag, nothing)
 
 
 def test_real_time() -> None:
@@ -286,7 +286,7 @@ def test_real_time() -> None:
 def test_losses_by_link() -> None:
     loss = {"default": 0.2, "edges": [[2, 3, 0.6]], "arcs": [[1, 2, 0.05]]}
     document = describe_experiment(ValidExperiment.parse(DOCUMENT | {"noise": {"loss": loss, "burst": 5}}))
-    output = " ".join(shown(experiment_text.print_experiment, document).split())
+    output = " ".join(shown(tables.print_experiment, document).split())
     assert "loss 0.2 (2-3: 0.6, 1>2: 0.05), on_loss own, burst 5.0, delay 0" in output
 
 

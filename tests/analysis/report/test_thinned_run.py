@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from msg_analysis.common import large_arrays
-from msg_analysis.report.html.plots import thinned_run
-from msg_analysis.report.html.plots.thinned_run import envelope, thin, thin_together
+from msg_analysis.common import arrays
+from msg_analysis.report import plot_style
+from msg_analysis.report.plot_style import envelope, thin, thin_together
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def states() -> np.ndarray:
 
 @pytest.mark.parametrize("block", [1, 100, 10**6])  # numbers that are looked at together
 def test_bins(states: np.ndarray, block: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thinned_run, "BLOCK_NUMBERS", block)
+    monkeypatch.setattr(plot_style, "BLOCK_NUMBERS", block)
     found = thin(states, 1, None, numbers=100)
     assert found.width == 9  # 2 * 103 * 4 / 100, rounded up
     values = states[:, :, 1]
@@ -40,7 +40,7 @@ def test_bins(states: np.ndarray, block: int, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize("numbers", [100, 10**4])
 def test_several_replicas(states: np.ndarray, block: int, numbers: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each as if it were thinned alone."""
-    monkeypatch.setattr(thinned_run, "BLOCK_NUMBERS", block)
+    monkeypatch.setattr(plot_style, "BLOCK_NUMBERS", block)
     together = thin_together(states, slice(1, 3), 0.25, numbers)
     for found, replica in zip(together, (1, 2), strict=True):
         alone = thin(states, replica, 0.25, numbers)
@@ -72,5 +72,5 @@ def test_gaps_and_huge_numbers(states: np.ndarray) -> None:
 def test_a_run_of_any_length_has_one_size() -> None:
     for steps in (30_000, 300_000):
         found = thin(np.zeros((steps, 5, 1), np.float32), 0, None)
-        assert found.values[0].size + found.values[1].size <= thinned_run.NUMBERS + 10
-    assert large_arrays.BLOCK_NUMBERS == thinned_run.BLOCK_NUMBERS
+        assert found.values[0].size + found.values[1].size <= plot_style.NUMBERS + 10
+    assert arrays.BLOCK_NUMBERS == plot_style.BLOCK_NUMBERS

@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 
 from msg_analysis import Experiment, Run
-from msg_analysis.common.text.json_numbers import json_text
-from msg_analysis.runs import state_difference
-from msg_analysis.runs.bag_difference import bag_difference
-from msg_analysis.runs.pairs import measured, relative
-from msg_analysis.runs.state_difference import graph_difference
-from msg_analysis.runs.state_difference import state_difference as of_states
+from msg_analysis.common.text import json_text
+from msg_analysis.report import differences
+from msg_analysis.report.differences import bag_difference, graph_difference, measured, relative
+from msg_analysis.report.differences import state_difference as of_states
 
 DOCUMENT = {
     "name": "four",
@@ -41,7 +39,7 @@ def changed(run: Run, **changes: Any) -> Run:
 def blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """However few steps are looked at together, the answers are the same."""
     if request.param:
-        monkeypatch.setattr(state_difference, "BLOCK_NUMBERS", request.param)
+        monkeypatch.setattr(differences, "BLOCK_NUMBERS", request.param)
 
 
 @pytest.mark.usefixtures("blocks")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from msg_analysis import Experiment
-from msg_analysis.report.documents.transient_and_facts import describe_transient
-from msg_analysis.runs.experiment_difference import experiment_difference
+from msg_analysis.report.differences import experiment_difference
+from msg_analysis.report.documents import describe_transient
 
 
 def experiment(rate: float = 1.0, **changes: Any) -> Experiment:

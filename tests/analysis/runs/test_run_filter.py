@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from msg_analysis.errors import InputError
-from msg_analysis.runs.run_filter import RunFilter, moment
-from msg_analysis.runs.run_list import RunEntry
+from msg_analysis.runs import RunEntry, RunFilter, moment
 
 UTC = UTC
 NOW = datetime(2026, 11, 25, 12, 0, tzinfo=UTC)

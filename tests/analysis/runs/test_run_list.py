@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from msg_analysis import Experiment, InputError
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.runs.run_list import RunEntry, list_runs
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.runs import RunEntry, list_runs
 
 PAIR = {
     "name": "pair",

@@ -13,9 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.sweep.dotted_keys import KeyProblemError, put
-from msg_analysis.sweep.plan import Sweep, load_sweep, own_seed
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.sweep.grid import KeyProblemError, Sweep, load_sweep, own_seed, put
 from msg_analysis.sweep.sweep_file import json_schema
 
 EXPERIMENT: dict[str, Any] = {

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import msg_analysis
-from msg_analysis.sweep.jobs.software import source_digest, source_files
+from msg_analysis.sweep.points import source_digest, source_files
 
 PACKAGE = Path(msg_analysis.__file__).parent
 JOBS = """

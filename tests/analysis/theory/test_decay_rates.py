@@ -9,10 +9,10 @@ import mpmath
 import numpy as np
 import pytest
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.theory.decay_rates import Rates, asymptotic_rates
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.system import jump_system as systems
+from msg_analysis.theory.settling import Rates, asymptotic_rates
 from msg_analysis.theory.transient import MAX_UNKNOWNS, unknowns
 
 

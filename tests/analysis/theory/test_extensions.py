@@ -16,11 +16,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.step_model import build_step_model
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.step_model import build_step_model
+from msg_analysis.theory.jump_system import emulated, held
 from msg_analysis.theory.moments import MomentSolver, transient_mean
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.system.jump_system import emulated, held
 
 MODELS = settings(max_examples=40, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 
 NETWORKS = 6000

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.network.graphs import Graph
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.graphs import Graph
 from msg_analysis.theory.graph_indices import error_bounds, graph_indices
 from msg_analysis.theory.prediction import predict
 

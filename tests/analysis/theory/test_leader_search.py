@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from msg_analysis.theory.leaders.search import LeaderSearch
+from msg_analysis.theory.leader_search import LeaderSearch
 
 
 @dataclass

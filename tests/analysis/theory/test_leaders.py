@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.theory.leaders.search import LeaderSearch
-from msg_analysis.theory.leaders.selection import (
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.theory.leader_search import LeaderSearch
+from msg_analysis.theory.leaders import (
     LeaderProblem,
     joint_robustness_centrality,
     resolve_law,

@@ -16,16 +16,16 @@ import scipy.linalg
 from tests.support.switching_systems import LINE_RING, steady_of
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.phases import phases
-from msg_analysis.model.step.step_model import build_step_model
-from msg_analysis.theory.decay_rates import asymptotic_rates
-from msg_analysis.theory.leaders.selection import select_leaders, system_error
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.phases import phases
+from msg_analysis.model.step_model import build_step_model
+from msg_analysis.theory import jump_system as systems
+from msg_analysis.theory.leaders import select_leaders, system_error
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict, stationary_start_factor
-from msg_analysis.theory.system import jump_system as systems
+from msg_analysis.theory.settling import asymptotic_rates
 from msg_analysis.theory.transient import solve_transient
-from msg_analysis.theory.two_topology import two_topology
+from msg_analysis.theory.two_graphs import two_topology
 
 GRAPHS = {"a": {"arcs": [[1, 2], [2, 3, 0.7], [3, 1]]}, "b": {"edges": [[1, 2, 0.5]]}}
 PAIR = {"a": {"edges": [[1, 2]]}, "b": {"arcs": [[1, 2, 0.5]]}}

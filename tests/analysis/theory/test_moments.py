@@ -7,11 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.network.markov_chain import stationary_law
-from msg_analysis.theory import moments
+from msg_analysis.experiment.markov_chain import stationary_law
+from msg_analysis.theory import moments, solvers
+from msg_analysis.theory.jump_system import JumpSystem, held
 from msg_analysis.theory.moments import MomentSolver, mode_potential, transient_mean
-from msg_analysis.theory.solvers import dense
-from msg_analysis.theory.system.jump_system import JumpSystem, held
 
 MODELS = settings(max_examples=25, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
@@ -235,7 +234,7 @@ def test_unstable_steps_are_refused():
 
 
 def test_too_large_says_the_size(monkeypatch):
-    monkeypatch.setattr(dense, "MAX_UNKNOWNS", 10)
+    monkeypatch.setattr(solvers, "MAX_UNKNOWNS", 10)
     system, _, _ = consensus(np.random.default_rng(8), 4, 2)
     with pytest.raises(InputError, match="2 graphs of 4 agents give 12 coupled unknowns"):
         MomentSolver(system, method="dense")

@@ -11,9 +11,9 @@ import scipy.linalg
 from digits import DIGITS, exactly, solve
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.network.markov_chain import stationary_law
+from msg_analysis.experiment.markov_chain import stationary_law
+from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.system.jump_system import JumpSystem
 
 RATES = [1e-8, 1e-4, 1.0, 1e3, 1e6]
 GAINS = [1e-3, 1.0, 1e3, 1e6]

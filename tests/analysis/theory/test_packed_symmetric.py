@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from msg_analysis.theory.system import packed_symmetric as symmetric
+from msg_analysis.theory import packed_symmetric as symmetric
 
 
 @pytest.fixture

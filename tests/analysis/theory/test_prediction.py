@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 
 from msg_analysis.errors import NotAvailableError
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict, stationary_start_factor
 
 GOLDEN = Path(__file__).parents[2] / "data" / "golden"
@@ -116,8 +116,8 @@ def test_grounded_leaders_are_the_limit_of_large_gains():
     noise = {"process": [0.5, 1.0, 2.0, 1.0, 1.0]}
     grounded = experiment(problem="tracking", leaders=leaders | {"gain": float("inf")}, noise=noise)
     # Only the continuous law has the limit (no step is short enough for the gain).
+    from msg_analysis.theory.jump_system import JumpSystem
     from msg_analysis.theory.moments import MomentSolver
-    from msg_analysis.theory.system.jump_system import JumpSystem
 
     gain = np.diag([0.0, 1e8, 0.0, 0.0, 1e8])
     z = np.stack([graph.laplacian for graph in grounded.graph_list]) + gain

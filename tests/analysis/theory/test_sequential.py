@@ -6,11 +6,10 @@ import functools
 import numpy as np
 import pytest
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.graph_path import past_modes
-from msg_analysis.model.step.phases import phases
-from msg_analysis.model.step.sequential_law import build_run_model, ideal_uses, sequential
-from msg_analysis.model.step.step_model import build_step_model
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.graph_path import past_modes
+from msg_analysis.model.phases import phases
+from msg_analysis.model.step_model import build_run_model, build_step_model, ideal_uses, sequential
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 

@@ -7,12 +7,11 @@ import pytest
 import scipy.linalg
 from switching_systems import LINE_RING, network, steady_of
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory import settling, transient
-from msg_analysis.theory.decay_rates import asymptotic_rates
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.settling import settling_time
-from msg_analysis.theory.system import jump_system as systems
+from msg_analysis.theory.settling import asymptotic_rates, settling_time
 from msg_analysis.theory.transient import point_start, start_of
 
 

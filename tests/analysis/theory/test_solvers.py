@@ -12,15 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.network.markov_chain import stationary_law
-from msg_analysis.theory import moments
+from msg_analysis.experiment.markov_chain import stationary_law
+from msg_analysis.theory import coupled_equations, moments
+from msg_analysis.theory.coupled_equations import AveragedEquations, CoupledEquations
+from msg_analysis.theory.jump_system import JumpSystem, held
+from msg_analysis.theory.krylov import plain_conjugate_gradients
+from msg_analysis.theory.lyapunov import LocalSolves
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.solvers import coupled_equations
-from msg_analysis.theory.solvers.averaged_equations import AveragedEquations
-from msg_analysis.theory.solvers.coupled_equations import CoupledEquations
-from msg_analysis.theory.solvers.krylov import plain_conjugate_gradients
-from msg_analysis.theory.solvers.lyapunov import LocalSolves
-from msg_analysis.theory.system.jump_system import JumpSystem, held
 
 MODELS = settings(max_examples=30, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
@@ -360,10 +358,10 @@ def test_drift_that_pushes_away_is_refused():
 
 
 def test_no_convergence_is_an_error_or_a_dense_solve(monkeypatch):
-    from msg_analysis.theory.solvers import iterative
+    from msg_analysis.theory import solvers
 
-    monkeypatch.setattr(iterative, "MAX_ITERATIONS", 2)
-    monkeypatch.setattr(iterative, "MAX_RELATIVE_ERROR", 1e-14)
+    monkeypatch.setattr(solvers, "MAX_ITERATIONS", 2)
+    monkeypatch.setattr(solvers, "MAX_RELATIVE_ERROR", 1e-14)
     random = np.random.default_rng(12)
     model = system(random, 12, generator(random, 4), "directed")
     with pytest.raises(InputError, match="iterations do not converge"):
@@ -377,11 +375,11 @@ def test_no_convergence_is_an_error_or_a_dense_solve(monkeypatch):
 
 
 def test_many_forms_are_solved_in_batches(monkeypatch):
-    from msg_analysis.theory.solvers import iterative
+    from msg_analysis.theory import solvers
 
     random = np.random.default_rng(13)
     model = system(random, 9, generator(random, 3))
     forms = np.stack([a + a.T for a in random.standard_normal((7, 8, 8))])
     together = MomentSolver(model).dual(forms)
-    monkeypatch.setattr(iterative, "CHUNK", 400)
+    monkeypatch.setattr(solvers, "CHUNK", 400)
     np.testing.assert_allclose(MomentSolver(model).dual(forms), together, rtol=1e-10, atol=1e-12)

@@ -10,7 +10,7 @@ import pytest
 import scipy.linalg
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.theory import time_mean_variance
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.theory.time_mean_variance import mean_variance

@@ -12,13 +12,11 @@ from hypothesis import strategies as st
 from switching_systems import LINE_RING, network, steady_of
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.theory import transient
-from msg_analysis.theory.decay_rates import asymptotic_rates
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.theory import jump_system as systems
+from msg_analysis.theory import rational_krylov, transient
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.settling import settling_time
-from msg_analysis.theory.solvers import rational_krylov
-from msg_analysis.theory.system import jump_system as systems
+from msg_analysis.theory.settling import asymptotic_rates, settling_time
 from msg_analysis.theory.transient import point_start, start_of, unreduced_consensus
 
 MODELS = settings(max_examples=20, deadline=None, derandomize=True)

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.system import jump_system as systems
-from msg_analysis.theory.two_topology import MAX_UNKNOWNS, two_topology
+from msg_analysis.theory.two_graphs import MAX_UNKNOWNS, two_topology
 
 MODELS = settings(max_examples=25, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)

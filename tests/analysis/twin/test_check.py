@@ -9,15 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.common import large_arrays
-from msg_analysis.common.large_arrays import in_file
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.common import arrays
+from msg_analysis.common.arrays import FloatArray, IntArray, in_file
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.run import Trajectory
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
-from msg_analysis.types import FloatArray, IntArray
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +60,8 @@ def flip(states: FloatArray, *where: int) -> FloatArray:
 
 def test_a_long_run(stored: Callable[..., Trajectory], twin: Trajectory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Logged and computed states are in files and compared in pieces, here of ten steps."""
-    monkeypatch.setattr(large_arrays, "LARGE", 1)
-    monkeypatch.setattr(large_arrays, "BLOCK_NUMBERS", 60)
+    monkeypatch.setattr(arrays, "LARGE", 1)
+    monkeypatch.setattr(arrays, "BLOCK_NUMBERS", 60)
     again = simulate(twin.record.experiment, record=twin.record)
     assert in_file(again.states)
     assert np.array_equal(again.states, twin.states)

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.trajectory import Trajectory
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.run import Trajectory
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 

@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.arithmetic.payload import from_payload, to_payload
-from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.agent_law import agent_law
-from msg_analysis.model.run.graph_path import mode_path
-from msg_analysis.model.run.trajectory import Completeness, Trajectory
-from msg_analysis.model.step.phases import phases
-from msg_analysis.model.step.process_noise import ProcessNoise
-from msg_analysis.model.step.step_model import build_step_model
+from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK
+from msg_analysis.arithmetic.update_law import from_payload, to_payload
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.agent_law import agent_law
+from msg_analysis.model.graph_path import mode_path
+from msg_analysis.model.phases import phases
+from msg_analysis.model.process_noise import ProcessNoise
+from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.step_model import build_step_model
 from msg_analysis.twin.check import check
 from msg_analysis.twin.log_replay import replay
 from msg_analysis.twin.simulate import new_record
-from msg_analysis.types import FloatArray
 
 DT = 50_000_000  # ns
 

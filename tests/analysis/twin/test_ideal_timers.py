@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from msg_analysis.model.arithmetic.payload import from_payload, to_payload
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.agent_law import agent_law
-from msg_analysis.model.step.phases import phases
-from msg_analysis.model.step.step_model import build_step_model
-from msg_analysis.report.documents.transient_and_facts import describe_transient
+from msg_analysis.arithmetic.update_law import from_payload, to_payload
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.agent_law import agent_law
+from msg_analysis.model.phases import phases
+from msg_analysis.model.step_model import build_step_model
+from msg_analysis.report.documents import describe_transient
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from links_by_hand import assert_by_hand
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.arithmetic import many_steps
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.agent_law import agent_law
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.model.step.air import LOST
+from msg_analysis.arithmetic import update_law
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.agent_law import agent_law
+from msg_analysis.model.reception import LOST
+from msg_analysis.model.run import Trajectory
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
@@ -79,7 +79,7 @@ def test_equals_loops_over_numbers_to_the_last_bit(pace: str, law: str, air: str
 @pytest.mark.parametrize("air", ["all", "late and lost", "bursts, hold"])
 @pytest.mark.parametrize("pace", PACES)
 def test_so_does_numpy(pace: str, air: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(many_steps, "COMPILED", False)
+    monkeypatch.setattr(update_law, "COMPILED", False)
     assert_by_hand(simulate(experiment("consensus", air, pace)))
 
 

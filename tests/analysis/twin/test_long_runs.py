@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.common import large_arrays
-from msg_analysis.common.large_arrays import in_file
-from msg_analysis.inference.verdict.compare import compare
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.graph_path import mode_path
-from msg_analysis.model.step.air_reception import MessagesUsed
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.common import arrays
+from msg_analysis.common.arrays import in_file
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.graph_path import mode_path
+from msg_analysis.model.reception import MessagesUsed
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record, simulate
 
@@ -58,7 +58,7 @@ def test_the_same_in_files(case: str, tmp_path: Path, monkeypatch: pytest.Monkey
     """Twin, bag and check; a bit that is turned over behind two blocks of steps is found."""
     what = experiment(case, 600)
     twin = simulate(what)
-    monkeypatch.setattr(large_arrays, "LARGE", 1)
+    monkeypatch.setattr(arrays, "LARGE", 1)
     again = simulate(what, record=twin.record)
     for name in ("states", "published", "lost", "used", "made", "agent_modes"):
         one, other = getattr(twin, name), getattr(again, name)
@@ -80,7 +80,7 @@ def test_the_same_in_files(case: str, tmp_path: Path, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize("case", ["held", "noisy", "real time", "protocol"])
 def test_check_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice the steps need hardly more memory: 8 bytes of each step for its graph, and as much for a copy."""
-    monkeypatch.setattr(large_arrays, "LARGE", 1)
+    monkeypatch.setattr(arrays, "LARGE", 1)
     runs = [simulate(experiment(case, steps)) for steps in (768, 1_280)]
     short, long = (_peak(lambda run=run: check(run)) for run in runs)
     assert long - short < 512 * 32
@@ -89,11 +89,11 @@ def test_check_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize("case", ["real time", "protocol in real time"])
 def test_comparison_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice the steps need at most some numbers more for each; its states alone have 320 bytes."""
-    monkeypatch.setattr(large_arrays, "LARGE", 1)
+    monkeypatch.setattr(arrays, "LARGE", 1)
     for place in ("observed.observation.BLOCK_NUMBERS", "observed.measurement.BLOCK_NUMBERS"):
         monkeypatch.setattr(f"msg_analysis.inference.{place}", 4_000)
-    monkeypatch.setattr("msg_analysis.inference.errors.given_path.SMALL_BLOCK", 4_000)
-    monkeypatch.setattr("msg_analysis.inference.realtime.pattern_events.CACHED_NUMBERS", 4_000)
+    monkeypatch.setattr("msg_analysis.inference.given_path.SMALL_BLOCK", 4_000)
+    monkeypatch.setattr("msg_analysis.inference.pattern_events.CACHED_NUMBERS", 4_000)
     runs = [simulate(experiment(case, steps, replicas=8)) for steps in (200, 400)]
     for run in runs:  # what is kept for comparisons to come
         compare(run)

@@ -14,12 +14,12 @@ import pytest
 import yaml
 from processors import another_processor
 
-from msg_analysis.bags.reader import read_bag
-from msg_analysis.bags.trajectory_writer import write_trajectory
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.errors import InputError
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.twin import start as twin_start
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.run_record import RunRecord
+from msg_analysis.twin import simulate as twin_start
 from msg_analysis.twin.simulate import new_record, simulate
 
 PATH_AND_STAR = {"path": {"path": [1, 2, 3, 4, 5, 6]}, "star": {"star": {"center": 2}}}
@@ -53,8 +53,8 @@ CASES: dict[str, dict[str, Any]] = {
 WRITE = """
 import sys
 from pathlib import Path
-from msg_analysis.bags.trajectory_writer import write_trajectory
-from msg_analysis.model.experiment.experiment import ValidExperiment
+from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.twin.simulate import simulate
 for file in map(Path, sys.argv[1:]):
     write_trajectory(simulate(ValidExperiment.load(file)), file.with_suffix(""))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from msg_analysis.model.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, generator
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.agent_law import agent_law
-from msg_analysis.model.run.graph_path import mode_path
-from msg_analysis.model.step.step_model import build_step_model
+from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, generator
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.agent_law import agent_law
+from msg_analysis.model.graph_path import mode_path
+from msg_analysis.model.step_model import build_step_model
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import new_record, simulate
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.agent_law import agent_law
-from msg_analysis.model.run.trajectory import Trajectory
-from msg_analysis.model.step.air import LOST
-from msg_analysis.model.step.step_model import build_step_model
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.agent_law import agent_law
+from msg_analysis.model.reception import LOST
+from msg_analysis.model.run import Trajectory
+from msg_analysis.model.step_model import build_step_model
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 

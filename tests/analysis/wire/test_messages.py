@@ -12,8 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from msg_analysis.wire.cdr_fields import CdrError
-from msg_analysis.wire.messages import (
+from msg_analysis.messages.cdr import CdrError
+from msg_analysis.messages.messages import (
     ActiveGraph,
     AgentState,
     Progress,

@@ -11,16 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.run.graph_path import Sojourn, sojourns
-from msg_analysis.model.run.record import RunRecord
-from msg_analysis.model.step.step_model import first_graph
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.messages.acceptance import Refusal, RunRules, decode_of_run, sign, state_frame, state_receiver
+from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, encode_string
+from msg_analysis.messages.topics import END, PROGRESS, RESEND
+from msg_analysis.model.graph_path import Sojourn, sojourns
+from msg_analysis.model.run_record import RunRecord
+from msg_analysis.model.step_model import first_graph
 from msg_analysis.twin.simulate import new_record
-from msg_analysis.wire.messages import ActiveGraph, AgentState, Progress, encode_string
-from msg_analysis.wire.receiving import RunRules, decode_of_run, state_frame, state_receiver
-from msg_analysis.wire.refusals import Refusal
-from msg_analysis.wire.signatures import sign
-from msg_analysis.wire.topics import END, PROGRESS, RESEND
 
 RECORD = new_record(
     ValidExperiment.parse(

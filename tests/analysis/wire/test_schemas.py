@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-import msg_analysis.wire
-from msg_analysis.wire.schemas import ACTIVE_GRAPH, AGENT_STATE, ESTIMATE, PROGRESS, STRING, MessageType
+import msg_analysis.messages
+from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, ESTIMATE, PROGRESS, STRING, MessageType
 
 DEFINITIONS = Path(msg_analysis.wire.__file__).parent / "definitions"
 INTERFACES = Path(__file__).parents[3] / "ros_ws" / "src" / "msg_agents_interfaces"

@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from msg_analysis.wire.cdr_fields import CdrError
-from msg_analysis.wire.schemas import STATE_BATCH
-from msg_analysis.wire.state_batches import decode_batch, encode_batch
+from msg_analysis.messages.cdr import CdrError, decode_batch, encode_batch
+from msg_analysis.messages.schemas import STATE_BATCH
 
 RUN = bytes(range(16))
 

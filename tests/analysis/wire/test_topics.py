@@ -6,8 +6,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from msg_analysis.wire.refusals import Refusal
-from msg_analysis.wire.topics import STATE, TOPICS, TRUTH, network_topics
+from msg_analysis.messages.acceptance import Refusal
+from msg_analysis.messages.topics import STATE, TOPICS, TRUTH, network_topics
 
 DOCS = Path(__file__).parents[3] / "docs"
 

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Publish a recorded network again, and watch it.
 
@@ -18,8 +7,7 @@ ros2 launch msg_agents_bringup replay.launch.py bag:=runs/line_ring_20260114_083
 """
 
 from msg_agents.nodes.launch_actions import describe
-from msg_agents.running.launch_arguments import REPLAY_ARGUMENTS
-from msg_agents.running.launch_support import LaunchedReplay
+from msg_agents.run.launch import REPLAY_ARGUMENTS, LaunchedReplay
 
 
 def generate_launch_description():

@@ -1,16 +1,5 @@
-# Copyright 2026 msg_agents maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
 
 """Radius of the fourth moments against Kronecker powers of the matrices of every possible loss."""
 
@@ -21,18 +10,18 @@ import numpy as np
 import pytest
 from tests.analysis.theory.test_message_steps import Brute, parse
 
-from msg_analysis.model.experiment.experiment import ValidExperiment
-from msg_analysis.model.step.sequential_law import build_run_model
-from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.tails.fourth_moments import (
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.step_model import build_run_model
+from msg_analysis.theory.fourth_moments import (
     FourthMoment,
     advance,
     fourth_moment,
     fourth_radius,
     lyapunov_bound,
+    random_steps,
     second_radius,
 )
-from msg_analysis.theory.tails.random_steps import random_steps
+from msg_analysis.theory.prediction import predict
 
 HEAVY = {  # found by a random search: the second moments are finite, the fourth are not
     "name": "heavy",

@@ -1,0 +1,262 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The messages of an MCAP file, whole or torn, in batches that numpy can work on.
+
+A file is read once, from front to back. Damaged chunks are counted and left out; a tear ends the reading.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Header, Metadata, Schema, Statistics
+
+from msg_analysis.bags.mcap_chunks import (
+    MESSAGE_HEAD,
+    RECORD,
+    RECORD_LIMIT,
+    ZSTD_SUFFIX,
+    DamageError,
+    gather,
+    indexed,
+    locate,
+    run_of_messages,
+    unpack,
+)
+from msg_analysis.bags.stored_file import Batch, StoredFile, no_time
+from msg_analysis.common.arrays import IntArray
+from msg_analysis.errors import BagError
+
+MAGIC = b"\x89MCAP0\r\n"
+MOST_OTHERS = 2**18  # records of a chunk that are no messages: two for every number of a channel
+MOST_DESCRIBED = 2**26  # bytes of the schemas and channels in the chunks of a file: what they describe is kept
+_LOOSE = 2**18  # bytes of a batch of messages that are not in chunks
+
+
+@dataclass(slots=True)
+class _Chunk:
+    """A chunk and the message index records behind it."""
+
+    content: bytes
+    end: int  # bytes of the file up to the end of its record
+    index: list[bytes] = field(default_factory=list)
+    _filled: int = 0
+
+    def add_index(self, content: bytes) -> None:
+        """Take the content of one more index record, up to ``RECORD_LIMIT`` bytes of all."""
+        self._filled += len(content)
+        if self._filled <= RECORD_LIMIT:
+            self.index.append(content)
+
+
+class _Source:
+    """A stream of records that gives out many message records in a row at once; nothing else may read the stream."""
+
+    def __init__(self, stream: io.BufferedReader) -> None:
+        self._stream = stream
+        self._buffer, self._at = b"", 0  # bytes read from the stream, and how many of them were given out
+
+    def read(self, size: int) -> bytes:
+        """So many bytes; fewer at the end."""
+        found = self._buffer[self._at : self._at + size]
+        self._at += size
+        if len(found) < size:
+            self._buffer, self._at = b"", 0
+            found += self._stream.read(size - len(found))
+        return found
+
+    def messages(self, head: bytes) -> tuple[bytes, IntArray, IntArray, int]:
+        """Buffer, (messages,) content offsets and sizes in it, and bytes of all, of whole message records in a row.
+
+        The first is the one whose ``head`` was read last. 0 bytes where it is cut off or does not fit into ``_LOOSE``
+        bytes.
+        """
+        if self._at >= len(head):
+            self._at -= len(head)
+        else:
+            self._buffer, self._at = head, 0
+        for _ in range(2):
+            start, size, end = run_of_messages(self._buffer, self._at)
+            if len(start):
+                break
+            self._buffer, self._at = self._buffer[self._at :] + self._stream.read(_LOOSE), 0
+        length, self._at = end - self._at, end
+        if not length:
+            self._at += len(head)  # the head counts as read again
+        return self._buffer, start, size, length
+
+
+@dataclass(slots=True)
+class McapFile(StoredFile):
+    """An MCAP file to be read once, by iterating over ``batches()``; compressed as a whole if named *.zstd."""
+
+    statistics: Statistics | None = None
+    false_indexes: int = 0  # chunks whose index is wrong: here the records decide, other programs use the index
+    _described: int = 0  # bytes of the schemas and channels in the chunks
+
+    def _stored(self) -> Iterator[Batch]:
+        try:
+            size = self.path.stat().st_size
+            with contextlib.ExitStack() as stack:
+                stream = stack.enter_context(self.path.open("rb"))
+                if self.path.suffix == ZSTD_SUFFIX:
+                    size = 2**62  # not known before all is unpacked
+                    unpacked = zstandard.ZstdDecompressor().stream_reader(stream, read_across_frames=True)
+                    stream = stack.enter_context(io.BufferedReader(unpacked))
+                yield from self._batches(stream, size)
+        except (OSError, zstandard.ZstdError) as error:
+            if self.whole_bytes and isinstance(error, zstandard.ZstdError):
+                self.torn = f"cannot be unpacked beyond byte {self.whole_bytes}"
+                return
+            raise BagError(f"{self.path}: cannot be read ({error})") from error
+
+    def _batches(self, stream: io.BufferedReader, size: int) -> Iterator[Batch]:
+        start = stream.read(len(MAGIC))
+        if not start:
+            raise BagError(f"{self.path}: empty: nothing was recorded")
+        if start != MAGIC:
+            raise BagError(f"{self.path}: not an MCAP file: expected a bag of ROS 2's mcap storage")
+        self.whole_bytes = len(MAGIC)
+        _keep_memory()
+        zstd = zstandard.ZstdDecompressor()
+        chunk: _Chunk | None = None
+        for opcode, content, places in self._records(_Source(stream), size):
+            if opcode == Opcode.MESSAGE_INDEX and chunk is not None:
+                chunk.add_index(content)
+                continue
+            if chunk is not None:
+                yield from self._chunk(chunk, zstd)
+                chunk = None
+            if opcode == Opcode.CHUNK:
+                chunk = _Chunk(content, self.whole_bytes)
+            elif opcode == Opcode.MESSAGE:
+                yield _loose_batch(content, *places, self.whole_bytes)
+            else:
+                with contextlib.suppress(DamageError):
+                    self.note(opcode, content)
+        if chunk is not None:
+            yield from self._chunk(chunk, zstd)
+
+    def _records(self, stream: _Source, size: int) -> Iterator[tuple[int, bytes, tuple[IntArray, IntArray]]]:
+        """Opcode, content and (offsets, sizes) of each record; message records in a row come together."""
+        while True:
+            head = stream.read(RECORD.size)
+            if len(head) < RECORD.size:
+                self.torn = f"ends after {self.whole_bytes} bytes without a footer"
+                return
+            opcode, length = RECORD.unpack(head)
+            content = b""
+            if opcode == Opcode.MESSAGE:
+                data, start, sizes, whole = stream.messages(head)
+                if whole:
+                    self.whole_bytes += whole
+                    yield opcode, data, (start, sizes)
+                    continue
+            if not opcode:  # a power cut leaves zeros
+                self.torn = f"no record at byte {self.whole_bytes}, where one should be"
+                return
+            if length <= min(RECORD_LIMIT, size - self.whole_bytes):
+                content = stream.read(length)
+            if len(content) < length:
+                self.torn = f"the record at byte {self.whole_bytes} is cut off or damaged"
+                return
+            self.whole_bytes += RECORD.size + length
+            if opcode == Opcode.FOOTER:
+                if stream.read(len(MAGIC)) != MAGIC:
+                    self.torn = "the closing magic bytes are missing"
+                return
+            yield opcode, content, (np.array([0]), np.array([length]))
+
+    def note(self, opcode: int, content: bytes) -> None:
+        """Keep the content of a record that is not a message; DamageError where it does not fit its type.
+
+        BagError where there are too many channels.
+        """
+        stream = ReadDataStream(io.BytesIO(content))
+        try:
+            if opcode == Opcode.HEADER:
+                header = Header.read(stream)
+                self.profile, self.library = header.profile, header.library
+            elif opcode == Opcode.SCHEMA:
+                schema = Schema.read(stream)
+                self.schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = Channel.read(stream)
+                self.add_channel(channel)
+            elif opcode == Opcode.METADATA:
+                self.metadata.append(Metadata.read(stream))
+            elif opcode == Opcode.STATISTICS:
+                self.statistics = Statistics.read(stream)
+            elif opcode == Opcode.ATTACHMENT:
+                self.attachments.append(Attachment.read(stream))
+        except BagError:
+            raise
+        except Exception as error:  # the library raises many kinds of errors on damage
+            raise DamageError from error
+
+    def _chunk(self, chunk: _Chunk, zstd: zstandard.ZstdDecompressor) -> Iterator[Batch]:
+        try:
+            data = unpack(chunk.content, zstd)
+        except Exception:  # decompressors raise many kinds of errors on damage
+            self.damaged_chunks += 1
+            return
+        self.count_expanded(len(data), chunk.end)
+        try:
+            places = locate(data, chunk.index)
+            if places is None:
+                places = self._walk(data)
+                self.false_indexes += bool(chunk.index) and not indexed(places[0], chunk.index)
+            batch = Batch.of_contents(data, *places, chunk.end)
+        except BagError:
+            raise
+        except Exception:  # the library raises many kinds of errors on damage
+            self.damaged_chunks += 1
+            return
+        yield batch
+
+    def _walk(self, data: bytes) -> tuple[IntArray, IntArray]:
+        """(messages,) content offsets and sizes of all message records of a chunk; other records are noted."""
+        starts, sizes, at, others = [], [], 0, 0
+        while at < len(data):
+            start, size, at = run_of_messages(data, at)
+            starts.append(start)
+            sizes.append(size)
+            if at == len(data):
+                break
+            opcode, length = RECORD.unpack_from(data, at)
+            at += RECORD.size
+            others += 1
+            if length > len(data) - at or opcode in (0, Opcode.MESSAGE) or others > MOST_OTHERS:
+                raise DamageError
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):  # nothing else belongs into a chunk
+                self._described += length
+                if self._described > MOST_DESCRIBED:
+                    raise DamageError
+                self.note(opcode, data[at : at + length])
+            at += length
+        none = np.empty(0, dtype=np.int64)
+        return np.concatenate([none, *starts]), np.concatenate([none, *sizes])
+
+
+def _keep_memory() -> None:
+    """Let the C library keep large blocks that are freed from chunk to chunk, instead of mapping fresh pages each time.
+
+    Touching fresh pages takes longer than all that is done with a chunk. Freeing one large block raises the threshold
+    (mallopt(3), M_MMAP_THRESHOLD).
+    """
+    np.empty(2**24, np.uint8)
+
+
+def _loose_batch(data: bytes, start: IntArray, size: IntArray, end: int) -> Batch:
+    """Messages that are not in a chunk; damaged ones are left out one by one."""
+    start, size = start[size >= MESSAGE_HEAD.itemsize], size[size >= MESSAGE_HEAD.itemsize]
+    timed = ~no_time(gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD))
+    return Batch.of_contents(data, start[timed], size[timed], end)

@@ -1,0 +1,289 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Writes MCAP files with their messages in chunks: the same bytes as ``mcap.writer.Writer``, in half its time.
+
+The records other than messages and their indexes are encoded by ``mcap``.
+"""
+
+from __future__ import annotations
+
+import struct
+import tempfile
+import zlib
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from typing import BinaryIO
+
+import numpy as np
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+
+from msg_analysis.bags.mcap_chunks import MESSAGE_HEAD, Compression, gather, scatter
+from msg_analysis.common.arrays import AnyArray, IntArray
+
+MAGIC = b"\x89MCAP0\r\n"
+MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time; then the data
+_MESSAGE_RECORD = np.dtype([("opcode", "u1"), ("length", "<u8"), ("head", MESSAGE_HEAD)])  # the same
+ENTRY = struct.Struct("<QQ")  # of an index: log time, place among the records of the chunk
+MESSAGE_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of the entries; then the entries
+CHUNK = struct.Struct("<BQQQQI")  # opcode, length, first and last time, size and checksum of the records
+FOOTER = struct.Struct("<BQQQ")  # what of it the checksum of the summary covers
+INDEXES_IN_MEMORY = 2**24  # bytes of the indexes of chunks; what is beyond is kept in a temporary file
+ZSTD_LEVEL = -1  # noisy states: 3 % larger than with zstd's own level, 3, in a third of the time
+COMPRESSION_NAMES: dict[Compression, str] = {"none": "", "zstd": "zstd", "lz4": "lz4"}
+
+
+class McapWriter:
+    """An MCAP file being written to a stream; OSError, from every method: the stream takes no more."""
+
+    def __init__(
+        self,
+        stream: BinaryIO,
+        *,
+        chunk_size: int,
+        compression: Compression,
+        profile: str = "ros2",
+        library: str = "mcap",
+        directory: str | None = None,  # of a temporary file; None: that of the system
+    ) -> None:
+        self._stream, self._chunk_size, self._compression = stream, chunk_size, compression
+        self._schemas: list[Schema] = []
+        self._channels: list[Channel] = []
+        # An index of a chunk has an entry for every channel: an hour of a thousand agents has gigabytes of them.
+        self._chunk_indexes = tempfile.SpooledTemporaryFile(INDEXES_IN_MEMORY, dir=directory)  # noqa: SIM115
+        self._chunks = 0
+        self._first: int | None = None  # log time [ns] of the first message
+        self._last = 0
+        self._metadata_indexes: list[MetadataIndex] = []
+        self._attachment_indexes: list[AttachmentIndex] = []
+        self._counts: dict[int, int] = {}  # messages by channel, of the chunks that are finished
+        self._chunk: list[bytes] = []  # records of the chunk in progress, in parts
+        self._size = 0  # of the chunk in progress
+        self._index: dict[int, bytearray] = defaultdict(bytearray)  # by channel: an ENTRY for each message
+        stream.write(MAGIC + _encoded(Header(profile=profile, library=library)))
+
+    def add_metadata(self, name: str, data: dict[str, str]) -> None:
+        """Append a metadata record, outside the chunks."""
+        record = _encoded(Metadata(name=name, metadata=data))
+        self._metadata_indexes.append(MetadataIndex(offset=self._stream.tell(), length=len(record), name=name))
+        self._stream.write(record)
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Append an attachment, outside the chunks."""
+        record = _encoded(attachment)
+        self._attachment_indexes.append(
+            AttachmentIndex(
+                offset=self._stream.tell(),
+                length=len(record),
+                log_time=attachment.log_time,
+                create_time=attachment.create_time,
+                data_size=len(attachment.data),
+                name=attachment.name,
+                media_type=attachment.media_type,
+            )
+        )
+        self._stream.write(record)
+
+    def register_schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Register a schema; its number."""
+        self._schemas.append(Schema(id=len(self._schemas) + 1, data=data, encoding=encoding, name=name))
+        return self._register(self._schemas)
+
+    def register_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
+        """Register a channel; its number."""
+        self._channels.append(
+            Channel(
+                id=len(self._channels) + 1, topic=topic, message_encoding=encoding, schema_id=schema, metadata=metadata
+            )
+        )
+        return self._register(self._channels)
+
+    def _register(self, records: Sequence[McapRecord]) -> int:
+        record = _encoded(records[-1])
+        self._chunk.append(record)
+        self._size += len(record)
+        if self._size > self._chunk_size:
+            self._finish_chunk()
+        return len(records)
+
+    def add_message(
+        self, channel: int, time_ns: int, data: bytes, sequence: int, published_ns: int | None = None
+    ) -> None:
+        """Append a message, logged at that time, and published then if no other time is given."""
+        length = len(data)
+        published = time_ns if published_ns is None else published_ns
+        self._chunk += (MESSAGE.pack(Opcode.MESSAGE, length + 22, channel, sequence, time_ns, published), data)
+        self._index[channel] += ENTRY.pack(time_ns, self._size)
+        self._size += length + MESSAGE.size
+        if self._size > self._chunk_size:
+            self._finish_chunk()
+
+    def add_messages(self, head: AnyArray, data: bytes, start: IntArray, size: IntArray) -> None:
+        """Append messages: heads (``MESSAGE_HEAD``), places and sizes of their bytes in ``data``, (messages,) each.
+
+        The same bytes as by ``add_message`` for each, in a fraction of the time.
+        """
+        done = 0
+        while done < len(head):
+            piece = slice(done, done + self.fitting(size[done:]))
+            self._add_piece(head[piece], data, start[piece], size[piece])
+            done = piece.stop
+
+    def fitting(self, size: IntArray) -> int:
+        """How many of the messages with these sizes, (messages,), go into the chunk in progress."""
+        end = np.cumsum(size + MESSAGE.size)
+        whole = int(np.searchsorted(end, self._chunk_size - self._size, side="right"))
+        return min(whole + 1, len(size))  # a chunk ends with the message that makes it too large
+
+    def _add_piece(self, head: AnyArray, data: bytes, start: IntArray, size: IntArray) -> None:
+        """Append messages to one chunk, and finish that when it is full."""
+        place = np.cumsum(size + MESSAGE.size) - size  # of their bytes among the records
+        total = int(place[-1] + size[-1])
+        records = np.empty(total, dtype=np.uint8)
+        heads = np.empty(len(head), _MESSAGE_RECORD)
+        heads["opcode"], heads["length"], heads["head"] = Opcode.MESSAGE, size + MESSAGE_HEAD.itemsize, head
+        scatter(records, place - MESSAGE.size, heads.view(f"V{MESSAGE.size}"))
+        for length in np.unique(size).tolist():
+            of_it = np.flatnonzero(size == length)
+            if length:
+                scatter(records, place[of_it], gather(data, start[of_it], length))
+        self._chunk.append(records.tobytes())
+        order = np.argsort(head["channel"], kind="stable")
+        entries = np.column_stack((head["log_time"], (place - MESSAGE.size + self._size).astype(np.uint64)))
+        flat = memoryview(entries[order].astype("<u8").tobytes())
+        channels, first, counts = np.unique(head["channel"][order], return_index=True, return_counts=True)
+        for number in np.argsort(order[first]).tolist():  # as they come
+            begin = int(first[number])
+            self._index[int(channels[number])] += flat[ENTRY.size * begin : ENTRY.size * (begin + int(counts[number]))]
+        self._size += total
+        if self._size > self._chunk_size:
+            self._finish_chunk()
+
+    def _finish_chunk(self) -> None:
+        """Write the chunk in progress; one without messages stays in progress."""
+        if not self._index:
+            return
+        records, entries = b"".join(self._chunk), dict(self._index)
+        self._chunk.clear()
+        self._index.clear()
+        self._size = 0
+        compressed = _compressed(records, self._compression)
+        name = COMPRESSION_NAMES[self._compression].encode()
+        times = np.frombuffer(b"".join(entries.values()), "<u8")[::2]
+        start, end = int(times.min()), int(times.max())
+        tail = struct.pack(f"<I{len(name)}sQ", len(name), name, len(compressed))
+        length = CHUNK.size - 9 + len(tail) + len(compressed)
+        head = CHUNK.pack(Opcode.CHUNK, length, start, end, len(records), zlib.crc32(records)) + tail
+        place = self._stream.tell()
+        after = place + len(head) + len(compressed)
+        indexes, offsets = bytearray(), {}
+        for channel, index in entries.items():
+            self._counts[channel] = self._counts.get(channel, 0) + len(index) // ENTRY.size
+            offsets[channel] = after + len(indexes)
+            indexes += MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, len(index) + 6, channel, len(index))
+            indexes += index
+        for part in (head, compressed, indexes):
+            self._stream.write(part)
+        chunk_index = ChunkIndex(
+            message_start_time=start,
+            message_end_time=end,
+            chunk_start_offset=place,
+            chunk_length=after - place,
+            message_index_offsets=offsets,
+            message_index_length=len(indexes),
+            compression=name.decode(),
+            compressed_size=len(compressed),
+            uncompressed_size=len(records),
+        )
+        self._chunk_indexes.write(_encoded(chunk_index))
+        self._chunks += 1
+        self._first = start if self._first is None else min(self._first, start)
+        self._last = max(self._last, end)
+
+    def flush(self) -> None:
+        """Finish the chunk in progress and hand everything to the operating system."""
+        self._finish_chunk()
+        self._stream.flush()
+
+    def finish(self) -> None:
+        """Write the summary; the stream stays open."""
+        self._finish_chunk()
+        self._stream.write(_encoded(DataEnd(0)))
+        start, checksum = self._stream.tell(), 0
+        offsets = b""
+        for opcode, parts in self._groups():
+            begin = self._stream.tell()
+            for part in parts:
+                checksum = zlib.crc32(part, checksum)
+                self._stream.write(part)
+            length = self._stream.tell() - begin
+            offsets += _encoded(SummaryOffset(group_opcode=opcode, group_start=begin, group_length=length))
+        self._chunk_indexes.close()
+        offset_start = self._stream.tell()
+        checksum = zlib.crc32(FOOTER.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(offsets, checksum))
+        footer = Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=checksum)
+        self._stream.write(offsets + _encoded(footer) + MAGIC)
+
+    def _groups(self) -> Iterator[tuple[Opcode, Iterable[bytes]]]:
+        """Opcode and bytes of the groups of the summary."""
+        groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
+            (Opcode.SCHEMA, self._schemas),
+            (Opcode.CHANNEL, self._channels),
+            (Opcode.STATISTICS, [self._statistics()]),
+        ]
+        for opcode, records in groups:
+            yield opcode, map(_encoded, records)
+        self._chunk_indexes.seek(0)
+        yield Opcode.CHUNK_INDEX, iter(lambda: self._chunk_indexes.read(2**20), b"")
+        yield Opcode.ATTACHMENT_INDEX, map(_encoded, self._attachment_indexes)
+        yield Opcode.METADATA_INDEX, map(_encoded, self._metadata_indexes)
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=len(self._attachment_indexes),
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
+            chunk_count=self._chunks,
+            message_count=sum(self._counts.values()),
+            metadata_count=len(self._metadata_indexes),
+            message_start_time=self._first or 0,
+            message_end_time=self._last,
+            schema_count=len(self._schemas),
+        )
+
+
+def _encoded(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    data: bytes = builder.end()
+    return data
+
+
+def _compressed(data: bytes, compression: Compression) -> bytes:
+    if compression == "zstd":
+        import zstandard
+
+        compressed: bytes = zstandard.compress(data, level=ZSTD_LEVEL)
+        return compressed
+    if compression == "lz4":
+        import lz4.frame
+
+        framed: bytes = lz4.frame.compress(data)
+        return framed
+    return data

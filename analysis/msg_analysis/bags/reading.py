@@ -1,0 +1,380 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Reads a recorded run, whichever program recorded it, and counts what is there and what is missing.
+
+The run record comes from the topic `experiment`, or from the metadata of files that this software wrote.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Metadata
+
+from msg_analysis.bags.files import Inventory, bag_files, first_file, stored_file
+from msg_analysis.bags.mcap_chunks import RECORD, RECORD_LIMIT
+from msg_analysis.bags.mcap_reading import MAGIC
+from msg_analysis.bags.run_builder import Collector
+from msg_analysis.bags.stored_file import Batch, StoredFile
+from msg_analysis.bags.writing import RECORD_NAME, recording_pid
+from msg_analysis.common.arrays import AnyArray, IntArray
+from msg_analysis.common.resources import tell
+from msg_analysis.errors import BagError, InputError
+from msg_analysis.messages.acceptance import Refusal
+from msg_analysis.messages.cdr import CdrError
+from msg_analysis.messages.messages import ActiveGraph, Progress, decode_string
+from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, PROGRESS, STRING
+from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run_record import RunRecord
+
+# Topics are recognised by type and by the end of their name: the network may run in any namespace.
+_STATE, _TRUTH, _GRAPH, _EXPERIMENT, _STOP = "state", "truth", "graph", "experiment", "stop"
+_NUMBERS = {None: 0, _STATE: 1, _TRUTH: 2, _GRAPH: 3, _EXPERIMENT: 4, _STOP: 5}
+_TOPICS = {
+    AGENT_STATE.full_name: re.compile(r"(?:^|/)agent_\d+/(state|truth)$"),
+    ACTIVE_GRAPH.full_name: re.compile(r"(?:^|/)(graph)$"),
+    STRING.full_name: re.compile(r"(?:^|/)(experiment)$"),
+    PROGRESS.full_name: re.compile(r"(?:^|/)(stop)$"),
+}
+MOST_RECORDS = 100  # different run records that a bag may have: reading each takes milliseconds
+
+
+def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory:
+    """The run of a bag: of a directory or of one of its files; torn files are read up to the tear.
+
+    ``inventory`` is filled with what the files hold, even if no run can be made of it. BagError: no bag, no run record,
+    or several runs; InputError: the run record is not valid.
+    """
+    path = Path(path)
+    contents = _Contents(path)
+    unreadable: list[BagError] = []
+    files = bag_files(path)
+    for number, file in enumerate(files):
+        tell(f"reading {path.name}", number, len(files))
+        entry = (inventory or Inventory()).add(stored_file(file))
+        try:
+            contents.read(entry.file, entry.watch() if inventory else entry.file.batches())
+        except BagError as error:  # the recorder died just after it made the file, or its start is damaged
+            entry.problem = str(error)
+            unreadable.append(error)
+    if len(unreadable) == len(files):
+        raise unreadable[0]
+    contents.refused[Refusal.UNREADABLE_FILE] += len(unreadable)
+    return _trajectory(contents, _choose(contents))
+
+
+def read_record(path: str | Path, *, most: int | None = None) -> RunRecord:
+    """The run record of a bag, as ``read_bag`` finds it, without the states; at once where it comes first.
+
+    BagError or InputError: no bag, or no valid run record in the first ``most`` bytes of messages (None: in all).
+    """
+    path = Path(path)
+    contents = _Contents(path)
+    unreadable: list[BagError] = []
+    files = bag_files(path)
+    seen = 0
+    for name in files:
+        file = stored_file(name)
+        try:
+            for batch, kind in contents.network_topics(file, file.batches()):
+                seen += len(batch.data)
+                if most is not None and seen > most:
+                    return _choose(contents)
+                contents.learn(batch, np.flatnonzero(kind == _NUMBERS[_EXPERIMENT]))
+                contents.keep_metadata(file)
+                known = contents.first_record()
+                if known is not None:
+                    return known
+        except BagError as error:
+            unreadable.append(error)
+        contents.keep_metadata(file)
+    if len(unreadable) == len(files):
+        raise unreadable[0]
+    return _choose(contents)
+
+
+@dataclass(slots=True)
+class _Contents:
+    """What the files of a bag hold of the network's topics."""
+
+    path: Path
+    states: Collector = field(default_factory=Collector)
+    truths: Collector = field(default_factory=Collector)
+    # By their bytes: every file of a split bag may begin with those in force.
+    graphs: dict[bytes, ActiveGraph] = field(default_factory=dict)
+    stops: set[tuple[bytes, int]] = field(default_factory=set)  # run, and the step at which it ended early
+    # Run records by text, in order, or why a text is not one: from the topic, and from the metadata of our files.
+    experiments: dict[str, RunRecord | InputError] = field(default_factory=dict)
+    metadata: dict[str, None] = field(default_factory=dict)
+    refused: Counter[str] = field(default_factory=Counter)
+
+    def read(self, file: StoredFile, batches: Iterable[Batch]) -> None:
+        """Take all of a file."""
+        for batch, kind in self.network_topics(file, batches):
+            self._add(batch, kind)
+        self.keep_metadata(file)
+        self.refused[Refusal.TORN_FILE] += file.torn is not None
+        self.refused[Refusal.DAMAGED_CHUNK] += file.damaged_chunks
+
+    def network_topics(self, file: StoredFile, batches: Iterable[Batch]) -> Iterator[tuple[Batch, AnyArray]]:
+        """Each batch with the kinds of its messages, (messages,): one of ``_NUMBERS``."""
+        kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel; 0: not a topic of the network
+        known = 0
+        size = file.path.stat().st_size
+        for batch in batches:
+            tell(f"reading {file.path.name}", min(batch.end, size), size)
+            for number, channel in itertools.islice(file.channels.items(), known, None):
+                schema = file.schemas.get(channel.schema_id)
+                pattern = _TOPICS.get(schema.name if schema else "")
+                found = pattern.search(channel.topic) if pattern else None
+                kind_of[number] = _NUMBERS[found[1] if found else None]
+            known = len(file.channels)
+            yield batch, kind_of[batch.channel]
+
+    def keep_metadata(self, file: StoredFile) -> None:
+        """Keep the run records in the metadata of a file."""
+        for record in file.metadata:
+            if record.name == RECORD_NAME and "record" in record.metadata and len(self.metadata) < MOST_RECORDS:
+                self.metadata[record.metadata["record"]] = None
+
+    def _add(self, batch: Batch, kind: AnyArray) -> None:
+        # Records first: states of a known run are put in their places at once.
+        self.learn(batch, np.flatnonzero(kind == _NUMBERS[_EXPERIMENT]))
+        for index in np.flatnonzero(kind == _NUMBERS[_GRAPH]).tolist():
+            data = batch.message(index)
+            if data in self.graphs:
+                continue
+            try:
+                self.graphs[data] = ActiveGraph.decode(data)
+            except CdrError:
+                self.refused[Refusal.UNDECODABLE] += 1
+        for index in np.flatnonzero(kind == _NUMBERS[_STOP]).tolist():
+            try:
+                stop = Progress.decode(batch.message(index))
+                self.stops.add((stop.run, stop.step))
+            except CdrError:
+                self.refused[Refusal.UNDECODABLE] += 1
+        for name, collector in ((_STATE, self.states), (_TRUTH, self.truths)):
+            chosen = np.flatnonzero(kind == _NUMBERS[name])
+            if len(chosen):
+                collector.add(batch, chosen)
+
+    def learn(self, batch: Batch, chosen: IntArray) -> None:
+        """Take the run records in a batch: the messages with the indices ``chosen``, (k,)."""
+        for index in chosen.tolist():
+            try:
+                self._learn(decode_string(batch.message(index)))
+            except CdrError:
+                self.refused[Refusal.UNDECODABLE] += 1
+
+    def first_record(self) -> RunRecord | None:
+        """The first valid run record so far."""
+        found = (*self.experiments.values(), *map(self.parsed, self.metadata))
+        return next((record for record in found if isinstance(record, RunRecord)), None)
+
+    def _learn(self, text: str) -> None:
+        if text in self.experiments:
+            return
+        if len(self.experiments) >= MOST_RECORDS:
+            raise BagError(
+                f"{self.path}: more than {MOST_RECORDS} different messages on the topic `experiment`: expected the one "
+                "record of a run: record each run into a bag of its own"
+            )
+        self.experiments[text] = record = self.parsed(text)
+        if isinstance(record, RunRecord):
+            for collector, width in zip((self.states, self.truths), _widths(record), strict=True):
+                collector.expect(record, width)
+
+    def parsed(self, text: str) -> RunRecord | InputError:
+        """A run record, or why the text is not one: that matters only if no text is (another program's topic)."""
+        try:
+            return RunRecord.from_json(text, f"{self.path}: topic experiment")
+        except InputError as error:
+            return error
+
+
+def _widths(record: RunRecord) -> tuple[int, int]:
+    """Lengths of the states on the topics `state` and `truth`."""
+    experiment = record.experiment
+    return (experiment.run.replicas, experiment.width) if experiment.truth else (experiment.width, 0)
+
+
+def _choose(contents: _Contents) -> RunRecord:
+    """The run record of the one run that has states."""
+    path = contents.path
+    later = (text for text in contents.metadata if text not in contents.experiments)
+    found = [*contents.experiments.values(), *map(contents.parsed, later)]
+    if not found and contents.refused[Refusal.DAMAGED_CHUNK]:
+        raise BagError(
+            f"{path}: {contents.refused[Refusal.DAMAGED_CHUNK]} chunks are damaged (wrong checksums, or times that no "
+            "clock shows), and no record of the run is in what is left: copy the bag again, or record the run again"
+        )
+    if not found:
+        pid = recording_pid(path)
+        hint = f" (process {pid} is still recording it)" if pid else ""
+        raise BagError(
+            f"{path}: the latched topic `experiment` is missing, so the run is not known{hint}: record that topic too, "
+            "with durability transient_local (as `ros2 bag record -a` does)"
+        )
+    errors = [each for each in found if isinstance(each, InputError)]
+    records: dict[bytes, RunRecord] = {}
+    for each in found:
+        if not isinstance(each, RunRecord):
+            continue
+        first = records.setdefault(each.run.bytes, each)
+        if first is not each and first.to_json() != each.to_json():
+            raise BagError(
+                f"{path}: two records of run {each.run} contradict each other, and one of them is forged: another "
+                "program published on the topic `experiment`; record the run again"
+            )
+    if not records:
+        raise errors[0]
+    with_states = [record for run, record in records.items() if contents.states.count(run)]
+    candidates = with_states or list(records.values())
+    if len(candidates) > 1:
+        listed = "; ".join(
+            f"{r.run} ({r.experiment.name}, {contents.states.count(r.run.bytes)} states)" for r in candidates
+        )
+        raise BagError(f"{path}: {len(candidates)} runs in one bag: {listed}: record each run into a bag of its own")
+    return candidates[0]
+
+
+def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
+    planned, end = record.experiment.steps, _end(contents, record)
+    if end is not None:
+        record = record.ended(end)
+    experiment = record.experiment
+    modes = _modes(contents, record.run.bytes, experiment.steps, planned, len(experiment.graph_list))
+    published, widths = None, _widths(record)
+    if experiment.truth:
+        published = contents.states.finish(record, widths[0])
+        truth = contents.truths.finish(record, widths[1])
+    else:
+        truth = contents.states.finish(record, widths[0])
+    if experiment.run.pace == "lockstep":  # in real time agents may use older graphs
+        differs = ((truth.modes[1:] != modes[:, None]) & (truth.modes[1:] >= 0)).any(axis=1) & (modes >= 0)
+        contents.refused[Refusal.OTHER_GRAPH] += int(differs.sum())
+        modes[differs] = -1
+    parts = [truth] if published is None else [truth, published]
+    for part in parts:
+        contents.refused.update(part.refused)
+    expected = len(parts) * (experiment.steps + 1) * experiment.agents
+    received = sum(part.received for part in parts)
+    completeness = Completeness(
+        expected=expected,
+        received=received,
+        missing=expected - received,
+        duplicates=sum(part.duplicates for part in parts),
+        out_of_order=sum(part.out_of_order for part in parts),
+        missing_modes=int((modes < 0).sum()),
+        refused={reason: count for reason, count in sorted(contents.refused.items()) if count},
+    )
+    return Trajectory(
+        record,
+        truth.states,
+        modes,
+        completeness,
+        truth.modes,
+        published=published.states if published else None,
+        lost=truth.lost,
+        used=truth.used,
+        made=truth.made,
+    )
+
+
+def _end(contents: _Contents, record: RunRecord) -> int | None:
+    """The step at which a run ended before its planned one; None: it did not, or two messages contradict each other."""
+    steps = sorted({step for run, step in contents.stops if run == record.run.bytes})
+    if not steps or record.until is None:
+        return None
+    if len(steps) > 1 or not 1 <= steps[0] < record.experiment.steps:
+        contents.refused[Refusal.CONTRADICTION if len(steps) > 1 else Refusal.OUT_OF_RANGE] += len(steps)
+        return None
+    return steps[0]
+
+
+def _modes(contents: _Contents, run: bytes, steps: int, planned: int, graphs: int) -> IntArray:
+    """(N,) graph of every step from the sojourns, from 0; -1 where none or more than one covers it.
+
+    Sojourns may go on after ``steps``, up to the ``planned`` ones.
+    """
+    sojourns: set[tuple[int, int, int, int]] = set()
+    for graph in contents.graphs.values():
+        if graph.run != run:
+            contents.refused[Refusal.OTHER_RUN] += 1
+        elif not (1 <= graph.mode <= graphs and graph.first_step <= graph.last_step < planned):
+            contents.refused[Refusal.GRAPH_OUT_OF_RANGE] += 1
+        else:
+            sojourns.add((graph.sequence, graph.mode, graph.first_step, graph.last_step))
+    modes = np.full(steps, -1, dtype=np.int64)
+    claims = np.zeros(steps, dtype=np.int64)
+    for _, mode, first, last in sorted(sojourns):
+        modes[first : last + 1] = mode - 1
+        claims[first : last + 1] += 1
+    modes[claims != 1] = -1
+    return modes
+
+
+MOST = 16 << 20  # bytes of messages in which the record of another recorder's bag is looked for
+
+
+def record_document(path: Path) -> dict[str, Any]:
+    """The document of the run record of a bag; only that of another recorder's bag is checked.
+
+    BagError: there is none in the first ``MOST`` bytes; InputError: it is not valid.
+    """
+    text = _head_record(first_file(path)) or read_record(path, most=MOST).to_json()
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: its run record is not JSON ({error}): the bag is damaged") from error
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: its run record is not a JSON object: the bag is damaged")
+    return document
+
+
+def started(path: Path) -> datetime | None:
+    """When the run of a bag was started, by the head of its first file alone; None where that does not say it."""
+    try:
+        found = datetime.fromisoformat(json.loads(_head_record(first_file(path)) or "{}")["started"])
+        return found if found.tzinfo else found.replace(tzinfo=UTC)
+    except (BagError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+
+
+def _head_record(file: Path | None) -> str | None:
+    """The text that our recorder and the twin put before the first chunk of an MCAP file; None where there is none."""
+    if file is None or file.suffix != ".mcap":
+        return None
+    try:
+        size = file.stat().st_size
+        with file.open("rb") as stream:
+            if stream.read(len(MAGIC)) != MAGIC:
+                return None
+            while len(head := stream.read(RECORD.size)) == RECORD.size:
+                opcode, length = RECORD.unpack(head)
+                if opcode not in (Opcode.HEADER, Opcode.METADATA) or length > min(RECORD_LIMIT, size):
+                    return None
+                content = stream.read(length)
+                if opcode == Opcode.METADATA:
+                    record = Metadata.read(ReadDataStream(io.BytesIO(content)))
+                    if record.name == RECORD_NAME:
+                        found: str | None = record.metadata.get("record")
+                        return found
+    except Exception as error:  # the library raises many kinds of errors on damage
+        if isinstance(error, OSError):
+            raise BagError(f"{file}: cannot be read ({error.strerror})") from error
+    return None

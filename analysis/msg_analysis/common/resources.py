@@ -1,0 +1,109 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Cores, threads of linear algebra, and the progress of long work."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
+
+
+def available_cores() -> list[int]:
+    """Their numbers, ascending; none where the system does not say (not Linux)."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
+def count_cores() -> int:
+    """How many there are; all of the machine where the system does not say."""
+    return len(available_cores()) or os.cpu_count() or 1
+
+
+SINGLE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+"""Environment of processes whose arithmetic is too small for threads: they would only compete for the cores."""
+
+LARGE = 500  # smallest number of agents with which more than one thread pays on a quiet machine
+
+
+class Network(Protocol):
+    """What has a number of agents: an experiment."""
+
+    @property
+    def agents(self) -> int:
+        """Their number."""
+
+
+N = TypeVar("N", bound=Network)
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def one_blas_thread() -> AbstractContextManager[Any]:
+    """Context in which BLAS uses one thread, in the libraries that are loaded when it begins."""
+    limit: AbstractContextManager[Any] = _controller(with_scipy="scipy.linalg" in sys.modules).limit(
+        limits=1, user_api="blas"
+    )
+    return limit
+
+
+def blas_threads(agents: int) -> AbstractContextManager[Any]:
+    """Context in which BLAS uses one thread for networks of this size, unless they are large.
+
+    Its threads wait for each other without sleeping. Where another program keeps a core busy, every product of small
+    matrices then takes as long as a time slice: a comparison of 20 agents took 3 minutes instead of 4 s.
+    """
+    if agents >= LARGE:
+        return nullcontext()
+    import scipy.linalg  # noqa: F401  it brings a library of its own
+
+    return one_blas_thread()
+
+
+def few_blas_threads(function: Callable[Concatenate[N, P], R]) -> Callable[Concatenate[N, P], R]:
+    """Decorator: call a function of an experiment within ``blas_threads``."""
+
+    @functools.wraps(function)
+    def limited(network: N, /, *arguments: P.args, **options: P.kwargs) -> R:
+        with blas_threads(network.agents):
+            return function(network, *arguments, **options)
+
+    return limited
+
+
+@functools.cache  # it looks through all loaded libraries, which takes milliseconds
+def _controller(*, with_scipy: bool) -> ThreadpoolController:  # noqa: ARG001  each has found other libraries
+    import numpy  # noqa: F401  the library must be loaded
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+Watch = Callable[[str, int, int], None]
+"""Takes what is being done, how much of it is done, and how much there is to do, in any unit."""
+
+_watch: ContextVar[Watch | None] = ContextVar("watch", default=None)
+
+
+@contextmanager
+def watched(watch: Watch) -> Iterator[None]:
+    """Call ``watch`` in this context, often, by what is done in it."""
+    token = _watch.set(watch)
+    try:
+        yield
+    finally:
+        _watch.reset(token)
+
+
+def tell(what: str, done: int, total: int) -> None:
+    """Say how far the work is."""
+    watch = _watch.get()
+    if watch is not None:
+        watch(what, done, total)

@@ -1,0 +1,337 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Graphs of all kinds: by agents, from GraphML, CSV, networkx and matrices."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import ParseError
+
+import numpy as np
+
+from msg_analysis.common.arrays import BoolArray, FloatArray
+from msg_analysis.common.files import read_bytes
+from msg_analysis.common.text import agent_name, agent_text, listed
+from msg_analysis.experiment.graphs import Graph, hops
+from msg_analysis.experiment.markov_chain import Time
+from msg_analysis.experiment.network_spec import NAME_PATTERN, GraphSpec, Link, LossSpec, is_number
+from msg_analysis.experiment.problems import problem, show
+
+_COLUMNS = ("source", "target", "weight", "type")
+_NODE = f"expected a node's name of the form {NAME_PATTERN.strip('^$')}"
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignGraph:
+    """A graph with the nodes of its source, as texts, in their order."""
+
+    nodes: Sequence[str]
+    links: Sequence[tuple[str, str, float]]  # of a directed one: source, target, weight
+    directed: bool
+
+
+class GraphError(Exception):
+    """One mistake in a graph from elsewhere; the text is a line of ``problems.problem``."""
+
+
+def read_graphml(key: str, file: Path) -> ForeignGraph:
+    """The graph of a GraphML file; ``key`` is for the GraphError."""
+    import networkx as nx  # here, since every process of a run would wait for it
+
+    try:
+        graph = nx.read_graphml(io.BytesIO(_content(key, file)))
+    except (
+        ParseError,
+        nx.NetworkXError,
+        ValueError,
+        KeyError,
+        StopIteration,
+        AttributeError,
+        TypeError,
+    ) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise GraphError(problem(key, str(file), f"expected a GraphML file ({reason})", "export it again")) from error
+    if not graph:
+        raise GraphError(problem(key, str(file), "expected a graph with nodes", "export it again"))
+    return _of_networkx(key, graph)
+
+
+def is_networkx(value: object) -> bool:
+    """Whether it is a graph of networkx; without its import, which takes long."""
+    networkx = sys.modules.get("networkx")
+    return networkx is not None and isinstance(value, networkx.Graph)
+
+
+def from_networkx(key: str, graph: Any) -> ForeignGraph:
+    """A graph of networkx; ``key`` is for the GraphError."""
+    if graph.is_multigraph():
+        wanted, kind = "expected a networkx.Graph or networkx.DiGraph", type(graph).__name__
+        raise GraphError(problem(key, f"a {kind}", wanted, "convert it, for example networkx.Graph(graph)"))
+    if not graph:
+        raise GraphError(problem(key, "a graph without nodes", "expected a graph with nodes", "add nodes"))
+    return _of_networkx(key, graph)
+
+
+def _of_networkx(key: str, graph: Any) -> ForeignGraph:
+    nodes = {node: _node(key, node) for node in graph.nodes}
+    twice = sorted({name for name in nodes.values() if list(nodes.values()).count(name) > 1}) if _repeat(nodes) else []
+    if twice:
+        raise GraphError(problem(key, f"node {show(twice[0])} twice", "expected different names", "rename one"))
+    links = []
+    for source, target, weight in graph.edges(data="weight", default=1.0):
+        plain = weight.item() if isinstance(weight, np.generic) else weight
+        if not is_number(plain) or plain <= 0:
+            place = f"weight {show(plain)} of {source} - {target}"
+            raise GraphError(problem(key, place, "expected a weight > 0", "correct it in the file"))
+        links.append((nodes[source], nodes[target], float(plain)))
+    return ForeignGraph(list(nodes.values()), links, graph.is_directed())
+
+
+def _repeat(nodes: Mapping[Any, str]) -> bool:
+    return len(set(nodes.values())) < len(nodes)
+
+
+def _node(key: str, node: object) -> str:
+    name = str(node).strip()
+    if not re.match(NAME_PATTERN, name):
+        raise GraphError(problem(key, f"node {show(str(node))}", _NODE, "rename it"))
+    return name
+
+
+def _content(key: str, file: Path) -> bytes:
+    try:
+        return read_bytes(file)
+    except FileNotFoundError as error:
+        line = problem(key, str(file), "no such file", "the path is relative to the experiment file")
+        raise GraphError(line) from error
+    except OSError as error:
+        raise GraphError(problem(key, str(file), "cannot be read", str(error.strerror))) from error
+
+
+def read_csv(key: str, file: Path) -> ForeignGraph:
+    """The edge list of a CSV file with a header; ``key`` is for the GraphError.
+
+    A row is an arc to the ``target``, which listens to the ``source``; with ``undirected`` in ``type``, an edge.
+    """
+    wanted = "expected the columns source,target[,weight][,type], separated by commas"
+    try:
+        rows = csv.reader(io.StringIO(_content(key, file).decode("utf-8-sig"), newline=""), skipinitialspace=True)
+        table = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise GraphError(
+            problem(key, str(file), f"expected a CSV file in UTF-8 ({error})", "export it again")
+        ) from error
+    table = [(line, row) for line, row in table if any(row)]
+    if not table:
+        raise GraphError(problem(key, str(file), f"empty: {wanted}", "write them into its first line"))
+    head = [name.lower() for name in table[0][1]]
+    if not {"source", "target"} <= set(head) <= set(_COLUMNS) or len(set(head)) < len(head):
+        place = f"{file}, line {table[0][0]}: {show(','.join(table[0][1]))}"
+        raise GraphError(problem(key, place, wanted, "correct the header"))
+    found, edges = [], []
+    for line, row in table[1:]:
+        source, target, weight, undirected = _csv_row(key, f"{file}, line {line}", head, row)
+        found.append((source, target, weight))
+        edges.append(undirected)
+    if not found:
+        raise GraphError(problem(key, str(file), "expected rows below the header", "add one for each link"))
+    nodes = list(dict.fromkeys(node for source, target, _ in found for node in (source, target)))
+    if all(edges):
+        return ForeignGraph(nodes, found, directed=False)
+    back = [(b, a, weight) for (a, b, weight), undirected in zip(found, edges, strict=True) if undirected]
+    return ForeignGraph(nodes, found + back, directed=True)
+
+
+def _csv_row(key: str, place: str, head: Sequence[str], row: Sequence[str]) -> tuple[str, str, float, bool]:
+    """Source, target, weight, and whether the row is an edge without direction."""
+    if len(row) != len(head):
+        shown = f"{place}: {show(','.join(row))}"
+        raise GraphError(problem(key, shown, f"expected {len(head)} values as in the header", "correct the line"))
+    cells = dict(zip(head, row, strict=True))
+    for end in ("source", "target"):
+        if not re.match(NAME_PATTERN, cells[end]):
+            raise GraphError(problem(key, f"{place}: {end} {show(cells[end])}", _NODE, "correct the line"))
+    text = cells.get("weight") or "1"
+    try:
+        weight = float(text)
+    except ValueError:
+        weight = 0.0
+    if not is_number(weight) or not weight > 0:
+        raise GraphError(problem(key, f"{place}: weight {show(text)}", "expected a number > 0", "correct the line"))
+    kind = cells.get("type", "").lower() or "directed"
+    if kind not in ("directed", "undirected"):
+        shown = f"{place}: type {show(cells['type'])}"
+        raise GraphError(problem(key, shown, "expected directed or undirected", "correct the line"))
+    return cells["source"], cells["target"], weight, kind == "undirected"
+
+
+def from_adjacency(key: str, rows: Sequence[Sequence[float]]) -> GraphSpec:
+    """A matrix whose row i has the weights with which agent i listens; edges where it is symmetric, else arcs."""
+    if any(len(row) != len(rows) for row in rows):
+        shape = f"{len(rows)} rows of {' or '.join(sorted({str(len(row)) for row in rows}))} entries"
+        wanted = "expected a square matrix"
+        raise GraphError(problem(key, shape, wanted, "give one row and one column for each agent"))
+    matrix = np.array(rows, dtype=float)
+    for i in np.flatnonzero(np.diag(matrix)).tolist():
+        wanted = "expected 0 on the diagonal, since no agent listens to itself"
+        raise GraphError(problem(f"{key}[{i + 1}][{i + 1}]", float(matrix[i, i]), wanted, "set it to 0"))
+    directed = not np.array_equal(matrix, matrix.T)
+    listeners, sources = np.nonzero(matrix if directed else np.tril(matrix))
+    links = [
+        (source + 1, listener + 1, float(matrix[listener, source]))
+        for listener, source in zip(listeners.tolist(), sources.tolist(), strict=True)
+    ]
+    return _spec(links, directed=directed)
+
+
+def _spec(links: list[Link], *, directed: bool) -> GraphSpec:
+    return GraphSpec.model_construct(arcs=links) if directed else GraphSpec.model_construct(edges=links)
+
+
+def numbered(graphs: Iterable[ForeignGraph], names: Sequence[str] | None) -> tuple[dict[str, int], list[str] | None]:
+    """The number of every node of these graphs together, and the names of the agents; None where they have none.
+
+    Nodes that are all whole numbers are the agents' numbers, counted from 1, or from 0 if one of them is 0. Others are
+    numbered in the order in which they first appear, or by ``names``, which raise a KeyError where a node is not there.
+    """
+    nodes = list(dict.fromkeys(node for graph in graphs for node in graph.nodes))
+    if all(node.isascii() and node.isdigit() for node in nodes) and not set(nodes) <= set(names or []):
+        first = min(map(int, nodes), default=1)
+        return {node: int(node) + (first == 0) for node in nodes}, list(names) if names else None
+    known = list(names) if names is not None else nodes
+    places = {name: number for number, name in enumerate(known, start=1)}
+    return {node: places[node] for node in nodes}, known
+
+
+def as_spec(graph: ForeignGraph, numbers: Mapping[str, int]) -> GraphSpec:
+    """The graph with numbers of agents instead of nodes."""
+    links = [(numbers[source], numbers[target], weight) for source, target, weight in graph.links]
+    return _spec(links, directed=graph.directed)
+
+
+def largest_label(spec: GraphSpec) -> int:
+    """Largest agent number that the graph mentions; 0 where it mentions none."""
+    if spec.path or spec.cycle:
+        return max(spec.path or spec.cycle or [0])
+    if spec.star:
+        return spec.star.center
+    if spec.grid:
+        return spec.grid[0] * spec.grid[1]
+    return max((label for link in spec.edges or spec.arcs or [] for label in link[:2]), default=0)
+
+
+def links(spec: GraphSpec, agents: int) -> list[Link]:
+    """(i, j, weight), agents from 1, of every edge (``arcs``: arc i -> j). Not for files: see ``graph_sources``."""
+    if spec.edges is not None or spec.arcs is not None:
+        return list(spec.edges or spec.arcs or [])
+    pairs: list[tuple[int, int]]
+    if spec.path is not None:
+        pairs = list(pairwise(spec.path))
+    elif spec.cycle is not None:
+        pairs = list(pairwise([*spec.cycle, spec.cycle[0]]))
+    elif spec.star is not None:
+        pairs = [(spec.star.center, j) for j in range(1, agents + 1) if j != spec.star.center]
+    elif spec.grid is not None:
+        labels = np.arange(1, spec.grid[0] * spec.grid[1] + 1).reshape(spec.grid)
+        beside = np.stack([labels[:, :-1].ravel(), labels[:, 1:].ravel()], axis=1)
+        below = np.stack([labels[:-1].ravel(), labels[1:].ravel()], axis=1)
+        pairs = [(int(i), int(j)) for i, j in (*beside, *below)]
+    else:
+        pairs = list(combinations(range(1, agents + 1), 2))
+    return [(i, j, 1.0) for i, j in pairs]
+
+
+def link_problems(key: str, spec: GraphSpec, agents: int, names: Sequence[str] | None = None) -> list[str]:
+    """Self-loops, duplicate links and agents that do not exist; ``key`` and ``names`` of the agents are for them."""
+    kind = spec.kinds[0]
+    largest = largest_label(spec)
+    if largest > agents:
+        return [
+            problem(key, f"agent {largest}", f"expected agents 1 to {agents}", "correct it, or raise `agents`"),
+        ]
+    found = []
+    seen: set[tuple[int, int]] = set()
+    for i, j, _ in links(spec, agents):
+        pair = (i, j) if kind == "arcs" else (min(i, j), max(i, j))
+        ends = show([i, j] if names is None else [names[i - 1], names[j - 1]])
+        if i == j:
+            who = agent_text(i, names)
+            found.append(problem(key, ends, f"{who} is linked with itself", "remove the self-loop"))
+        elif pair in seen:
+            text = "arc" if kind == "arcs" else "edge (edges have no direction)"
+            found.append(problem(key, ends, f"expected every {text} once", "remove the duplicate"))
+        seen.add(pair)
+    return found
+
+
+def build_graph(name: str, spec: GraphSpec, agents: int) -> Graph:
+    """The graph with its (m, m) adjacency, from a spec without mistakes."""
+    adjacency = np.zeros((agents, agents))
+    for i, j, weight in links(spec, agents):
+        adjacency[j - 1, i - 1] = weight
+        if spec.arcs is None:
+            adjacency[i - 1, j - 1] = weight
+    return Graph(name, adjacency)
+
+
+def numbered_losses(loss: LossSpec, names: Sequence[str] | None) -> tuple[LossSpec, list[str]]:
+    """The same with numbers instead of names of agents, and the names that are unknown."""
+    found: list[str] = []
+
+    def number(key: str, agent: int | str) -> int | str:
+        if not isinstance(agent, str):
+            return agent
+        if agent in (names or []):
+            return (names or []).index(agent) + 1
+        wanted = f"expected one of the names {listed(names)}" if names else "expected a number, since no agent is named"
+        found.append(problem(key, show(agent), wanted, "correct it"))
+        return agent
+
+    numbers = {
+        kind: [(number(f"noise.loss.{kind}", i), number(f"noise.loss.{kind}", j), p) for i, j, p in getattr(loss, kind)]
+        for kind in ("edges", "arcs")
+    }
+    return loss.model_copy(update=numbers), found
+
+
+def loss_matrix(
+    loss: LossSpec, graphs: Sequence[Graph], time: Time, names: Sequence[str] | None
+) -> tuple[FloatArray, list[str]]:
+    """(m, m) probability that a message from agent j (column) to agent i (row) is lost, 0 on the diagonal.
+
+    Also the links in ``loss``, which has numbers of agents, that are in no graph or are repeated.
+    """
+    agents, found = graphs[0].agents, []
+    heard = heard_links(graphs, time)
+    matrix = np.where(np.eye(agents, dtype=np.bool_), 0.0, loss.default)
+    seen: set[tuple[int, int]] = set()
+    directed = [("arcs", int(i), int(j), p) for i, j, p in loss.arcs]
+    directed += [("edges", *ends, p) for i, j, p in loss.edges for ends in ((int(i), int(j)), (int(j), int(i)))]
+    for kind, i, j, probability in directed:
+        key, ends = f"noise.loss.{kind}", show([i, j] if names is None else [agent_name(a, names) for a in (i, j)])
+        if max(i, j) > agents or not heard[j - 1, i - 1]:
+            wanted = f"expected agents of which {agent_name(j, names)} hears {agent_name(i, names)} in some graph"
+            found.append(problem(key, ends, wanted, "correct it"))
+        elif (i, j) in seen:
+            found.append(problem(key, ends, "expected every link once, in each direction", "remove one"))
+        else:
+            matrix[j - 1, i - 1] = probability
+        seen.add((i, j))
+    return matrix, found
+
+
+def heard_links(graphs: Sequence[Graph], time: Time) -> BoolArray:
+    """(m, m) whether agent i hears agent j in some graph: in discrete time, with exp(-Z), over many arcs, too."""
+    heard = np.any([graph.adjacency > 0 for graph in graphs], axis=0)
+    if time == "discrete":
+        heard = np.any([[hops(graph.adjacency > 0, [i]) > 0 for i in range(graph.agents)] for graph in graphs], axis=0)
+    return np.asarray(heard)

@@ -1,0 +1,88 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Weighted directed graphs of agents and their Laplacians."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+
+from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+
+
+def hops(leads: BoolArray, sources: Collection[int]) -> IntArray:
+    """(v,) least number of arcs from any source to each vertex; -1 if unreachable. ``leads[i, j]``: arc from i to j.
+
+    Not by networkx: every process of a run needs this, and importing networkx takes longer than all its other imports.
+    """
+    level = np.full(len(leads), -1)
+    front, distance = np.array(sorted(sources), dtype=int), 0
+    while front.size:
+        level[front] = distance
+        front, distance = np.flatnonzero(leads[front].any(axis=0) & (level < 0)), distance + 1
+    return level
+
+
+def widest_reaching(leads: BoolArray) -> list[int]:
+    """The vertices from which the most others are reached, of one strongly connected component only.
+
+    ``leads[i, j]`` (v, v): an arc leads from i to j.
+    """
+    known = np.zeros(len(leads), dtype=bool)
+    widest, reached = 0, known.copy()
+    for vertex in range(len(leads)):
+        if not known[vertex]:  # else a vertex that reaches it was tried, which reaches at least as many
+            found = hops(leads, [vertex]) >= 0
+            known |= found
+            if found.sum() > reached.sum():
+                widest, reached = vertex, found
+    return np.flatnonzero(reached & (hops(leads.T, [widest]) >= 0)).tolist()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Graph:
+    """One mode of the switching network.
+
+    Attributes
+    ----------
+    name
+        name of the graph in the experiment file
+    adjacency
+        (m, m), zero diagonal; ``adjacency[i, j]`` [1 / unit of time] is the weight with which agent i listens to
+        agent j (from 0). Symmetric for an undirected graph.
+    """
+
+    name: str
+    adjacency: FloatArray
+
+    @property
+    def agents(self) -> int:
+        """Number of agents m."""
+        return int(self.adjacency.shape[0])
+
+    @property
+    def laplacian(self) -> FloatArray:
+        """(m, m) in-degree Laplacian L = D - A; every row sums to zero (section II of the paper)."""
+        return np.diag(self.adjacency.sum(axis=1)) - self.adjacency
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether the graph is undirected."""
+        return bool(np.array_equal(self.adjacency, self.adjacency.T))
+
+    @property
+    def arcs(self) -> list[tuple[int, int, float]]:
+        """(source, target, weight) of every arc, agents from 1: target listens to source. Sorted by target, source."""
+        targets, sources = np.nonzero(self.adjacency)
+        return [
+            (int(source) + 1, int(target) + 1, float(self.adjacency[target, source]))
+            for target, source in zip(targets, sources, strict=True)
+        ]
+
+    @property
+    def edges(self) -> list[tuple[int, int, float]]:
+        """(i, j, weight), i < j, of every pair that listen to each other with equal weight, agents from 1."""
+        return [(s, t, w) for s, t, w in self.arcs if s < t and self.adjacency[s - 1, t - 1] == w]

@@ -1,0 +1,438 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""From a YAML document to an experiment, section by section; memory that it needs."""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+from collections.abc import Hashable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.files import SAFE_LOADER, load_yaml, read_text
+from msg_analysis.common.text import listed
+from msg_analysis.errors import InputError
+from msg_analysis.experiment import graph_sources, protocols, validation
+from msg_analysis.experiment import graph_sources as topology
+from msg_analysis.experiment.graph_sources import ForeignGraph, GraphError, is_networkx
+from msg_analysis.experiment.graphs import Graph
+from msg_analysis.experiment.markov_chain import MarkovChain, Time
+from msg_analysis.experiment.network_spec import GraphSpec, NoiseSpec
+from msg_analysis.experiment.problems import problem, show, translate
+from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
+from msg_analysis.experiment.spec import ExperimentSpec, RunSpec
+
+
+class _StrictLoader(SAFE_LOADER):  # type: ignore[misc]  # one of two classes: see there
+    """The safe loader with the scalars of YAML 1.2 (1e-3 is a number, not a text), without duplicate keys."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 (of PyYAML)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
+                if key.value in seen:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"key '{key.value}' appears twice: remove one", key.start_mark
+                    )
+                seen.add(key.value)
+        return dict(super().construct_mapping(node, deep))
+
+
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?[0-9]+", list("-+0123456789")),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        list("-+.0123456789"),
+    ),
+    ("merge", r"<<", ["<"]),
+):
+    _StrictLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _first)
+
+
+def _construct_int(loader: _StrictLoader, node: yaml.ScalarNode) -> int:
+    """Decimal, also with leading zeros (octal in YAML 1.1)."""
+    return int(loader.construct_scalar(node))
+
+
+_StrictLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
+
+_BAG_FILES = ("metadata.yaml", "*.mcap", "*.mcap.zstd", "*.db3", "*.db3.zstd")
+_BAG_STARTS = (b"\x89MCAP0\r\n", b"SQLite format 3\x00")
+_BAG_KEY = "rosbag2_bagfile_information"  # of its metadata.yaml
+_NOT_A_BAG = (
+    "expected a YAML file: give the experiment file from which it was recorded; `msg-analysis info`, `compare` and "
+    "`export` read bags"
+)
+_HEAD = 65_536  # bytes of a file that are looked at
+
+
+def is_bag(path: Path) -> bool:
+    """Whether it is a bag, or a file of one, by its name or its beginning; it may be damaged."""
+    if path.is_dir():
+        return any(next(path.glob(pattern), None) for pattern in _BAG_FILES)
+    return _head(path).startswith(_BAG_STARTS)
+
+
+def no_bag_but(path: Path) -> str | None:
+    """What a file is instead of one of a bag, and what to do, in words; None where that cannot be told."""
+    text = _head(path).decode("utf-8", "ignore")
+    if re.search(rf"^{_BAG_KEY}\s*:", text, re.MULTILINE):
+        return f"is the metadata of a bag: expected a bag: give its directory, {path.parent}"
+    keys = set(re.findall(r"""^[ {]*["']?(\w+)["']?\s*:""", text, re.MULTILINE))
+    if "graphs" in keys:
+        wanted = f"expected a bag: `msg-agents run {path}` and `msg-analysis simulate {path}` make one"
+        return f"is an experiment file: {wanted}"
+    if {"experiment", "over"} <= keys:
+        return f"is a sweep file: expected a bag: `msg-analysis sweep {path}` runs it"
+    return None
+
+
+def _head(path: Path) -> bytes:
+    """The beginning of a regular file; nothing of others, whose reader says what is wrong."""
+    if not path.is_file():
+        return b""
+    try:
+        with path.open("rb") as stream:
+            return stream.read(_HEAD)
+    except OSError:
+        return b""
+
+
+def other_kind(mapping: Mapping[Any, Any], wanted: str) -> str | None:
+    """What a document is instead of the ``wanted`` kind (experiment, sweep), and what to do; None: not another kind."""
+    if _BAG_KEY in mapping:
+        return f"the metadata of a bag: {_NOT_A_BAG}"
+    if wanted == "experiment" and {"experiment", "over"} <= mapping.keys() and "graphs" not in mapping:
+        return "a sweep file: expected an experiment file: `msg-analysis sweep` runs sweeps"
+    if wanted == "sweep" and "graphs" in mapping and not {"experiment", "over"} & mapping.keys():
+        return "an experiment file: expected a sweep file: name it there as `experiment:`, and its values as `over:`"
+    return None
+
+
+def read_yaml(path: Path) -> Any:
+    """The content of a YAML (or JSON) file in UTF-8.
+
+    InputError, with file and (if known) line: the file cannot be read, is not YAML in UTF-8, is too large or too deep,
+    or has a key twice.
+    """
+    if is_bag(path):
+        raise InputError(f"{path}: is a bag: {_NOT_A_BAG}")
+    try:
+        text = read_text(path)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file: check the path") from error
+    except IsADirectoryError as error:
+        raise InputError(f"{path}: is a directory: expected an experiment file (YAML)") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: byte {error.start}: not UTF-8 text: expected an experiment file (YAML)") from error
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, source: str) -> Any:
+    """The content of a text in YAML (or JSON); errors as of ``read_yaml``, ``source`` in the place of the file."""
+    try:
+        return load_yaml(text, _StrictLoader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        raise InputError(f"{source}: {line}{', '.join(filter(None, (error.context, error.problem)))}") from error
+    except (yaml.YAMLError, ValueError) as error:
+        raise InputError(f"{source}: not YAML: {' '.join(str(error).split())}") from error
+
+
+_MATRICES_PER_GRAPH = 8  # adjacency, W, its coupling, F, B, N, the variance of loss, and the product that makes N
+
+
+def memory_needed(
+    agents: int, modes: int, steps: int, replicas: int, delay: int = 0, truth: bool = False
+) -> tuple[int, int]:
+    """Bytes for the states of a run, and for the matrices of all graphs; ``replicas``: numbers in an agent's state.
+
+    A delay [steps] makes the matrices larger. With ``truth``, states are kept twice: as they are and as published.
+    """
+    states = (steps + 1) * agents * replicas * 8 * (2 if truth else 1)
+    return states, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
+
+
+def available_memory() -> int:
+    """Available bytes: what Linux estimates as available, elsewhere all physical memory."""
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass  # not Linux: all physical memory is the next best number
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: int, truth: bool = False) -> list[str]:
+    """Problems if states and matrices do not fit in memory; arguments as in ``memory_needed``."""
+    available = available_memory()
+    states, matrices = memory_needed(agents, modes, steps, replicas, delay, truth)
+    if states + matrices <= available:
+        return []
+    room = f"expected at most {amount(available)}, the memory available"
+    if matrices > states:
+        if delay:
+            text = f"{delay} steps with {modes} graphs of {agents} agents need {amount(matrices)}"
+            return [problem("noise.delay", text, room, "lower the delay, or the number of agents or graphs")]
+        text = f"{modes} graphs of {agents} agents need {amount(matrices)}"
+        return [problem("graphs", text, room, "lower the number of agents or graphs")]
+    text = f"{steps} steps of {agents} agents with {replicas} replicas need {amount(states)}"
+    return [problem("run", text, room, "lower run.duration or run.replicas, or raise run.dt")]
+
+
+def amount(size: float) -> str:
+    """A number of bytes as text with a unit: ``1.5 GB``."""
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if size < 1000 or unit == "TB":
+            return f"{size:.3g} {unit}"
+        size /= 1000
+    raise AssertionError
+
+
+@functools.cache
+def _adapter(key: str) -> TypeAdapter[Any]:
+    """The validator of one section; cached, since making it takes longer than using it."""
+    annotation: Any = ExperimentSpec.model_fields[key].annotation
+    return TypeAdapter(annotation)
+
+
+def _section(key: str, mapping: Mapping[Any, Any]) -> Any:
+    """One valid section of a document with mistakes in others."""
+    if key in mapping:
+        return _adapter(key).validate_python(mapping[key])
+    return ExperimentSpec.model_fields[key].get_default(call_default_factory=True, validated_data={})
+
+
+def _graphs_of_networkx(mapping: Mapping[Any, Any]) -> tuple[dict[str, Any], Mapping[Any, Any]]:
+    """The graphs of networkx in a document, by name, and the document with empty graphs in their places."""
+    graphs = mapping.get("graphs")
+    if not isinstance(graphs, Mapping):
+        return {}, mapping
+    found = {name: graph for name, graph in graphs.items() if is_networkx(graph)}
+    if not found:
+        return {}, mapping
+    return found, {**mapping, "graphs": {**graphs, **{name: {"edges": []} for name in found}}}
+
+
+class Sections:
+    """A document that is being checked: a section is None as long as it is not known to be valid.
+
+    ``recorded``: protocol of a recorded run, which need not be installed.
+    """
+
+    def __init__(self, mapping: Mapping[Any, Any], recorded: ProtocolInfo | None = None) -> None:
+        self.problems: list[str] = []
+        self._networkx, mapping = _graphs_of_networkx(mapping)
+        self._foreign: dict[str, ForeignGraph] = {}  # read, but not numbered yet
+        self._named_by_files = False
+        self.keys: dict[str, str] = {}  # of the graphs, for messages
+        bad: set[str] = set()
+        try:
+            spec = ExperimentSpec.model_validate(dict(mapping))
+            self.values = {key: getattr(spec, key) for key in ExperimentSpec.model_fields}
+        except ValidationError as error:
+            self.problems += [translate(detail) for detail in error.errors(include_url=False)]
+            bad = {str(detail["loc"][0]) for detail in error.errors(include_url=False)}
+            self.values = {key: None if key in bad else _section(key, mapping) for key in ExperimentSpec.model_fields}
+        self.known = set(self.values) - bad
+        run = self.values["run"]
+        if run is not None and self.values["time"] == "discrete" and "dt" not in run.model_fields_set:
+            self.values["run"] = run.model_copy(update={"dt": 1.0})
+        self.agents: int | None = None
+        self.graphs: tuple[Graph, ...] = ()
+        self.chain: MarkovChain | None = None
+        self.noise_gain: FloatArray | None = None
+        self.loss: FloatArray | None = None
+        self._recorded = recorded
+        self.protocol: ChosenProtocol | None = None
+
+    def resolve(self, directory: Path) -> None:
+        """Check what several keys say together; paths in the document are relative to ``directory``."""
+        time, run = self.values["time"], self.values["run"]
+        self._find_protocol()
+        self._count_agents(directory)
+        self._name_leaders()
+        leaders = self.values["leaders"]
+        leaders_good = self.values["problem"] is not None and "leaders" in self.known
+        if leaders_good:
+            found = validation.leader_problems(self.values["problem"], leaders, self.agents, self.values["names"])
+            leaders_good = not found
+            self.problems += found
+        if self.values["graphs"] and self.values["switching"] and time:
+            self.chain, found = validation.chain_of(self.values["switching"], list(self.values["graphs"]), time)
+            self.problems += found
+        whole_steps = False
+        if run and time:
+            found = validation.run_problems(run, time, self.agents)
+            whole_steps = not found
+            self.problems += found
+        if self.agents is None or not self._fits(run if whole_steps else None):
+            return
+        if self.values["noise"]:
+            names = list(self.values["graphs"])
+            self.noise_gain, found = validation.noise_gain_of(self.values["noise"], names, self.agents)
+            self.problems += found
+        self._build_graphs()
+        if not self.graphs or not leaders_good:
+            return
+        self.problems += validation.connection_problems(self.graphs, leaders, self.values["names"])
+        if self.values["noise"] and time:
+            self._resolve_losses(self.values["noise"], time)
+        built_in = "protocol" in self.known and self.values["protocol"] is None
+        if time == "continuous" and run and built_in:
+            gains = validation.leader_gains(leaders, self.agents)
+            self.problems += validation.stability_problems(self.graphs, gains, run.dt)
+
+    def spec(self) -> ExperimentSpec:
+        """The whole document with everything resolved. Only valid once there are no problems."""
+        return ExperimentSpec.model_construct(**(self.values | {"agents": self.agents}))
+
+    def _find_protocol(self) -> None:
+        """The protocol and its parameters, with their defaults written out."""
+        spec = self.values["protocol"]
+        if spec is None:
+            return
+        self.protocol, found = protocols.find(spec, self._recorded)
+        self.problems += found
+        if self.protocol and self.protocol.parameters is not None:
+            parameters = self.protocol.parameters.model_dump(mode="json")
+            self.values["protocol"] = type(spec).model_validate({"name": spec.name, **parameters})
+
+    def _count_agents(self, directory: Path) -> None:
+        """The number of agents and their names, if every graph is valid; files with graphs are read here."""
+        graphs: dict[str, GraphSpec] | None = self.values["graphs"]
+        if graphs is None or not {"agents", "names"} <= self.known:
+            return
+        before = len(self.problems)
+        for name, spec in graphs.items():
+            if name == "stationary":
+                wanted = "expected another name, since switching.initial uses this one"
+                self.problems.append(problem("graphs", "'stationary'", wanted, "rename the graph"))
+            if len(spec.kinds) != 1:
+                given = " and ".join(spec.kinds) or "nothing"
+                wanted = f"expected one of {', '.join(GraphSpec.model_fields)}"
+                self.problems.append(problem(f"graphs.{name}", given, wanted, "give exactly one"))
+                continue
+            self.keys[name] = key = f"graphs.{name}" if name in self._networkx else f"graphs.{name}.{spec.kinds[0]}"
+            try:
+                self._read(name, key, spec, directory)
+            except GraphError as error:
+                self.problems.append(str(error))
+        if len(self.problems) > before or not self._number_nodes(graphs):
+            return
+        declared, names = self.values["agents"], self.values["names"]
+        largest = max(map(topology.largest_label, graphs.values()))
+        untold = all(spec.complete or spec.star for spec in graphs.values())
+        if declared is None and names is None and (untold or largest < 2):
+            wanted = "expected the number of agents, since the graphs do not give it"
+            self.problems.append(problem("agents", "missing", wanted, "for example agents: 5"))
+        elif names is not None and len(names) != (declared or max(largest, len(names))):
+            shown = f"{len(names)} names" if len(names) > 1 else "1 name"
+            whose = " from the files of the graphs" if self._named_by_files else ""
+            wanted = f"expected one for each of the {declared or largest} agents"
+            self.problems.append(problem("names", shown + whose, wanted, "name the others, or correct `agents`"))
+        else:
+            self.agents = declared or (len(names) if names else largest)
+
+    def _read(self, name: str, key: str, spec: GraphSpec, directory: Path) -> None:
+        """Read a graph that is not given by numbers of agents. GraphError: its mistake."""
+        if name in self._networkx:
+            self._foreign[name] = graph_sources.from_networkx(key, self._networkx[name])
+        elif spec.graphml is not None:
+            self._foreign[name] = graph_sources.read_graphml(key, directory / spec.graphml)
+        elif spec.csv is not None:
+            self._foreign[name] = graph_sources.read_csv(key, directory / spec.csv)
+        elif spec.adjacency is not None:
+            self.values["graphs"][name] = graph_sources.from_adjacency(key, spec.adjacency)
+
+    def _number_nodes(self, graphs: dict[str, GraphSpec]) -> bool:
+        """Numbers instead of nodes in ``graphs``, and the names of the agents; False where these have mistakes."""
+        given: list[str] | None = self.values["names"]
+        twice = sorted({name for name in given or [] if (given or []).count(name) > 1})
+        if twice:
+            self.problems.append(problem("names", show(twice[0]), "expected different names", "rename one"))
+            return False
+        if not self._foreign:
+            return True
+        try:
+            numbers, names = graph_sources.numbered(self._foreign.values(), given)
+        except KeyError as error:
+            wanted = f"expected one of the names {listed(given or [])}"
+            place = next(self.keys[name] for name, graph in self._foreign.items() if error.args[0] in graph.nodes)
+            self.problems.append(
+                problem(place, f"node {show(error.args[0])}", wanted, "correct it, or add it to `names`")
+            )
+            return False
+        graphs |= {name: graph_sources.as_spec(graph, numbers) for name, graph in self._foreign.items()}
+        self._named_by_files = given is None
+        self.values["names"] = names
+        return True
+
+    def _name_leaders(self) -> None:
+        """Numbers instead of names in ``leaders``; what is not a name of an agent is a mistake."""
+        leaders = self.values["leaders"]
+        if leaders is None or not any(isinstance(agent, str) for agent in leaders.agents):
+            return
+        names: list[str] = self.values["names"] or []
+        numbers = [names.index(agent) + 1 if agent in names else agent for agent in leaders.agents]
+        unknown = [agent for agent in numbers if isinstance(agent, str)]
+        if unknown and self.agents is not None:
+            wanted = (
+                f"expected one of the names {listed(names)}" if names else "expected a number, since no agent is named"
+            )
+            self.problems += [problem("leaders.agents", show(agent), wanted, "correct it") for agent in unknown]
+        known = [agent for agent in numbers if not isinstance(agent, str)]
+        self.values["leaders"] = leaders.model_copy(update={"agents": known})
+        if unknown:
+            self.known.discard("leaders")
+
+    def _resolve_losses(self, noise: NoiseSpec, time: Time) -> None:
+        """Numbers instead of names in ``noise.loss``, and the probability of every link."""
+        names: list[str] | None = self.values["names"]
+        loss, found = topology.numbered_losses(noise.loss, names)
+        if not found:
+            self.values["noise"] = noise.model_copy(update={"loss": loss})
+            self.loss, found = topology.loss_matrix(loss, self.graphs, time, names)
+        self.problems += found
+        if noise.burst is not None and not found:
+            self.problems += validation.burst_problems(noise.burst, loss)
+
+    def _fits(self, run: RunSpec | None) -> bool:
+        assert self.agents is not None
+        steps = run.steps if run else 1
+        replicas = run.replicas if run else 1
+        noise = self.values["noise"]
+        delay, truth = (noise.delay, noise.broadcast > 0) if noise else (0, False)
+        modes = len(self.values["graphs"])
+        found = memory_problems(self.agents, modes, steps, replicas, delay, truth)
+        self.problems += found
+        return not found
+
+    def _build_graphs(self) -> None:
+        assert self.agents is not None
+        graphs: dict[str, GraphSpec] = self.values["graphs"]
+        names: list[str] | None = self.values["names"]
+        found = [
+            line
+            for name, spec in graphs.items()
+            for line in topology.link_problems(self.keys[name], spec, self.agents, names)
+        ]
+        self.problems += found
+        if not found:
+            self.graphs = tuple(topology.build_graph(name, spec, self.agents) for name, spec in graphs.items())

@@ -1,0 +1,146 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The Markov chain that switches between the graphs."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.experiment.graphs import hops
+
+Time = Literal["continuous", "discrete"]
+
+
+def stationary_law(matrix: FloatArray) -> FloatArray:
+    """(n,) stationary law of an irreducible chain by the GTH algorithm; ``matrix`` (n, n): generator or transitions.
+
+    Uses no subtraction and only off-diagonal entries, so every entry of the law is accurate to machine precision
+    whatever the rates (Grassmann, Taksar, Heyman 1985).
+    """
+    rates = np.array(matrix, dtype=float)
+    n = len(rates)
+    for k in range(n - 1, 0, -1):
+        rates[:k, k] /= rates[k, :k].sum()
+        rates[:k, :k] += np.outer(rates[:k, k], rates[k, :k])
+    law = np.ones(n)
+    for k in range(1, n):
+        law[k] = (law[:k] * rates[:k, k]).sum()  # not @: the order of a sum in BLAS depends on the processor
+    return np.asarray(law / law.sum())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkovChain:
+    """An ergodic chain on the n graphs.
+
+    Attributes
+    ----------
+    time
+        "continuous" (matrix is the generator Gamma [1 / unit of time]) or "discrete" (matrix is P, one jump a step)
+    matrix
+        (n, n)
+    """
+
+    time: Time
+    matrix: FloatArray
+
+    @property
+    def modes(self) -> int:
+        """Number of graphs n."""
+        return len(self.matrix)
+
+    @property
+    def irreducible(self) -> bool:
+        """Whether every graph can be reached from every other one."""
+        jumps = self.matrix > 0
+        return bool((hops(jumps, [0]) >= 0).all() and (hops(jumps.T, [0]) >= 0).all())
+
+    @property
+    def period(self) -> int:
+        """Greatest common divisor of the lengths of all cycles of an irreducible chain; 1 in continuous time."""
+        if self.time == "continuous":
+            return 1
+        level, jumps = hops(self.matrix > 0, [0]), np.argwhere(self.matrix > 0)
+        return math.gcd(*(int(level[i]) + 1 - int(level[j]) for i, j in jumps))
+
+    @property
+    def ergodic(self) -> bool:
+        """Irreducible and, in discrete time, aperiodic (assumption 1 of the paper)."""
+        return self.irreducible and self.period == 1
+
+    @property
+    def stationary(self) -> FloatArray:
+        """(n,) stationary law pi."""
+        return stationary_law(self.matrix)
+
+    @property
+    def holding_times(self) -> list[float | None]:
+        """Mean time in each graph before it is left [units of simulated time]; None where it is never left."""
+        leaving = (self.matrix - np.diag(np.diag(self.matrix))).sum(axis=1)
+        return [1.0 / rate if rate > 0 else None for rate in leaving.tolist()]
+
+    @property
+    def reversed(self) -> MarkovChain:
+        """The stationary chain backwards in time: its rates are pi_j Gamma_ji / pi_i, or pi_j P_ji / pi_i."""
+        law = self.stationary
+        return MarkovChain(self.time, self.matrix.T * law / law[:, None])
+
+    def transition(self, dt: float) -> FloatArray:
+        """(n, n) law of the graph one step later: expm(Gamma dt), or P itself in discrete time.
+
+        Parameters
+        ----------
+        dt
+            length of a step [units of simulated time]; without meaning in discrete time
+        """
+        if self.time == "discrete":
+            return self.matrix.copy()
+        import scipy.linalg  # here, since every agent's process would wait for it
+
+        transition = np.clip(np.asarray(scipy.linalg.expm(self.matrix * dt), dtype=float), 0.0, None)
+        return np.asarray(transition / transition.sum(axis=1, keepdims=True))
+
+    def sojourns(self, initial: FloatArray, random: np.random.Generator) -> Iterator[tuple[int, float]]:
+        """Exact path of the chain, without end: (mode from 0, time spent in it).
+
+        Holding times are exponential [units of time] in continuous time, geometric [steps] in discrete time; the
+        next graph is drawn from the jump chain.
+
+        Parameters
+        ----------
+        initial
+            (n,) law of the first graph
+        random
+            the stream to draw from; equal streams give equal paths
+        """
+        off_diagonal = self.matrix - np.diag(np.diag(self.matrix))
+        leaving = off_diagonal.sum(axis=1).tolist()
+        jumps = [_cumulative(law / rate) if rate > 0.0 else [] for law, rate in zip(off_diagonal, leaving, strict=True)]
+        mode = _draw(_cumulative(initial), random)
+        while True:
+            if leaving[mode] == 0.0:
+                yield mode, np.inf
+                return
+            if self.time == "continuous":
+                held = random.exponential(1.0 / leaving[mode])
+            else:
+                held = float(random.geometric(min(leaving[mode], 1.0)))
+            yield mode, held
+            mode = _draw(jumps[mode], random)
+
+
+def _cumulative(law: FloatArray) -> list[float]:
+    sums: list[float] = np.cumsum(law).tolist()
+    return sums
+
+
+def _draw(cumulative: list[float], random: np.random.Generator) -> int:
+    """Index drawn by inversion from one uniform number."""
+    return bisect_right(cumulative, random.random() * cumulative[-1])

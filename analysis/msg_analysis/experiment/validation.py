@@ -1,0 +1,323 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What several keys of an experiment must satisfy together; each check returns the mistakes that it finds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.text import agent_name, agent_text
+from msg_analysis.experiment.graphs import Graph, hops, widest_reaching
+from msg_analysis.experiment.markov_chain import MarkovChain, Time
+from msg_analysis.experiment.network_spec import LossSpec, NoiseGain, NoiseSpec, SwitchingSpec
+from msg_analysis.experiment.problems import problem, show
+from msg_analysis.experiment.spec import LeadersSpec, RunSpec
+
+SUM_TOLERANCE = 1e-9
+STEP_TOLERANCE = 1e-9
+MOST_STEPS = 1e15
+"""Beyond this, a double cannot tell one step from the next."""
+LONGEST_DURATION = 2**31 - 1
+"""A message's stamp has 32 bits for the seconds of simulated time."""
+
+
+def chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tuple[MarkovChain | None, list[str]]:
+    """The chain that the file describes, and what is wrong with it (then the chain is None).
+
+    Within the tolerance of the check, the diagonal of a generator is replaced by minus the sum of the other rates, and
+    rows of a transition matrix are divided by their sum.
+    """
+    found = _initial_problems(switching, names)
+    given = [key for key in ("generator", "rates", "transition") if getattr(switching, key) is not None]
+    wanted = "generator or rates" if time == "continuous" else "transition"
+    if not given:
+        if len(names) == 1:
+            return MarkovChain(time, np.array([[0.0 if time == "continuous" else 1.0]])), found
+        line = problem(
+            "switching", "missing", f"expected {wanted}, since there are {len(names)} graphs", f"add {wanted}"
+        )
+        return None, [*found, line]
+    if len(given) > 1:
+        line = problem("switching", " and ".join(given), "expected one of them", "remove the others")
+        return None, [*found, line]
+    key = given[0]
+    if (key == "transition") != (time == "discrete"):
+        line = problem(
+            f"switching.{key}",
+            f"given in {time} time",
+            f"expected {wanted}",
+            f"give {wanted}, or change `time`",
+        )
+        return None, [*found, line]
+    if switching.scale != 1.0 and key != "rates":
+        found.append(problem("switching.scale", switching.scale, "expected with rates only", "remove it"))
+    if switching.rates is not None:
+        matrix, more = _from_rates(switching.rates, switching.scale, names)
+    else:
+        matrix, more = _from_matrix(key, switching.generator or switching.transition or [], names)
+    if matrix is None:
+        return None, found + more
+    chain = MarkovChain(time, matrix)
+    found += ergodicity_problems(chain, names, f"switching.{key}")
+    return (None if found else chain), found
+
+
+def _initial_problems(switching: SwitchingSpec, names: Sequence[str]) -> list[str]:
+    if switching.initial == "stationary" or switching.initial in names:
+        return []
+    wanted = f"expected 'stationary' or one of the graphs {', '.join(names)}"
+    return [problem("switching.initial", show(switching.initial), wanted, "use one of them")]
+
+
+def _from_rates(
+    rates: Mapping[str, Mapping[str, float]], scale: float, names: Sequence[str]
+) -> tuple[FloatArray | None, list[str]]:
+    found = []
+    index = {name: mode for mode, name in enumerate(names)}
+    matrix = np.zeros((len(names), len(names)))
+    for source, row in rates.items():
+        for name, key in [
+            (source, "switching.rates"),
+            *((target, f"switching.rates.{source}") for target in row),
+        ]:
+            if name not in index:
+                wanted = f"expected one of the graphs {', '.join(names)}"
+                found.append(problem(f"{key}.{name}", "unknown graph", wanted, "correct the name"))
+        if source in row:
+            key = f"switching.rates.{source}.{source}"
+            found.append(problem(key, row[source], "expected rates to other graphs only", "remove it"))
+        for target, rate in row.items():
+            if source in index and target in index:
+                matrix[index[source], index[target]] = rate * scale
+    return (None if found else matrix - np.diag(matrix.sum(axis=1))), found
+
+
+def _from_matrix(
+    key: str, rows: Sequence[Sequence[float]], names: Sequence[str]
+) -> tuple[FloatArray | None, list[str]]:
+    n = len(names)
+    generator = key == "generator"
+    if len(rows) != n or any(len(row) != n for row in rows):
+        shape = f"{len(rows)} rows of {' or '.join(sorted({str(len(row)) for row in rows})) or 'no'} entries"
+        wanted = f"expected {n} x {n}, one row and column for each graph"
+        return None, [problem(f"switching.{key}", shape, wanted, "rows and columns are the graphs in file order")]
+    matrix = np.array(rows, dtype=float)
+    found = []
+    for i, j in np.ndindex(n, n):
+        value = float(matrix[i, j])
+        place = f"switching.{key}[{i + 1}][{j + 1}]"
+        if generator and i != j and value < 0:
+            found.append(problem(place, value, "expected a rate >= 0", f"rate from {names[i]} to {names[j]}"))
+        elif not generator and not 0 <= value <= 1:
+            wanted = "expected a probability between 0 and 1"
+            found.append(problem(place, value, wanted, f"probability from {names[i]} to {names[j]}"))
+    target = 0.0 if generator else 1.0
+    for i, total in wrong_sums(matrix, target):
+        remedy = "the diagonal is minus the sum of the others" if generator else "correct the row"
+        where = f"row {i + 1} ({names[i]}) sums to {total:.12g}"
+        found.append(problem(f"switching.{key}[{i + 1}]", where, f"expected {target:g}", remedy))
+    if found:
+        return None, found
+    if generator:
+        np.fill_diagonal(matrix, 0.0)
+        np.fill_diagonal(matrix, 0.0 - matrix.sum(axis=1))
+        return matrix, []
+    return np.asarray(matrix / matrix.sum(axis=1, keepdims=True)), []
+
+
+def wrong_sums(matrix: FloatArray, target: float) -> Iterator[tuple[int, float]]:
+    """The rows (from 0) whose sum is not ``target``, apart from rounding, and their sums."""
+    for i, row in enumerate(matrix):
+        total = math.fsum(row)
+        if abs(total - target) > SUM_TOLERANCE * float(np.abs(row).max()):
+            yield i, total
+
+
+def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> list[str]:
+    """Graphs that cannot be reached, or a period of the chain (assumption 1 of the paper); ``key`` is for messages."""
+    if chain.ergodic:
+        return []
+    for source in range(chain.modes):
+        unreached = np.flatnonzero(hops(chain.matrix > 0, [source]) < 0).tolist()
+        if unreached:
+            text = f"{', '.join(names[mode] for mode in unreached)} cannot be reached from {names[source]}"
+            return [problem(key, text, "expected an ergodic chain", "let every graph lead to every other one")]
+    text = f"the chain has period {chain.period}"
+    return [problem(key, text, "expected an ergodic chain", "give some graph a probability > 0 to stay")]
+
+
+def connection_problems(
+    graphs: Sequence[Graph], leaders: LeadersSpec | None, names: Sequence[str] | None = None
+) -> list[str]:
+    """Agents that are not connected in the union of all graphs; ``leaders`` is None in consensus.
+
+    Mean-square stability of the disagreement (tracking: of the deviation from the reference) needs a union in which
+    some agent (tracking: the leaders together) reaches every other one.
+    """
+    union = np.any([graph.adjacency.T > 0 for graph in graphs], axis=0)
+    sources = widest_reaching(union) if leaders is None else [label - 1 for label in leaders.agents]
+    lost = np.flatnonzero(hops(union, sources) < 0).tolist()
+    if not lost:
+        return []
+    start = "a leader" if leaders is not None else f"agent{_list(sources, names)}"
+    text = f"agent{_list(lost, names)} cannot be reached from {start} in the union of all graphs"
+    return [problem("graphs", text, "expected a union that connects all agents", "add an edge, or lower `agents`")]
+
+
+def _list(agents: Sequence[int], names: Sequence[str] | None, longest: int = 8) -> str:
+    """`` 3`` or ``s 1, 2, 3``: agents (from 0) as texts count or name them, after the word "agent"."""
+    shown = ", ".join(agent_name(agent + 1, names) for agent in agents[:longest])
+    more = f" and {len(agents) - longest} more" if len(agents) > longest else ""
+    return ("s " if len(agents) > 1 else " ") + shown + more
+
+
+def noise_gain_of(noise: NoiseSpec, names: Sequence[str], agents: int) -> tuple[FloatArray, list[str]]:
+    """(n, m, m) F of every graph as ``noise.process`` has it, and what is wrong with it.
+
+    If all graphs have the same F it is stored once, in a read-only view.
+    """
+    if not isinstance(noise.process, dict):
+        gain, found = _gain_of("noise.process", noise.process, agents)
+        return np.broadcast_to(gain, (len(names), *gain.shape)), found
+    found = []
+    for name in noise.process:
+        if name not in names:
+            wanted = f"expected one of the graphs {', '.join(names)}"
+            found.append(problem(f"noise.process.{name}", "unknown graph", wanted, "correct the name"))
+    gains = np.zeros((len(names), agents, agents))
+    for mode, name in enumerate(names):
+        key = f"noise.process.{name}"
+        if name not in noise.process:
+            found.append(problem(key, "missing", "expected the noise of every graph", f"for example {name}: 1.0"))
+            continue
+        gain, faults = _gain_of(key, noise.process[name], agents)
+        found += faults
+        if not faults:
+            gains[mode] = gain
+    return gains, found
+
+
+def _gain_of(key: str, value: NoiseGain, agents: int) -> tuple[FloatArray, list[str]]:
+    """(m, m) F, and what is wrong with its shape."""
+    f = np.array(value, dtype=float) if not _ragged(value) else np.empty((0, 0))
+    if f.ndim == 0:
+        return np.eye(agents) * f, []
+    if f.shape == (agents,):
+        return np.diag(f), []
+    if f.shape == (agents, agents):
+        return f, []
+    if f.ndim == 1:
+        shape = f"{len(f)} entries"
+    elif f.size:
+        shape = f"{f.shape[0]} x {f.shape[1]}"
+    else:
+        shape = "rows of different lengths"
+    wanted = f"expected a number, {agents} numbers or a {agents} x {agents} matrix F"
+    return f, [problem(key, shape, wanted, f"there are {agents} agents")]
+
+
+def _ragged(value: object) -> bool:
+    rows = value if isinstance(value, list) else []
+    return len({len(row) for row in rows if isinstance(row, list)}) > 1
+
+
+def burst_problems(burst: float, loss: LossSpec) -> list[str]:
+    """Losses so likely that they cannot come in bursts as short as this."""
+    found = []
+    for key, probability in [("", loss.default), *((f" of {i} to {j}", p) for i, j, p in (*loss.edges, *loss.arcs))]:
+        shortest = probability / (1.0 - probability)
+        if burst <= shortest:
+            wanted = f"expected more than p / (1 - p) = {shortest:.6g}, with the loss{key} p = {probability:g}"
+            found.append(problem("noise.burst", burst, wanted, "raise it, or lower noise.loss"))
+    return found
+
+
+def leader_problems(
+    problem_kind: str, leaders: LeadersSpec | None, agents: int | None, names: Sequence[str] | None = None
+) -> list[str]:
+    """Leaders that are forbidden, missing, duplicate, unknown or without followers; ``agents``: None if unknown."""
+    if problem_kind == "consensus":
+        if leaders is None:
+            return []
+        return [problem("leaders", "given with problem: consensus", "expected none", "set problem: tracking")]
+    if leaders is None:
+        wanted = "expected leaders, since problem is tracking"
+        return [problem("leaders", "missing", wanted, "for example leaders: {agents: [1], gain: 1.0}")]
+    found = []
+    for label in sorted(label for label in set(leaders.agents) if leaders.agents.count(label) > 1):
+        found.append(
+            problem("leaders.agents", f"{agent_text(label, names)} twice", "expected every leader once", "remove one")
+        )
+    if agents is None:
+        return found
+    for label in leaders.agents:
+        if label > agents:
+            found.append(problem("leaders.agents", f"agent {label}", f"expected agents 1 to {agents}", "correct it"))
+    if math.isinf(leaders.gain) and len(set(leaders.agents)) >= agents:
+        wanted = "expected at least one agent that follows"
+        found.append(problem("leaders.agents", "all agents, with gain inf", wanted, "remove a leader"))
+    return found
+
+
+def stability_limit(graph: Graph, gains: FloatArray) -> float:
+    """Limit of dt: I - dt Z, Z = L + diag(gains), is stable below min 2 Re(lambda) / |lambda|^2 over lambda != 0 of Z.
+
+    Rows and columns of agents with infinite gain are deleted; ``gains`` (m,) kappa. inf for a graph without links.
+    """
+    follows = np.isfinite(gains)
+    z = (graph.laplacian + np.diag(np.where(follows, gains, 0.0)))[np.ix_(follows, follows)]
+    values = np.linalg.eigvalsh(z) if np.array_equal(z, z.T) else np.linalg.eigvals(z)
+    size = np.abs(values)
+    moving = size > 1e-9 * size.max(initial=np.finfo(float).tiny)
+    values, size = values[moving], size[moving]
+    return float(np.min(2.0 * (values.real / size) / size, initial=np.inf))
+
+
+def stability_problems(graphs: Iterable[Graph], gains: FloatArray, dt: float) -> list[str]:
+    """Graphs for which an Euler step of dt is unstable; ``gains`` (m,) kappa, inf for grounded leaders."""
+    found = []
+    for graph in graphs:
+        limit = stability_limit(graph, gains)
+        if dt >= limit:
+            wanted = f"expected less than {limit:.6g}, the stability limit of graph {graph.name}"
+            found.append(problem("run.dt", dt, wanted, "lower run.dt"))
+    return found
+
+
+def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
+    """Steps, durations and starting values that do not fit; ``agents`` is None where unknown."""
+    found = []
+    if run.pace == "lockstep" and run.delivery == "best_effort":
+        wanted = "in lockstep expected reliable, since every value is needed"
+        found.append(problem("run.delivery", "best_effort", wanted, "remove it, or use run.pace: realtime"))
+    if time == "discrete" and run.dt != 1.0:
+        found.append(problem("run.dt", run.dt, "expected 1 in discrete time", "remove run.dt"))
+    else:
+        steps = run.duration / run.dt
+        if steps > MOST_STEPS:
+            wanted = f"expected at most {MOST_STEPS:.0e} steps"
+            found.append(problem("run.dt", run.dt, wanted, "raise run.dt, or lower run.duration"))
+        elif round(steps) < 1 or abs(steps - round(steps)) > STEP_TOLERANCE * steps:
+            near = max(round(steps), 1) * run.dt
+            wanted = f"expected a whole number of steps of {run.dt:g}"
+            found.append(problem("run.duration", run.duration, wanted, f"for example {near:.12g}"))
+    if run.duration > LONGEST_DURATION:
+        wanted = f"expected at most {LONGEST_DURATION}, the largest stamp of a message"
+        found.append(problem("run.duration", run.duration, wanted, "lower run.duration"))
+    if isinstance(run.start, list) and agents is not None and len(run.start) != agents:
+        wanted = f"expected one value for each of the {agents} agents"
+        found.append(problem("run.start", f"{len(run.start)} values", wanted, "give as many as there are agents"))
+    return found
+
+
+def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
+    """(m,) kappa; 0 for followers, inf for grounded leaders."""
+    gains = np.zeros(agents)
+    if leaders:
+        gains[np.array(leaders.agents) - 1] = leaders.gain
+    return gains

@@ -1,0 +1,467 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Candidate causes of a disagreement, and their words.
+
+Scores of the parameters that may be wrong (gains, noise, messages), and the single causes searched for.
+
+Every group has parameters with a score s and its information J, so that a change c of them gives s the mean J c.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.common.text import HALF_WIDTH_95
+from msg_analysis.experiment.markov_chain import MarkovChain
+from msg_analysis.inference.gains import Term
+from msg_analysis.inference.messages import LossTally
+from msg_analysis.inference.received_values import NO_NOISE
+from msg_analysis.inference.residuals import InnovationSums
+from msg_analysis.inference.statistics import chi2_quantile, log_normal_tail, pseudo_inverse
+
+MOST = 6  # causes searched for in one group
+SAME = 1e-9  # share of a candidate's information that must be left after removing what the others explain
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A change of the law along one direction."""
+
+    part: str  # with ``what``, the meaning, for the caller
+    what: Any
+    direction: FloatArray  # (K,) change of the parameters for a change by 1
+
+
+@dataclass(frozen=True, slots=True)
+class Selected:
+    """A change that was found."""
+
+    part: str  # of the candidate, as ``what``
+    what: Any
+    estimate: float  # of the change, given all others that were found
+    standard_error: float
+    log_p: float  # logarithm of the p-value, adjusted for all candidates
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 %."""
+        half = HALF_WIDTH_95 * self.standard_error
+        return self.estimate - half, self.estimate + half
+
+
+def select(
+    score: FloatArray, information: FloatArray, classes: Sequence[Sequence[Candidate]], families: int, level: float
+) -> tuple[list[Selected], FloatArray]:
+    """Find the changes that explain a score, the smallest p-value first, each given the others.
+
+    A candidate's p-value is multiplied by the number of candidates of its class and by the number of classes
+    (Bonferroni): so a class of one (all messages alike) needs less evidence than one of many links.
+
+    Parameters
+    ----------
+    score
+        (K,) with mean information @ change
+    information
+        (K, K) covariance of the score where nothing is wrong
+    classes
+        candidates, class by class
+    families
+        number of classes, those of other scores included
+    level
+        probability of finding anything where nothing is wrong, at most
+
+    Returns
+    -------
+    tuple[list[Selected], FloatArray]
+        what was found, and the total change (K,) of the parameters
+    """
+    candidates, penalties = _distinct(classes, families)
+    if not candidates:
+        return [], np.zeros(len(score))
+    directions = np.array([candidate.direction for candidate in candidates])
+    moved = directions @ information
+    scores, full = directions @ score, moved @ directions.T
+    chosen: list[int] = []
+    while len(chosen) < MOST:
+        log_p = _log_p(scores, full, chosen) + penalties
+        best = int(np.argmin(log_p))
+        if log_p[best] >= math.log(level):
+            break
+        chosen.append(best)
+        # A cause that later ones explain better is dropped.
+        for old in list(chosen[:-1]):
+            others = [c for c in chosen if c != old]
+            if (_log_p(scores, full, others) + penalties)[old] >= math.log(level):
+                chosen = others
+                break
+    if not chosen:
+        return [], np.zeros(len(score))
+    inverse = np.linalg.pinv(full[np.ix_(chosen, chosen)], hermitian=True)
+    values, errors = inverse @ scores[chosen], np.sqrt(np.diag(inverse).clip(0.0))
+    found = []
+    for place, c in enumerate(chosen):
+        others = [other for other in chosen if other != c]
+        surprise = float((_log_p(scores, full, others) + penalties)[c])
+        part, what = candidates[c].part, candidates[c].what
+        found.append(Selected(part, what, float(values[place]), float(errors[place]), min(surprise, 0.0)))
+    return sorted(found, key=lambda one: one.log_p), values @ directions[chosen]
+
+
+def _log_p(scores: FloatArray, full: FloatArray, chosen: list[int]) -> FloatArray:
+    """(C,): of all candidates, given the chosen ones."""
+    own = np.diag(full).copy()
+    rest, left = scores, own.copy()
+    if chosen:
+        shared = full[:, chosen] @ np.linalg.pinv(full[np.ix_(chosen, chosen)], hermitian=True)
+        rest = scores - shared @ scores[chosen]
+        left = own - np.einsum("cs,cs->c", shared, full[:, chosen])
+    possible: BoolArray = left > SAME * np.maximum(own, own.max(initial=0.0) * SAME)
+    z = np.zeros(len(scores))
+    z[possible] = rest[possible] / np.sqrt(left[possible])
+    return np.where(possible, math.log(2.0) + log_normal_tail(np.abs(z)), 0.0)
+
+
+def _distinct(classes: Sequence[Sequence[Candidate]], families: int) -> tuple[list[Candidate], FloatArray]:
+    """Candidates that differ from all earlier ones, and the logarithm of the factor of each p-value."""
+    seen: set[bytes] = set()
+    kept: list[Candidate] = []
+    penalties = []
+    for candidates in classes:
+        for candidate in candidates:
+            key = np.round(candidate.direction, 12).tobytes()
+            if key in seen or not candidate.direction.any():
+                continue
+            seen.add(key)
+            kept.append(candidate)
+            penalties.append(math.log(len(candidates) * families))
+    return kept, np.array(penalties)
+
+
+CauseKind = Literal[
+    "frozen",
+    "graph",
+    "gain",
+    "ignored",
+    "reference",
+    "offset",
+    "noise",
+    "correlation",
+    "lag",
+    "outlier",
+    "stale",
+    "switching",
+    "sojourns",
+    "loss",
+    "broadcast",
+    "unknown",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One thing that is wrong."""
+
+    kind: CauseKind
+    words: str  # a sentence
+    agent: int | None = None  # from 1; None where the cause is not one agent
+    link: tuple[int, int] | None = None  # from 1: sender and receiver, or the two ends of an edge or of a correlation
+    graph: str | list[str] | None = None  # name; for switching [from, to] or [from]; None: all graphs
+    estimate: float | None = None  # measured: factor of a gain or variance, share, rate, correlation or value
+    interval: tuple[float, float] | None = None  # 95 %, for this cause alone
+    expected: float | None = None  # the same according to the experiment; 1 for a factor
+    p: float | None = None  # adjusted for all candidate causes; 0 where the law makes it impossible
+    steps: tuple[int, int] | None = None  # first and last, where the cause is a stretch of the run
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON document."""
+        return {
+            "kind": self.kind,
+            "words": self.words,
+            "agent": self.agent,
+            "link": list(self.link) if self.link else None,
+            "graph": self.graph,
+            "estimate": self.estimate,
+            "interval": list(self.interval) if self.interval else None,
+            "expected": self.expected,
+            "p": self.p,
+            "steps": list(self.steps) if self.steps else None,
+        }
+
+
+def numbers_text(value: float, interval: tuple[float, float]) -> str:
+    """A number and its interval."""
+    return f"{value:#.3g} ({interval[0]:#.3g} to {interval[1]:#.3g})"
+
+
+MIN_SAMPLES = 30  # fewest innovations for a variance
+MAX_PARAMETERS = 600  # most parameters whose information is inverted
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Suspects:
+    """A group of parameters that may be wrong."""
+
+    score: FloatArray  # (K,)
+    information: FloatArray  # (K, K)
+    classes: list[list[Candidate]]  # candidates, class by class; the more specific of equal ones first
+
+
+def frozen(sums: InnovationSums) -> list[tuple[int, int, int]]:
+    """(agent, steps in which it did not move, steps) of agents that cannot have stood still with their noise."""
+    noisy = np.sqrt(np.diagonal(sums.noises, axis1=1, axis2=2)) > 1e-12 * sums.largest
+    still, steps = (sums.still * noisy).sum(axis=0), (sums.steps[:, None] * noisy).sum(axis=0)
+    # One or two unmoved steps may be a coincidence of rounding.
+    return [(i, int(still[i]), int(steps[i])) for i in np.flatnonzero(still >= 3).tolist()]
+
+
+def gains(sums: InnovationSums, pardoned: Iterable[int]) -> Suspects | None:
+    """Parameters of the regression on what the agents heard, without the ``pardoned``; None where it is not available.
+
+    Changes of gains are relative, those of the reference and of offsets (per step) absolute. The score G C^-1 U and the
+    information G C^-1 G follow from the regression's score U, covariance C and gram G.
+    """
+    if sums.gram is None or len(sums.terms) > MAX_PARAMETERS:
+        return None
+    out = set(pardoned)
+    kept = np.array([a for a, term in enumerate(sums.terms) if term.agent not in out], dtype=np.int64)
+    if not kept.size:
+        return None
+    square = np.ix_(kept, kept)
+    inverse = pseudo_inverse(sums.covariance[square])
+    back = sums.gram[square] @ inverse
+    score, information = np.zeros(len(sums.terms)), np.zeros_like(sums.gram)
+    score[kept], information[square] = back @ sums.score[kept], back @ sums.gram[square]
+    return Suspects(score, information, _gain_classes(sums.terms))
+
+
+def _gain_classes(terms: Sequence[Term]) -> list[list[Candidate]]:
+    weights = np.array([term.weight for term in terms])
+
+    def group(kind: str, part: str, of: Callable[[Term], Hashable]) -> list[Candidate]:
+        """One candidate for each value of ``of`` over the terms of a kind."""
+        found: dict[Hashable, FloatArray] = {}
+        for a, term in enumerate(terms):
+            if term.kind == kind:
+                found.setdefault(of(term), np.zeros(len(terms)))[a] = weights[a]
+        return [Candidate(part, key, direction) for key, direction in found.items()]
+
+    def pair(term: Term) -> Hashable:
+        return frozenset((term.agent, term.sender))
+
+    classes = [
+        group("link", "link", lambda t: (t.sender, t.agent, None)),
+        group("link", "link", lambda t: (t.sender, t.agent, t.graph)),
+        group("link", "edge", lambda t: (pair(t), None)),
+        group("link", "edge", lambda t: (pair(t), t.graph)),
+        group("link", "receiver", lambda t: t.agent),
+        group("link", "sender", lambda t: t.sender),
+        group("link", "graph", lambda t: t.graph),
+        group("link", "all", lambda _: None),
+        group("lead", "leader", lambda t: t.agent),
+        group("lead", "leaders", lambda _: None),
+        group("pull", "receiver", lambda t: t.agent),
+        group("pull", "receiver in graph", lambda t: (t.agent, t.graph)),
+        group("pull", "graph", lambda t: t.graph),
+        group("pull", "all", lambda _: None),
+        group("constant", "offset", lambda t: t.agent),
+        [Candidate("reference", None, _reference(terms))],
+    ]
+    return [found for found in classes if any(candidate.direction.any() for candidate in found)]
+
+
+def _reference(terms: Sequence[Term]) -> FloatArray:
+    """(K,): effect of a reference that is larger by 1: leaders are pulled that much higher."""
+    pulls: dict[int, list[float]] = {}
+    for term in terms:
+        if term.kind == "lead":
+            pulls.setdefault(term.agent, []).append(-term.weight)
+    return np.array(
+        [np.mean(pulls[term.agent]) if term.kind == "constant" and term.agent in pulls else 0.0 for term in terms]
+    )
+
+
+def noise(sums: InnovationSums, pardoned: Iterable[int], change: FloatArray) -> Suspects | None:
+    """Logarithms of the noise variances over their nominal values, by graph and agent; None without usable ones.
+
+    Left out are the ``pardoned`` agents, and what the coefficients ``change`` (K,) of the regression explain.
+    """
+    n, m = sums.still.shape
+    out = np.zeros(m, np.bool_)
+    out[list(pardoned)] = True
+    should = np.diagonal(sums.noises, axis1=1, axis2=2)
+    squares = np.diagonal(sums.scatter, axis1=1, axis2=2) - _explained(sums, change)
+    usable: BoolArray = (should > NO_NOISE * should.max(initial=0.0)) & (sums.samples >= MIN_SAMPLES)[:, None] & ~out
+    usable &= squares > 0.0
+    cells = np.argwhere(usable)
+    if not 0 < len(cells) <= MAX_PARAMETERS:
+        return None
+    graph, agent = cells.T
+    ratios = np.log(squares[graph, agent] / (sums.samples[graph] * should[graph, agent]))
+    root = np.sqrt(should[graph, agent])
+    # Cells of different graphs are independent; their entries here are not used.
+    correlation = sums.noises[graph[:, None], agent[:, None], agent] / (root[:, None] * root)
+    covariance = np.where(graph[:, None] == graph, 2.0 * correlation**2 / sums.samples[graph][:, None], 0.0)
+    information = pseudo_inverse(covariance)
+    classes = [
+        [Candidate("agent", int(i), (agent == i) * 1.0) for i in np.unique(agent)],
+        [Candidate("agent in graph", (int(i), int(g)), np.eye(len(cells))[c]) for c, (g, i) in enumerate(cells)],
+        [Candidate("graph", int(g), (graph == g) * 1.0) for g in np.unique(graph)],
+        [Candidate("all", None, np.ones(len(cells)))],
+    ]
+    return Suspects(information @ ratios, information, classes if n > 1 else [classes[0], classes[3]])
+
+
+def variances(squares: FloatArray, samples: int) -> Suspects:
+    """Logarithms of the variances of m kinds of independent normal numbers, nominally 1.
+
+    ``squares`` (m,) are sums of squares of as many numbers as ``samples``.
+    """
+    information = np.eye(len(squares)) * samples / 2.0
+    classes = [
+        [Candidate("agent", i, row) for i, row in enumerate(np.eye(len(squares)))],
+        [Candidate("all", None, np.ones(len(squares)))],
+    ]
+    return Suspects(information @ np.log(np.maximum(squares, 1e-300) / samples), information, classes)
+
+
+def losses(tally: LossTally) -> Suspects:
+    """Log-odds of losing a message, link by link."""
+    pairs = tally.pairs
+    score, information = tally.score()
+    # Other links say nothing; one that should lose nothing, but does, is all but impossible.
+    usable = (tally.probability > 0.0) | (tally.lost > 0)
+    information = np.where(usable & (information == 0.0), 1e-9 * tally.messages, information)
+    identity = np.eye(len(pairs))
+    classes = [
+        [Candidate("link", (int(j), int(i)), identity[a]) for a, (i, j) in enumerate(pairs) if usable[a]],
+        [Candidate("receiver", int(i), (pairs[:, 0] == i) * usable.astype(float)) for i in np.unique(pairs[usable, 0])],
+        [Candidate("sender", int(j), (pairs[:, 1] == j) * usable.astype(float)) for j in np.unique(pairs[usable, 1])],
+        [Candidate("all", None, usable.astype(float))],
+    ]
+    return Suspects(np.asarray(score), np.diag(information), classes)
+
+
+def _explained(sums: InnovationSums, change: FloatArray) -> FloatArray:
+    """(n, m): how much smaller the sums of squares are with this change of the law."""
+    n, m = sums.still.shape
+    explained = np.zeros((n, m))
+    touched = np.flatnonzero(change)
+    if sums.gram is None or not touched.size:
+        return explained
+    shares = sums.samples / max(int(sums.samples.sum()), 1)
+    gram = sums.gram[np.ix_(touched, touched)]
+    for place, a in enumerate(touched.tolist()):
+        term, c = sums.terms[a], change[touched]
+        less = c[place] * (2.0 * sums.score[a] - gram[place] @ c)
+        explained[:, term.agent] += less * (shares if term.graph is None else np.arange(n) == term.graph)
+    return explained
+
+
+WIDEST = math.log(1e3)  # largest change of a rate, either way, as a logarithm
+MAX_JUMPS = 400  # kinds of jumps; with more, no rates are tested
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """Rates, or in discrete time probabilities, that are all wrong by one factor."""
+
+    jumps: tuple[tuple[int, int], ...]  # (from, to) from 0
+    origin: int | None  # the graph that is left, where it is all jumps from one; else None
+    factor: float  # measured over nominal
+    interval: tuple[float, float]  # 95 %, by the likelihood ratio
+    log_p: float  # adjusted, see ``forward_selection``
+
+
+def find_rates(counts: IntArray, chain: MarkovChain, dt: float, families: int, level: float) -> list[Rate]:
+    """Find the rates that explain the counted transitions: score tests, then maximum likelihood of the factors.
+
+    Parameters
+    ----------
+    counts
+        (n, n) of transitions from step to step
+    chain
+        the nominal chain; with more than ``MAX_JUMPS`` kinds of jumps nothing is found
+    dt
+        length of a step [simulated time]
+    families, level
+        see ``selection.select``
+    """
+    n = chain.modes
+    transition = chain.transition(dt)
+    jumps = [(g, h) for g, h in np.argwhere(chain.matrix > 0.0).tolist() if g != h]
+    if not jumps or len(jumps) > MAX_JUMPS:
+        return []
+    origin, target = np.array(jumps).T
+    visits = counts.sum(axis=1)
+    stay = np.diag(transition)
+    # Log-likelihood of e^theta P_gh, with P_gg making up the difference: multinomial, row by row.
+    odds = np.divide(transition[origin, target], stay[origin], out=np.zeros(len(jumps)), where=stay[origin] > 0.0)
+    score = counts[origin, target] - counts[origin, origin] * odds
+    expected = visits[origin] * transition[origin, target]
+    information = np.diag(expected) + np.where(origin[:, None] == origin, expected[:, None] * odds, 0.0)
+    identity = np.eye(len(jumps))
+    classes = [
+        [Candidate("jump", (g, h), identity[a]) for a, (g, h) in enumerate(jumps)],
+        [Candidate("leaving", g, (origin == g) * 1.0) for g in range(n)],
+        [Candidate("all", None, np.ones(len(jumps)))],
+    ]
+    selected, _ = select(score, information, classes, families, level)
+    rates, matrix = [], chain.matrix
+    for one in selected:
+        chosen: BoolArray = np.zeros((n, n), np.bool_)
+        if one.part == "jump":
+            chosen[one.what] = True
+        else:
+            chosen[origin, target] = True if one.part == "all" else origin == one.what
+        theta, interval = _likeliest(counts, MarkovChain(chain.time, matrix), dt, chosen)
+        matrix = _scaled(matrix, chain, chosen, theta)
+        where = tuple((g, h) for g, h in jumps if chosen[g, h])
+        leaves = one.what if one.part == "leaving" else None
+        rates.append(Rate(where, leaves, math.exp(theta), (math.exp(interval[0]), math.exp(interval[1])), one.log_p))
+    return rates
+
+
+def _likeliest(counts: IntArray, chain: MarkovChain, dt: float, chosen: BoolArray) -> tuple[float, tuple[float, float]]:
+    """Logarithm of the factor of the chosen jumps, and the interval in which 2 log L falls by less than 3.84."""
+    from scipy import optimize  # here, since few comparisons come this far
+
+    highest = WIDEST
+    if chain.time == "discrete":  # the diagonal must not become negative
+        given = (chain.matrix * chosen).sum(axis=1)
+        room = np.diag(chain.matrix) + given
+        highest = min(highest, float(np.log(room[given > 0.0] / given[given > 0.0]).min()) - 1e-9)
+
+    def less(theta: float) -> float:
+        """Negative log-likelihood."""
+        law = MarkovChain(chain.time, _scaled(chain.matrix, chain, chosen, theta)).transition(dt)
+        with np.errstate(divide="ignore"):
+            terms = np.where(counts > 0, counts * np.log(np.maximum(law, 1e-300)), 0.0)
+        return -float(terms.sum())
+
+    bounds = (-WIDEST, highest)
+    theta = float(optimize.minimize_scalar(less, bounds=bounds, method="bounded", options={"xatol": 1e-7}).x)
+    allowed = less(theta) + float(chi2_quantile(0.05, 1)) / 2.0
+    ends = []
+    for bound in bounds:
+        inside = less(bound) <= allowed
+        ends.append(
+            bound
+            if inside
+            else float(optimize.brentq(lambda t: less(t) - allowed, min(theta, bound), max(theta, bound)))
+        )
+    return theta, (ends[0], ends[1])
+
+
+def _scaled(matrix: FloatArray, chain: MarkovChain, chosen: BoolArray, theta: float) -> FloatArray:
+    """Generator or transition matrix with the chosen jumps e^theta times as frequent."""
+    scaled = np.where(chosen, matrix * math.exp(theta), matrix)
+    np.fill_diagonal(scaled, 0.0)
+    np.fill_diagonal(scaled, (1.0 if chain.time == "discrete" else 0.0) - scaled.sum(axis=1))
+    return scaled

@@ -1,0 +1,424 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.text import (
+    agent_text,
+    half_width_text,
+    markdown_table,
+    measured_text,
+    number_text,
+    with_names,
+    z_text,
+)
+from msg_analysis.errors import ExitCode
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.candidates import Cause
+from msg_analysis.inference.estimates import CovarianceTest, Estimate, Ranking
+from msg_analysis.inference.given_path import GivenPath
+from msg_analysis.inference.messages import LossTest
+from msg_analysis.inference.realtime_laws import Laws
+from msg_analysis.inference.residuals import InnovationTests
+from msg_analysis.inference.sequential_sums import AnyTimeEvidence
+from msg_analysis.inference.switching import SwitchingTest
+from msg_analysis.inference.time_means import TimeMeans
+from msg_analysis.inference.timing import Timing
+from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run_record import RunRecord
+from msg_analysis.model.step_model import step_law
+from msg_analysis.theory.fourth_moments import FourthMoment
+from msg_analysis.theory.prediction import SHOWN_AGENTS, Prediction
+
+# Keys of an experiment that do not change its law
+MAY_DIFFER = {"name", "names", "run.seed", "run.duration", "run.processes", "run.speed"}
+
+
+def law_keys(experiment: ValidExperiment) -> dict[str, Any]:
+    """Every key (nested ones with dots) that defines the law of a run, and its value."""
+    found = flat(experiment.to_document())
+    # The order of the graphs is that of the modes.
+    found["graphs"] = [graph.name for graph in experiment.graph_list]
+    if experiment.protocol:
+        found["protocol.version"] = experiment.protocol.info.version
+    return {key: value for key, value in found.items() if key not in MAY_DIFFER}
+
+
+def law_identity(experiment: ValidExperiment) -> str:
+    """A text of 16 hexadecimal digits, the same for runs of the same law."""
+    text = json.dumps(law_keys(experiment), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def first_difference(one: ValidExperiment, other: ValidExperiment) -> tuple[str, Any, Any] | None:
+    """Key and both values of the first difference, by name; None where the law is the same."""
+    a, b = law_keys(one), law_keys(other)
+    for key in sorted(a.keys() | b.keys()):
+        if a.get(key) != b.get(key):
+            return key, a.get(key), b.get(key)
+    return None
+
+
+def flat(document: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Every key of nested mappings, joined by dots, and its value."""
+    found: dict[str, Any] = {}
+    for key, value in document.items():
+        if isinstance(value, Mapping):
+            found |= flat(value, f"{prefix}{key}.")
+        else:
+            found[f"{prefix}{key}"] = value
+    return found
+
+
+Reason = Literal["heavy_tails", "kept_values", "short_run", "few_sojourns"]
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """Which errors to trust, and why not the others; ``errors`` is None where no errors have valid intervals."""
+
+    errors: Literal["all_paths", "given_path"] | None
+    reason: Reason | None = None
+    words: str | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The document."""
+        return asdict(self)
+
+
+def trusted(prediction: Prediction, means: TimeMeans, *, given: bool) -> Trust:
+    """Which errors of a run in lockstep to trust.
+
+    Parameters
+    ----------
+    prediction
+        of the experiment
+    means
+        over all paths, of one run or of several
+    given
+        whether there are errors given the path of the graphs
+    """
+    reason = _reason(prediction, means)
+    if reason is None:
+        return Trust("all_paths")
+    instead = "Trust the tests of innovations and switching, which do not depend on this."
+    if given:
+        instead = "Trust the errors given the path, and the tests, which do not depend on this."
+    return Trust("given_path" if given else None, reason, f"{_why(reason, prediction, means)} {instead}")
+
+
+def _reason(prediction: Prediction, means: TimeMeans) -> Reason | None:
+    if means.heavy:
+        return "heavy_tails"
+    if prediction.system.readout is not None:
+        return "kept_values"
+    if not means.long_enough:
+        return "short_run"
+    return "few_sojourns" if means.few_sojourns else None
+
+
+def _why(reason: Reason, prediction: Prediction, means: TimeMeans) -> str:
+    if reason == "heavy_tails":
+        return (
+            f"The fourth moments of the states {_infinite(prediction.fourth_moment)}: rare large values make a large "
+            "part of the mean error, so most runs measure less than the prediction, and the errors over all paths of "
+            "the graphs have no standard error and no interval."
+        )
+    if reason == "kept_values":
+        return (
+            "Agents keep values from step to step, so the standard errors over all paths of the graphs depend on more "
+            "than the log and are not known."
+        )
+    if reason == "short_run":
+        return "The run is too short for intervals of the errors over all paths of the graphs."
+    return (
+        f"This run sees few sojourns of the graphs (some graph is left {number_text(means.switches, 3)} times on "
+        "average), so the errors over all paths of the graphs depend on a few random lengths: they are far from "
+        "normal, and their intervals are too wide."
+    )
+
+
+def _infinite(fourth: FourthMoment) -> str:
+    if fourth.finite is None:
+        return "may be infinite (their growth is not known exactly)"
+    radius = fourth.radius if fourth.radius is not None else fourth.lower
+    least = "" if fourth.radius is not None else "at least "
+    return f"are infinite (they grow {least}{number_text(radius, 3)} times per step)"
+
+
+Verdict = Literal["agrees", "disagrees", "incomplete", "unpredicted"]
+
+EXIT_CODES: dict[Verdict, ExitCode] = {
+    "agrees": ExitCode.FINE,
+    "disagrees": ExitCode.DISAGREES,
+    "incomplete": ExitCode.INCOMPLETE,
+    "unpredicted": ExitCode.FINE,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Test:
+    """One member of the family of tests that the verdict is about."""
+
+    name: str
+    p: float  # of this test alone
+    p_adjusted: float  # Holm's, over the family
+    rejected: bool  # whether ``p_adjusted`` is below the level
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Member:
+    """One of the runs."""
+
+    name: str  # of its bag
+    record: RunRecord
+    steps: int  # used: all, or those before the first gap; 0 where these are too few
+    completeness: Completeness
+    system_error: Estimate
+    tested: Estimate  # the same, corrected for the path of the graphs where that is known
+    verdict: str  # on this run alone
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of one row."""
+        count = self.completeness
+        return {
+            "bag": self.name,
+            "run": str(self.record.run),
+            "seed": self.record.experiment.run.seed,
+            "steps": self.steps,
+            "simulated_time": self.steps * self.record.experiment.step_length,
+            "complete": count.complete,
+            "missing": count.missing,
+            "missing_modes": count.missing_modes,
+            "verdict": self.verdict,
+            "system_error": self.system_error.to_json(),
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pool:
+    """The runs of a comparison, and Cochran's Q test of whether their system errors differ; None without."""
+
+    members: tuple[Member, ...]
+    chi2: float | None = None
+    dof: int | None = None
+    p: float | None = None
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """The rows."""
+        return [member.to_json() for member in self.members]
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Comparison:
+    """The result of ``msg-analysis compare``.
+
+    Attributes
+    ----------
+    trajectory
+        what was compared; of several runs it has no data, but the completeness of all
+    level
+        probability of a false "disagrees", at most
+    steps
+        steps used: all, or those before the first gap
+    system_error, node_errors, covariance, innovations, switching
+        estimates and tests; ``switching`` is None where too few steps arrived. The errors have standard errors over all
+        paths of the graphs, if the run is long enough for these
+    continuous_error
+        the paper's continuous-time system error; None where it has none
+    batch
+        (low, high), the 95 % interval of batch means for the system error; None for short runs
+    tests
+        the family, in the order of the report
+    running
+        "time" [units of simulated time], and the mean of the system error up to then with its standard error (0 without
+        a prediction, and in runs that are too short for it): "system_error", "standard_error"; (T,) each, T at most 400
+    loss
+        test of the lost messages; None where none can be lost
+    p_broadcast
+        of the noise in published values; None without
+    unpredicted
+        why there is no prediction; None where there is one
+    transient
+        steps at the start that are left out of the measured errors; None with a prediction, which includes them
+    timing, laws
+        in real time: how time was kept, and which laws the log supports; None in lockstep. The errors and the
+        covariance are compared with the logged-pattern law where it is available, else with the sequential law
+    given
+        errors given the path of the graphs; None where they are not computed
+    order
+        which agents have smaller errors than which; None where the run is too short to know
+    blame
+        what is wrong, where the verdict is "disagrees"
+    pool
+        the runs, where there are several
+    any_time
+        evidence that may be looked at any time; None where too few steps arrived, or without a prediction
+    trust
+        in lockstep: which errors have valid intervals, and why; None where too few steps arrived, or without a
+        prediction
+    """
+
+    trajectory: Trajectory
+    level: float
+    steps: int
+    system_error: Estimate
+    node_errors: list[Estimate]
+    covariance: CovarianceTest
+    innovations: InnovationTests
+    switching: SwitchingTest | None
+    continuous_error: float | None
+    batch: tuple[float, float] | None
+    tests: list[Test]
+    running: dict[str, FloatArray]
+    loss: LossTest | None = None
+    p_broadcast: float | None = None
+    unpredicted: str | None = None
+    transient: int | None = None
+    timing: Timing | None = None
+    laws: Laws | None = None
+    given: GivenPath | None = None
+    order: Ranking | None = None
+    blame: Sequence[Cause] = ()
+    pool: Pool | None = None
+    any_time: AnyTimeEvidence | None = None
+    trust: Trust | None = None
+
+    def __repr__(self) -> str:
+        total, runs = self.system_error, f"{len(self.pool.members)} runs" if self.pool else "run"
+        numbers = f"measured {measured_text(total.measured, total.interval)}, predicted {number_text(total.predicted)}"
+        name = self.trajectory.record.experiment.name
+        return f"<Comparison, {runs} of {name!r}: {self.verdict}; system error {numbers}>"
+
+    def _repr_markdown_(self) -> str:
+        names = self.trajectory.record.experiment.names
+        rows = [
+            (
+                name,
+                number_text(error.measured),
+                half_width_text(error.interval),
+                number_text(error.predicted),
+                z_text(error.z),
+            )
+            for name, error in [
+                ("**system**", self.system_error),
+                *((agent_text(i, names), node) for i, node in enumerate(self.node_errors[:SHOWN_AGENTS], start=1)),
+            ]
+        ]
+        rows += [("...", "", "", "", "")] * (len(self.node_errors) > SHOWN_AGENTS)
+        table = markdown_table(("mean-square error", "measured", "± (95 %)", "predicted", "z"), rows)
+        blame = "".join(f"- {with_names(cause.words, names)}\n" for cause in self.blame)
+        return f"**{self.verdict}**\n\n{table}" + (f"\n{blame}" if blame else "")
+
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict: "incomplete" if data are missing, else "disagrees" if a test of the family is rejected.
+
+        A run that was to end as soon as its evidence disagrees (``--until decided``) disagrees when that has happened.
+        Without a prediction the remaining tests cannot show that a run agrees: "unpredicted".
+        """
+        if not self.trajectory.completeness.complete:
+            return "incomplete"
+        until = self.trajectory.record.until
+        decided = until is not None and until.decided and self.any_time is not None and self.any_time.disagrees
+        if decided or any(test.rejected for test in self.tests):
+            return "disagrees"
+        return "unpredicted" if self.unpredicted else "agrees"
+
+    @property
+    def exit_code(self) -> int:
+        """0 agrees or unpredicted, 1 disagrees, 3 incomplete."""
+        return EXIT_CODES[self.verdict]
+
+    @property
+    def _law(self) -> str:
+        """The law that the errors are compared with."""
+        if self.laws:
+            return self.laws.measured_against
+        tested = any(test.name == "system error" for test in self.tests)
+        real_time = self.trajectory.record.experiment.run.pace == "realtime"
+        return "pattern" if self.pool and real_time and tested else step_law(self.trajectory.record.experiment)
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of ``msg-analysis compare --json``; every number is finite or None."""
+        record, covariance, switching = self.trajectory.record, self.covariance, self.switching
+        document = {
+            "verdict": self.verdict,
+            "unpredicted": self.unpredicted,
+            "transient": self.transient,
+            "run": None if self.pool else str(record.run),
+            "experiment": record.experiment.name,
+            "experiment_identity": law_identity(record.experiment),
+            "names": record.experiment.names,
+            "leaders": (np.flatnonzero(record.experiment.leader_gains) + 1).tolist(),
+            "seed": None if self.pool else record.experiment.run.seed,
+            "level": self.level,
+            "until": _until(record),
+            "completeness": asdict(self.trajectory.completeness) | {"stretch": self.trajectory.stretch},
+            "steps": self.steps,
+            "simulated_time": self.steps * record.experiment.step_length,
+            "law": self._law,
+            "bags": self.pool.to_json() if self.pool else None,
+            "homogeneity": {key: getattr(self.pool, key, None) for key in ("chi2", "dof", "p")},
+            "system_error": self.system_error.to_json(),
+            "node_errors": [estimate.to_json() for estimate in self.node_errors],
+            "covariance": {
+                "measured": covariance.measured,
+                "predicted": covariance.predicted,
+                "chi2": covariance.chi2,
+                "dof": covariance.dof,
+                "p": covariance.p,
+                "note": covariance.note,
+                "z": covariance.z,
+            },
+            "innovations": asdict(self.innovations),
+            "switching": {
+                "counts": switching.counts if switching else None,
+                "expected": switching.expected if switching else None,
+                "p": switching.p if switching else None,
+            },
+            "loss": asdict(self.loss) if self.loss else dict.fromkeys(("lost", "expected", "p")),
+            "broadcast": {"p": self.p_broadcast},
+            "timing": self.timing.to_json() if self.timing else None,
+            "laws": self.laws.to_json() if self.laws else None,
+            "given_path": self.given.to_json() if self.given else None,
+            "order": self.order.to_json() if self.order else None,
+            "blame": [cause.to_json() for cause in self.blame],
+            "continuous": {"system_error": self.continuous_error},
+            "batch_means": {"interval": self.batch or (None, None)},
+            "tests": [asdict(test) for test in self.tests],
+            "any_time": self.any_time.to_json() if self.any_time else None,
+            "trust": self.trust.to_json() if self.trust else None,
+        }
+        return {key: _plain(value) for key, value in document.items()}
+
+
+def _until(record: RunRecord) -> dict[str, Any] | None:
+    """Of a run that was to end early."""
+    if record.until is None:
+        return None
+    early = record.planned is not None
+    return {"rule": str(record.until), "planned_steps": record.planned_steps, "ended_early": early}
+
+
+def _plain(value: Any) -> Any:
+    """JSON-able: arrays become lists, numbers that are not finite become None."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,245 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Power of the tests of a run for named faults, from the information that a step is expected to give.
+
+A test's statistic is noncentral chi-square under the fault, with the noncentrality parameter N times that of a step:
+twice the Kullback-Leibler divergence of the faulty law from the law (noise, switching), or the Fisher information of
+the gain times the square of its change. The states have the steady moments of the law without the fault. Only the test
+of what is wrong counts, at the level over the number of tests, the first bound of Holm's method.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy.linalg
+
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.experiment.markov_chain import MarkovChain
+from msg_analysis.inference.gains import MAX_REGRESSORS, regressors
+from msg_analysis.inference.received_values import NO_NOISE
+from msg_analysis.inference.sequential_questions import kind_weights
+from msg_analysis.inference.sequential_sums import EvidenceSums
+from msg_analysis.inference.statistics import chi2_quantile, needed_noncentrality, noncentral_chi2_tail
+from msg_analysis.model.step_model import StepModel
+from msg_analysis.theory.prediction import Prediction
+
+POWER = 0.99  # for which lengths are given
+
+Kind = Literal["noise", "gain", "switching"]
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A part of the law that is multiplied by a factor."""
+
+    kind: Kind  # noise variance of an agent, gain of a link in all graphs, all rates of switching
+    factor: float
+    agent: int | None = None  # from 0: whose noise, or who hears; None: where the fault is hardest to find
+    sender: int | None = None
+
+
+FAULTS = (
+    *(Fault("noise", factor) for factor in (1.05, 1.1)),
+    *(Fault("gain", factor) for factor in (0.8, 0.5)),
+    *(Fault("switching", factor) for factor in (1.4, 0.7)),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class StepInformation:
+    """What a test of a fault has in one step."""
+
+    name: str
+    dof: int
+    noncentrality: float  # of a step, all replicas together
+
+
+@dataclass(frozen=True, slots=True)
+class FaultPower:
+    """How surely a fault is found, at one agent or link."""
+
+    fault: Fault
+    agent: int | None  # from 0: whose noise, or who hears with this gain
+    sender: int | None
+    tests: Sequence[StepInformation]  # those of the fault
+    level: float  # of each test
+    log_price: float  # log evidence that the fault alone must bring to pass 1 / level, all questions together
+
+    def power(self, steps: float) -> float:
+        """Probability that the most powerful of the tests rejects after so many steps."""
+        return max(self.power_of(test, steps) for test in self.tests)
+
+    def power_of(self, test: StepInformation, steps: float) -> float:
+        """The same of one of the tests."""
+        x = chi2_quantile(self.level, test.dof)
+        return float(noncentral_chi2_tail(x, test.dof, steps * test.noncentrality))
+
+    def steps(self, power: float = POWER) -> float:
+        """Steps after which a test has this power; infinite: never."""
+        return min(
+            float(needed_noncentrality(chi2_quantile(self.level, test.dof), test.dof, power)) / test.noncentrality
+            if test.noncentrality > 0.0
+            else math.inf
+            for test in self.tests
+        )
+
+    def evidence_steps(self) -> float:
+        """Steps after which the evidence at any time is expected to pass: half of the runs stop before, about.
+
+        The mixed likelihood ratio of a coefficient with the noncentrality L is exp(L^2 / (2 (1 + L))) / sqrt(1 + L),
+        for a prior of the size of the fault.
+        """
+        information = max(test.noncentrality for test in self.tests)
+        if not information > 0.0 or math.isinf(self.log_price):
+            return math.inf
+        low, high = 0.0, 4.0 * self.log_price + 100.0
+        for _ in range(60):
+            middle = (low + high) / 2.0
+            found = 0.5 * middle**2 / (1.0 + middle) - 0.5 * math.log1p(middle)
+            low, high = (middle, high) if found < self.log_price else (low, middle)
+        return high / information
+
+
+def fault_powers(
+    prediction: Prediction, replicas: int, level: float, faults: Sequence[Fault] = FAULTS
+) -> list[FaultPower]:
+    """Of the faults that the law can have: those without noise, links or switching are left out.
+
+    Parameters
+    ----------
+    prediction
+        of the experiment
+    replicas
+        of the run
+    level
+        probability of a false "disagrees", all tests together
+    faults
+        each is one row of the result
+    """
+    step, sums = prediction.step, EvidenceSums(prediction, replicas, in_detail=True)
+    departures = sums.departures.families() if sums.departures else {}
+    # While a run goes on, departures are not looked for.
+    questions = {kind: logs.size for kind, logs in sums.families().items() if kind not in departures}
+    weights = dict(zip(questions, kind_weights(list(questions)).tolist(), strict=True))
+    share = level / (_family(prediction) + len(departures))
+    found = []
+    for fault in faults:
+        informations = {
+            "noise": lambda fault=fault: _noise(step, fault.factor, replicas),
+            "gain": lambda fault=fault: _gain(prediction, fault.factor, replicas),
+            "switching": lambda fault=fault: _switching(step, fault.factor),
+        }[fault.kind]()
+        if fault.agent is not None:
+            place = fault.agent, fault.sender
+            informations = {key: tests for key, tests in informations.items() if key == place}
+        if not informations:
+            continue
+        (agent, sender), tests = min(
+            informations.items(), key=lambda entry: max(test.noncentrality for test in entry[1])
+        )
+        asked = fault.kind in questions
+        price = math.log(questions[fault.kind] / (weights[fault.kind] * level)) if asked else math.inf
+        found.append(FaultPower(fault, agent, sender, tests, share, price))
+    return found
+
+
+_Informations = dict[tuple[int | None, int | None], list[StepInformation]]
+
+
+def _family(prediction: Prediction) -> int:
+    """Number of tests without departures: errors and covariance, innovations, and those of what the experiment has."""
+    step = prediction.step
+    return 1 + step.agents + 1 + 4 + (step.modes > 1) + (step.loss > 0.0) + (step.broadcast > 0.0)
+
+
+def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
+    """Per agent with noise: the likelihood ratio of the covariance of the innovations."""
+    same = bool((step.noise == step.noise[0]).all())
+    found: _Informations = {}
+    bases = [_noisy(noise) for noise in step.noise]
+    dof = sum(rank * (rank + 1) // 2 for rank in (len(base) for base in (bases[:1] if same else bases)))
+    for agent in range(step.agents):
+        divergence = 0.0
+        for share, whitener, gain in zip(step.stationary, bases, step.noise_gain, strict=True):
+            scaled = gain.copy()
+            scaled[agent] *= math.sqrt(factor)
+            change = whitener @ (scaled @ scaled.T - gain @ gain.T) @ whitener.T
+            values = np.linalg.eigvalsh(change)
+            divergence += float(share * (values - np.log1p(values)).sum())
+        if divergence > 0.0:
+            found[agent, None] = [StepInformation("innovations: covariance", dof, replicas * divergence)]
+    return found
+
+
+def _noisy(noise: FloatArray) -> FloatArray:
+    """(r, m) whitener of the directions that have noise."""
+    values, vectors = np.linalg.eigh(noise)
+    keep = values > NO_NOISE * max(float(values[-1]), 0.0)
+    return np.asarray((vectors[:, keep] / np.sqrt(values[keep])).T)
+
+
+def _gain(prediction: Prediction, factor: float, replicas: int) -> _Informations:
+    """Per link: the regression of the innovations on all that is heard, and on their sum."""
+    step, system = prediction.step, prediction.system
+    covariances = system.lifted(system.by_graph(prediction.steady))  # (n, m, m), times pi
+    air = step.link**2 + step.broadcast**2
+    _, _, terms = regressors(step, MAX_REGRESSORS)
+    links: dict[tuple[int, int], tuple[float, float]] = {}
+    total = 0.0
+    for mode, covariance in enumerate(covariances):
+        law = float(step.stationary[mode])
+        for i in range(step.agents):
+            variance = float(step.noise[mode, i, i])
+            if not variance > NO_NOISE * float(step.noise[mode].max()):
+                continue
+            row = step.nominal[mode, i].copy()
+            row[i] = step.nominal[mode, i, i] - 1.0  # the whole pull on the agent, leaders included
+            total += float(row @ covariance @ row) / variance
+            for j in step.neighbours(mode, i).tolist():
+                received, weight = 1.0 - float(step.losses[i, j]), float(step.nominal[mode, i, j])
+                difference = np.zeros(step.agents)
+                difference[i], difference[j] = -weight, weight
+                own = float(difference @ covariance @ difference) + law * weight**2 * air
+                with_all = float(difference @ covariance @ row) + law * weight**2 * air
+                before = links.get((i, j), (0.0, 0.0))
+                links[i, j] = before[0] + received * own / variance, before[1] + received * with_all / variance
+                total += law * weight**2 * air * received / variance
+    change = (factor - 1.0) ** 2 * replicas
+    return {
+        link: [
+            StepInformation("innovations: gains", len(terms), change * own),
+            StepInformation("innovations: common gain", 1, change * with_all**2 / total),
+        ]
+        for link, (own, with_all) in links.items()
+        if own > 0.0
+    }
+
+
+def _switching(step: StepModel, factor: float) -> _Informations:
+    """The likelihood ratio of the counted switches, with every rate away from a graph times the factor."""
+    if step.modes == 1:
+        return {}
+    law = step.transition
+    wrong = _faster(step.chain, step.dt, factor)
+    if wrong is None:
+        return {}
+    with np.errstate(divide="ignore", invalid="ignore"):
+        terms = np.where(wrong > 0.0, wrong * np.log(wrong / law), 0.0)
+    divergence = 2.0 * float(step.stationary @ terms.sum(axis=1))
+    dof = int((law > 0.0).sum()) - step.modes
+    return {(None, None): [StepInformation("switching", dof, divergence)]} if divergence > 0.0 else {}
+
+
+def _faster(chain: MarkovChain, dt: float, factor: float) -> FloatArray | None:
+    """(n, n) transition matrix with other rates; None where the probabilities of leaving would pass 1."""
+    if chain.time == "continuous":
+        return np.asarray(scipy.linalg.expm(factor * dt * chain.matrix))
+    leaving = factor * (chain.matrix - np.eye(chain.modes))
+    wrong = np.eye(chain.modes) + leaving
+    return None if (wrong < 0.0).any() else np.asarray(wrong)

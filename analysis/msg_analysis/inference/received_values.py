@@ -1,0 +1,295 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the agents heard in the steps of a run, with noise or loss on the air, and in real time.
+
+The log gives, for every step, what each agent used: which values of its neighbours, and in real time their steps and
+the graph. Given that, the innovations are normal and independent, with an exactly known covariance: process noise, by
+the graph that each agent used, plus the link noise of the received messages. Broadcast noise, losses and delays are
+part of what was used; they are tested, or reported, separately.
+
+Link noise of messages that are used more than once: what earlier steps say about it.
+
+The noise of a link belongs to the message: used again, because a newer one was lost or late, it is the same. So the
+innovations e_i of an agent are no longer independent, but those of the Kalman filter are: the noises of its newest
+messages are a Gaussian vector, of which every step observes one combination, w^T noise + process noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.statistics import chi2_below, chi2_tail
+from msg_analysis.model.reception import neighbour_tables
+from msg_analysis.model.step_model import StepModel, Wiring
+
+NO_NOISE = 1e-13  # directions with less variance than this, relative to the noisiest one, count as without noise
+
+
+@lru_cache(maxsize=4)
+def neighbour_weights(step: StepModel) -> FloatArray:
+    """(n, m, D): nominal weights of the neighbours' values; 0 beyond their number."""
+    tables = neighbour_tables(step)
+    there = np.arange(step.most_neighbours) < tables.count[:, :, None]
+    return np.where(there, np.take_along_axis(step.nominal, tables.senders, axis=2), 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeardValues:
+    """What was heard in a block of b steps."""
+
+    modes: IntArray  # (b,) graphs of the network
+    graphs: IntArray  # (b, m) graphs that the agents used; in lockstep those of the network
+    states: FloatArray  # (b, m, R) x
+    published: FloatArray  # (N + 1, m, R) what the agents published, of all steps
+    used: IntArray  # (b, m, D) step of the used value of the d-th neighbour; arbitrary where none arrived
+    senders: IntArray  # (b, m, D) that neighbour
+    weights: FloatArray  # (b, m, D) nominal weights of received values; 0 for others
+    own: FloatArray  # (b, m) weight of an agent's own state, which also replaces values that did not arrive
+    link_variance: FloatArray  # (b, m) of the link noise in what each agent heard, unless it is partly known
+
+    @classmethod
+    def of(cls, observation: Observation, first: int, last: int) -> HeardValues:
+        """Reception of the steps first..last-1."""
+        step, modes, timers = observation.step, observation.modes[first:last], observation.timers
+        if timers is None:
+            graphs = np.repeat(modes[:, None], step.agents, axis=1)
+            used = np.broadcast_to(np.arange(first, last)[:, None, None], (*graphs.shape, step.most_neighbours))
+            if observation.used is not None:
+                used = observation.used[first:last]
+            elif observation.lost is not None:
+                used = np.where(observation.lost[first:last], -1, used)
+        else:
+            graphs, used = timers.graphs[first:last], timers.used[first:last]
+        published = observation.states if observation.published is None else observation.published
+        return cls.by(step, modes, graphs, used, observation.states[first:last], published)
+
+    @classmethod
+    def by(
+        cls,
+        step: StepModel,
+        modes: IntArray,
+        graphs: IntArray,
+        used: IntArray,
+        states: FloatArray,
+        published: FloatArray,
+    ) -> HeardValues:
+        """Reception by what was used (b, m, D), at places in ``published``, -1: the own value; the rest as above."""
+        tables, agents = neighbour_tables(step), np.arange(step.agents)
+        weights = neighbour_weights(step)[graphs, agents]
+        weights = np.where(used >= 0, weights, 0.0)
+        return cls(
+            modes=modes,
+            graphs=graphs,
+            states=states,
+            published=published,
+            used=used,
+            senders=tables.senders[graphs, agents],
+            weights=weights,
+            own=step.nominal.sum(axis=2)[graphs, agents] - weights.sum(axis=2),
+            link_variance=step.link**2 * (weights**2).sum(axis=2),
+        )
+
+    def part(self, first: int, last: int) -> HeardValues:
+        """Of the steps first..last-1 of the block."""
+        cut = slice(first, last)
+        return replace(
+            self,
+            modes=self.modes[cut],
+            graphs=self.graphs[cut],
+            states=self.states[cut],
+            used=self.used[cut],
+            senders=self.senders[cut],
+            weights=self.weights[cut],
+            own=self.own[cut],
+            link_variance=self.link_variance[cut],
+        )
+
+    def heard(self, at: IntArray, agents: IntArray, which: IntArray) -> FloatArray:
+        """(k, a, R): what ``agents`` (a,) used of their neighbours ``which`` (a,) in the steps ``at`` (k,) of the
+        block.
+        """
+        index = at[:, None], agents, which
+        return np.asarray(self.published[self.used[index], self.senders[index]])
+
+    def mean(self) -> FloatArray:
+        """(b, m, R): the next states without noise and without the term of the reference."""
+        total = self.own[:, :, None] * self.states
+        every, agents = np.arange(len(self.modes)), np.arange(self.states.shape[1])
+        for d in range(self.weights.shape[2]):
+            total += self.weights[:, :, d, None] * self.heard(every, agents, np.full(len(agents), d))
+        return np.asarray(total)
+
+    def patterns(self, order: IntArray | None = None) -> Iterator[tuple[IntArray, IntArray | None, IntArray]]:
+        """Groups of like steps of the block: graphs (m,) of the agents, their order (m,) or None, steps (a,).
+
+        ``order`` (b, m) has the agents of each step, first to last.
+        """
+        if order is None and (self.graphs == self.modes[:, None]).all():
+            for mode in np.unique(self.modes):
+                at = np.flatnonzero(self.modes == mode)
+                yield self.graphs[at[0]], None, at
+            return
+        keys = self.graphs if order is None else np.column_stack([self.graphs, order])
+        found, owner = np.unique(keys, axis=0, return_inverse=True)
+        owner = owner.reshape(-1)
+        steps = np.argsort(owner, kind="stable")
+        ends = np.searchsorted(owner[steps], np.arange(len(found) + 1))
+        m = self.graphs.shape[1]
+        for number, pattern in enumerate(found):
+            at = steps[ends[number] : ends[number + 1]]
+            yield pattern[:m], None if order is None else pattern[m:], at
+
+
+def mode_links(step: Wiring, mode: int) -> tuple[IntArray, IntArray, IntArray]:
+    """Receiver, sender, and place among the receiver's neighbours, (links,) each, of all links of a graph.
+
+    Sorted by receiver and then by sender.
+    """
+    tables = neighbour_tables(step)
+    receiver, which = np.nonzero(np.arange(step.most_neighbours) < tables.count[mode][:, None])
+    return receiver, tables.senders[mode, receiver, which], which
+
+
+def full_reception_noise(observation: Observation) -> FloatArray:
+    """(n, m, m): covariance of the innovations of a step in which nothing is lost."""
+    step = observation.step
+    link = observation.prediction.experiment.noise.link**2 * (neighbour_weights(step) ** 2).sum(axis=2)
+    process = step.noise_gain @ step.noise_gain.transpose(0, 2, 1)
+    return np.asarray(process + link[:, :, None] * np.eye(step.agents))
+
+
+def process_noise(step: StepModel, graphs: IntArray) -> FloatArray:
+    """(m, m): covariance of the process noise of a step in which the agents use these graphs (m,)."""
+    gain = step.noise_gain[graphs, np.arange(step.agents)]
+    return np.asarray(gain @ gain.T)
+
+
+class Equalizer:
+    """Transforms innovations of steps with different covariances to the covariance of a regular step.
+
+    With N the covariance of a step and M that of a step of the network's graph in which all messages arrived and all
+    agents knew the graph, M^1/2 N^-1/2 e has the covariance M. Where N and M differ in their number of noisy directions
+    (an agent without process noise received nothing), that is not possible: then only the total size of all innovations
+    can be tested. ``full`` are the M of all graphs, (n, m, m).
+    """
+
+    def __init__(self, step: StepModel, full: FloatArray) -> None:
+        self._step = step
+        self._roots = [_root(matrix, 0.5) for matrix in full]
+        self._ranks = [rank for _, rank in self._roots]
+        self.possible = True  # for every step so far
+        # Sum of e^T N^+ e, its degrees of freedom, and the largest innovation in directions without noise.
+        self.chi2, self.dof, self.quiet = 0.0, 0, 0.0
+
+    def equalize(self, innovations: FloatArray, reception: HeardValues) -> FloatArray:
+        """(b, m, R): transformed innovations (b, m, R) of the steps of a block."""
+        m = innovations.shape[1]
+        keys = np.column_stack([reception.modes, reception.graphs, reception.link_variance])
+        patterns, owner = np.unique(keys, axis=0, return_inverse=True)
+        owner = owner.reshape(-1)
+        equal = np.empty_like(innovations)
+        order = np.argsort(owner, kind="stable")
+        ends = np.searchsorted(owner[order], np.arange(len(patterns) + 1))
+        for number, pattern in enumerate(patterns):
+            at = order[ends[number] : ends[number + 1]]
+            mode, graphs, e = int(pattern[0]), pattern[1 : m + 1].astype(np.int64), innovations[at]
+            inverse, rank = _root(process_noise(self._step, graphs) + np.diag(pattern[m + 1 :]), -0.5)
+            white = inverse @ e
+            self.possible &= rank == self._ranks[mode]
+            self.chi2 += float((white**2).sum())
+            self.dof += rank * e.shape[0] * e.shape[2]
+            if rank < len(inverse):
+                projector = inverse @ np.linalg.pinv(inverse, hermitian=True)
+                self.quiet = max(self.quiet, float(np.abs(e - projector @ e).max()))
+            equal[at] = self._roots[mode][0] @ white
+        return equal
+
+    def merge(self, other: Equalizer) -> None:
+        """Add the sums of another run of the same experiment, with another seed."""
+        self.possible &= other.possible
+        self.chi2, self.dof, self.quiet = self.chi2 + other.chi2, self.dof + other.dof, max(self.quiet, other.quiet)
+
+    def p_size(self) -> float | None:
+        """Two-sided p-value of the total size of all innovations; None without noise."""
+        if not self.dof:
+            return None
+        return float(min(1.0, 2.0 * min(chi2_tail(self.chi2, self.dof), chi2_below(self.chi2, self.dof))))
+
+
+def _root(matrix: FloatArray, power: float) -> tuple[FloatArray, int]:
+    """Symmetric power of a covariance on its noisy directions, and their number."""
+    if not (matrix - np.diag(np.diag(matrix))).any():
+        variances = np.diag(matrix)
+        noisy = variances > NO_NOISE * variances.max()
+        return np.diag(np.where(noisy, variances, 1.0) ** power * noisy), int(noisy.sum())
+    values, vectors = np.linalg.eigh(matrix)
+    noisy = values > NO_NOISE * values[-1]
+    return (vectors[:, noisy] * values[noisy] ** power) @ vectors[:, noisy].T, int(noisy.sum())
+
+
+NEVER = -2
+
+
+class RepeatedNoise:
+    """Frees the innovations, block after block, of what earlier ones say about the noise in them.
+
+    Exact where the process noise of the agents is independent.
+    """
+
+    def __init__(self, observation: Observation) -> None:
+        self._step = step = observation.step
+        m, replicas = step.agents, observation.replicas
+        listens = step.listens()
+        most = int(listens.sum(axis=1).max(initial=1)) or 1
+        places = np.cumsum(listens, axis=1) - 1  # (m, m) place of a sender among all that an agent ever hears
+        self._place = places[np.arange(m)[:, None], neighbour_tables(step).senders]  # (n, m, D)
+        self._variance = step.link**2
+        self._process = np.square(step.noise_gain).sum(axis=2)  # (n, m)
+        self._message = np.full((m, most), NEVER, dtype=np.int64)
+        self._mean, self._covariance = np.zeros((m, most, replicas)), np.zeros((m, most, most))
+
+    @classmethod
+    def of(cls, observation: Observation) -> RepeatedNoise | None:
+        """None where there is no link noise, or no message is used again."""
+        kept = observation.timers is not None or observation.used is not None
+        return cls(observation) if observation.step.link and kept else None
+
+    def free(self, innovations: FloatArray, reception: HeardValues) -> tuple[FloatArray, FloatArray]:
+        """Innovations (b, m, R) less what is known of them, and the variance (b, m) of the link noise that is not."""
+        found, variances = np.empty_like(innovations), np.empty(reception.link_variance.shape)
+        agents = np.arange(innovations.shape[1])[:, None]
+        places = self._place[reception.graphs, agents.T]  # (b, m, D)
+        process = self._process[reception.graphs, agents.T]
+        for k, e in enumerate(innovations):
+            there = reception.weights[k] != 0.0
+            self._renew(reception.used[k], places[k], there)
+            weights = np.zeros(self._message.shape)
+            np.add.at(
+                weights, (np.broadcast_to(agents, there.shape)[there], places[k][there]), reception.weights[k][there]
+            )
+            across = (self._covariance @ weights[:, :, None])[:, :, 0]
+            variances[k] = (weights * across).sum(axis=1)
+            found[k] = e - (weights[:, None] @ self._mean)[:, 0]
+            total = variances[k] + process[k]
+            gain = np.divide(across, total[:, None], out=np.zeros_like(across), where=total[:, None] > 0.0)
+            self._mean += gain[:, :, None] * found[k][:, None]
+            self._covariance -= gain[:, :, None] * across[:, None]
+        return found, variances
+
+    def _renew(self, used: IntArray, places: IntArray, there: BoolArray) -> None:
+        """Forget the noise of messages that newer ones have replaced."""
+        agent, d = np.nonzero(there)
+        place = places[agent, d]
+        new = self._message[agent, place] != used[agent, d]
+        agent, place = agent[new], place[new]
+        self._message[agent, place] = used[agent, d[new]]
+        self._mean[agent, place] = 0.0
+        self._covariance[agent, place] = self._covariance[agent, :, place] = 0.0
+        self._covariance[agent, place, place] = self._variance

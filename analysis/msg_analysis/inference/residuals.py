@@ -1,0 +1,409 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Tests of the innovations e(k) = x(k+1) - W_g(k) x(k) - offset_g(k): what a step adds to its mean.
+
+Under the model the e(k) are independent N(0, N_g(k)), for any path of the graphs; so these tests are exact or nearly
+so, and find what the time means hardly show. With noise or loss on the air, and in real time, the same holds given the
+values that the agents heard (see ``heard_values``), for any timing. See docs/statistics.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import chain
+from typing import Protocol, Self
+
+import numpy as np
+
+from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.inference.diagnostics import Block, Departure, Finding, Law, Place, Question
+from msg_analysis.inference.e_values import EventEvidence, variance_evidence
+from msg_analysis.inference.gains import MAX_REGRESSORS, HeardRegression, StateRegression
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.received_values import NO_NOISE, Equalizer, HeardValues, RepeatedNoise, full_reception_noise
+from msg_analysis.inference.statistics import (
+    chi2_tail,
+    covariance_statistic,
+    direction_p,
+    log_normal_tail,
+    quadratic_form,
+)
+from msg_analysis.model.step_model import StepModel
+
+LAGS = 10
+QUIET_ROUNDING = 1e-9  # relative size of what counts as rounding in directions without noise
+
+
+@dataclass(frozen=True, slots=True)
+class InnovationTests:
+    """p-values; None where there is nothing to test."""
+
+    p_covariance: float | None  # of their covariance being N_g; 0 if anything moves in a direction without noise
+    p_whiteness: float | None  # correlation in time (lags 1..10) and between replicas
+    p_gain: float | None  # regression on what the agents heard: wrong gains, references, offsets
+    p_common_gain: float | None = None  # the same for one factor of all gains: ignored messages
+    # (m,) measured over nominal variance; NaN where an agent has no noise in some graph
+    ratios: tuple[float, ...] | None = None
+    samples: int | None = None  # of each agent, replicas counted; samples * ratio is chi-square(samples)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Directions:
+    """Directions of the noise of one graph, N_g = (basis * variances) basis^T, largest variance first."""
+
+    whitener: FloatArray  # (r, m)
+    quiet: FloatArray  # (m, m - r) orthonormal basis of the directions without noise
+
+
+class Follower(Protocol):
+    """What else is computed from the innovations of a run, in the same pass."""
+
+    @property
+    def numbers_per_step(self) -> int:
+        """Of temporary arrays."""
+
+    def add(self, first: int, last: int, heard: tuple[HeardValues, FloatArray] | None = None) -> None:
+        """The steps first..last-1, in order, with what was heard and the innovations; None: not computed yet."""
+
+
+class InnovationSums:
+    """Sums over the innovations of runs of one experiment: enough for the tests and for the diagnosis (``blame``).
+
+    In real time, ``position`` is that of ``event_order.EventOrder``, (N, m). ``follower`` is given every step, too.
+    """
+
+    def __init__(
+        self, observation: Observation, position: IntArray | None = None, follower: Follower | None = None
+    ) -> None:
+        step, noise = observation.step, observation.prediction.experiment.noise
+        n, m = step.modes, step.agents
+        # (n, m, m) nominal covariances
+        self.noises: FloatArray = full_reception_noise(observation) if noise.on_air else step.noise
+        self.replicas = observation.replicas
+        # Number of innovations, replicas counted, and sum of e e^T, by graph.
+        self.samples, self.scatter = np.zeros(n, np.int64), np.zeros((n, m, m))
+        self.still = np.zeros((n, m), np.int64)  # steps in which no replica of an agent changed
+        self.quiet = self.largest = 0.0  # largest |e| in directions without noise; largest |x|
+        self._directions = [_directions(matrix) for matrix in self.noises]
+        # Graphs may differ in the number of noisy directions; the strongest ones that all graphs have are iid N(0, I).
+        self._whiteness = Whiteness(min(len(d.whitener) for d in self._directions))
+        self._repeated = RepeatedNoise.of(observation)
+        # False where innovations depend on each other in a way that is not followed here.
+        self.independent = self._repeated is None or not _correlated(step)
+        varies = self._repeated is not None or (step.loss > 0.0 and noise.link > 0.0)
+        if observation.timers and not varies:
+            varies = bool((step.noise_gain != step.noise_gain[0]).any())
+        self._equalizer = Equalizer(step, self.noises) if varies else None
+        regression: StateRegression | HeardRegression = (
+            HeardRegression(observation, MAX_REGRESSORS, position if _correlated(step) else None)
+            if noise.steps_only or observation.timers
+            else StateRegression(observation, MAX_REGRESSORS)
+        )
+        if self.independent:
+            self._add(observation, regression, follower)
+        elif follower:
+            for first, last in observation.blocks(follower.numbers_per_step, "evidence"):
+                follower.add(first, last)
+        self.terms = regression.terms
+        self.score, self.covariance = regression.statistic()  # (K,), (K, K)
+        self.gram = regression.gram()  # (K, K), see ``StateRegression.gram``; None where it is not available
+
+    @property
+    def steps(self) -> IntArray:
+        """(n,): steps of each graph."""
+        return self.samples // self.replicas
+
+    def merge(self, other: InnovationSums) -> None:
+        """Add the sums of another run of the same experiment, with another seed."""
+        self.samples += other.samples
+        self.scatter += other.scatter
+        self.still += other.still
+        self.quiet, self.largest = max(self.quiet, other.quiet), max(self.largest, other.largest)
+        self._whiteness.merge(other._whiteness)
+        if self._equalizer and other._equalizer:
+            self._equalizer.merge(other._equalizer)
+        self.score += other.score
+        self.covariance += other.covariance
+        self.gram = None if self.gram is None or other.gram is None else self.gram + other.gram
+
+    def tests(self) -> InnovationTests:
+        """All tests of the innovations."""
+        if not self.independent:
+            return InnovationTests(None, None, None)
+        ratios: tuple[float, ...] | None = None
+        # Variances below NO_NOISE are allowed for: ten standard deviations.
+        hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in self.noises))
+        p_whiteness = self._whiteness.p_value()
+        if self._equalizer and not self._equalizer.possible:
+            p_covariance, p_whiteness = self._equalizer.p_size(), None
+        else:
+            p_covariance, ratios = self._covariance_p(), self._ratios()
+        if self.quiet > max(QUIET_ROUNDING * self.largest, hidden):
+            p_covariance = 0.0
+        chi2, dof = quadratic_form(self.score, self.covariance)
+        p_gain = float(chi2_tail(chi2, dof)) if dof else None
+        p_common_gain = self._common_gain_p() if dof else None
+        return InnovationTests(p_covariance, p_whiteness, p_gain, p_common_gain, ratios, int(self.samples.sum()))
+
+    def _ratios(self) -> tuple[float, ...]:
+        """(m,): see ``InnovationTests``."""
+        seen = self.samples > 0
+        noise = np.diagonal(self.noises, axis1=1, axis2=2)[seen]
+        scatter = np.diagonal(self.scatter, axis1=1, axis2=2)[seen]
+        noisy = noise > NO_NOISE * noise.max(initial=0.0)
+        parts = np.divide(scatter, noise, out=np.full_like(scatter, np.nan), where=noisy)
+        return tuple((parts.sum(axis=0) / max(int(self.samples.sum()), 1)).tolist())
+
+    def _common_gain_p(self) -> float | None:
+        """Score test of one direction of the regression: every message counts for less, or more, than it should."""
+        agents = np.array([term.agent for term in self.terms])
+        size = np.diagonal(self.noises, axis1=1, axis2=2).mean(axis=0)[agents]
+        weights = np.array([term.weight if term.kind in ("link", "pull") else 0.0 for term in self.terms])
+        weights = np.divide(weights, size, out=np.zeros_like(weights), where=size > NO_NOISE * size.max(initial=0.0))
+        return direction_p(weights, self.score, self.covariance)
+
+    def _add(
+        self, observation: Observation, regression: StateRegression | HeardRegression, follower: Follower | None
+    ) -> None:
+        """One pass over the run."""
+        m = observation.step.agents
+        numbers = max(observation.states[0].size, regression.numbers_per_step)
+        if follower:
+            numbers = max(numbers, follower.numbers_per_step)
+        for first, last in observation.blocks(numbers, "innovations"):
+            modes = observation.modes[first:last]
+            if isinstance(regression, HeardRegression):
+                reception = HeardValues.of(observation, first, last)
+                e = innovations(observation, first, last, reception)
+                if follower:
+                    follower.add(first, last, (reception, e))
+                if self._repeated:
+                    e, link_variance = self._repeated.free(e, reception)
+                    reception = replace(reception, link_variance=link_variance)
+                regression.add(reception, e, first)
+                if self._equalizer:
+                    e = self._equalizer.equalize(e, reception)
+                    self.quiet = max(self.quiet, self._equalizer.quiet)
+            else:
+                e = innovations(observation, first, last)
+                if follower:
+                    follower.add(first, last, (HeardValues.of(observation, first, last), e))
+                regression.add(modes, observation.states[first:last], e)
+            states = observation.states[first : last + 1]
+            self.largest = max(self.largest, float(np.abs(states[:-1]).max()))
+            unmoved = (states[1:] == states[:-1]).all(axis=2)
+            white = np.empty((last - first, self._whiteness.rank, observation.replicas))
+            for mode, direction in enumerate(self._directions):
+                at = np.flatnonzero(modes == mode)
+                if not at.size:
+                    continue
+                flat = e[at].transpose(1, 0, 2).reshape(m, -1)
+                self.samples[mode] += flat.shape[1]
+                self.scatter[mode] += flat @ flat.T
+                self.still[mode] += unmoved[at].sum(axis=0)
+                self.quiet = max(self.quiet, float(np.abs(direction.quiet.T @ flat).max(initial=0.0)))
+                white[at] = direction.whitener[: self._whiteness.rank] @ e[at]
+            self._whiteness.add(white)
+
+    def _covariance_p(self) -> float | None:
+        """Of all steps together when the noise is the same in every graph, else added up over the graphs."""
+        modes = range(len(self.noises))
+        groups = [list(modes)] if (self.noises == self.noises[0]).all() else [[g] for g in modes]
+        statistic, dof = 0.0, 0.0
+        for group in groups:
+            whitener = self._directions[group[0]].whitener
+            samples = int(self.samples[group].sum())
+            if len(whitener) and samples:
+                scatter = whitener @ self.scatter[group].sum(axis=0) @ whitener.T
+                part = covariance_statistic(scatter, samples)
+                statistic, dof = statistic + part[0], dof + part[1]
+        return float(chi2_tail(statistic, dof)) if dof else None
+
+
+def innovations(observation: Observation, first: int, last: int, reception: HeardValues | None = None) -> FloatArray:
+    """(last - first, m, R): innovations e(k) of the steps first..last-1, given what was heard.
+
+    Without a ``reception`` of these steps, all agents heard the states themselves.
+    """
+    step, now = observation.step, observation.states[first:last]
+    after = observation.states[first + 1 : last + 1].copy()
+    if reception is not None:
+        return heard_innovations(step, reception, after)
+    for mode in range(step.modes):
+        at = np.flatnonzero(observation.modes[first:last] == mode)
+        after[at] -= step.weights[mode] @ now[at] + step.offsets[mode][:, None]
+    return after
+
+
+def heard_innovations(step: StepModel, reception: HeardValues, after: FloatArray) -> FloatArray:
+    """(b, m, R): innovations of steps, given what was heard in them, and the states after them (b, m, R)."""
+    offsets = step.offsets[reception.graphs, np.arange(step.agents)]
+    return np.asarray(after - reception.mean() - offsets[:, :, None])
+
+
+def _correlated(step: StepModel) -> bool:
+    """Whether the process noise of two agents can be correlated, under any graphs that they use."""
+    together = np.einsum("gik,hjk->ij", np.abs(step.noise_gain), np.abs(step.noise_gain))
+    return bool((together - np.diag(np.diag(together))).any())
+
+
+def _directions(noise: FloatArray) -> _Directions:
+    values, vectors = np.linalg.eigh(noise)
+    values, vectors = values[::-1], vectors[:, ::-1]
+    rank = int((values > NO_NOISE * values[0]).sum()) if values[0] > 0.0 else 0
+    return _Directions((vectors[:, :rank] / np.sqrt(values[:rank])).T, vectors[:, rank:])
+
+
+class Whiteness:
+    """Portmanteau test of iid N(0, I) vectors of length r: lags 1..LAGS, and lag 0 between replicas.
+
+    The sum of squared sample correlations, each over its variance under the null hypothesis, is chi-square with LAGS
+    r^2 degrees of freedom, and r more where there are replicas.
+    """
+
+    def __init__(self, rank: int) -> None:
+        self.rank = rank
+        self._tail: FloatArray | None = None
+        self._products = np.zeros((LAGS, rank, rank))
+        self._counts = np.zeros(LAGS)
+        self._squares = np.zeros(rank)
+        self._pairs = np.zeros(rank)
+        self._steps, self._replicas = 0, 1
+
+    def add(self, white: FloatArray) -> None:
+        """Add the next block (b, r, R), which is standard normal if the law holds."""
+        self._steps += len(white)
+        self._replicas = white.shape[2]
+        squares = (white**2).sum(axis=2)
+        self._squares += squares.sum(axis=0)
+        self._pairs += ((white.sum(axis=2) ** 2 - squares) / 2).sum(axis=0)
+        joined = white if self._tail is None else np.concatenate([self._tail, white])
+        old = len(joined) - len(white)
+        for lag in range(1, LAGS + 1):
+            begin = max(old, lag)
+            if begin >= len(joined):
+                continue
+            late, early = joined[begin:], joined[begin - lag : len(joined) - lag]
+            self._products[lag - 1] += np.tensordot(late, early, axes=([0, 2], [0, 2]))
+            self._counts[lag - 1] += len(late) * self._replicas
+        self._tail = joined[-LAGS:]
+
+    def merge(self, other: Whiteness) -> None:
+        """Add the sums of another run with another seed; no lags are counted across runs."""
+        self._products += other._products
+        self._counts += other._counts
+        self._squares += other._squares
+        self._pairs += other._pairs
+        self._steps += other._steps
+
+    def p_value(self) -> float | None:
+        """None without noise or with at most LAGS steps. Coordinates are scaled by their size, tested elsewhere."""
+        size = self._squares / (self._steps * self._replicas)
+        if not self.rank or self._steps <= LAGS or not (size > 0.0).all():
+            return None
+        correlations = self._products**2 / np.outer(size, size)
+        chi2 = float((correlations.sum(axis=(1, 2)) / self._counts).sum())
+        dof = LAGS * self.rank**2
+        if self._replicas > 1:
+            pairs = self._steps * self._replicas * (self._replicas - 1) / 2
+            chi2 += float((self._pairs**2 / size**2).sum() / pairs)
+            dof += self.rank
+        return float(chi2_tail(chi2, dof))
+
+
+class BroadcastSums:
+    """Sums over the noise in published values, in units of its nominal standard deviation."""
+
+    def __init__(self, observation: Observation) -> None:
+        assert observation.published is not None
+        deviation = observation.prediction.experiment.noise.broadcast
+        agents = observation.step.agents
+        self.scatter = np.zeros((agents, agents))  # sum of the products of the agents' noise
+        length = observation.steps + 1
+        self.samples = length * observation.replicas  # published values of each agent
+        for first, last in chain(
+            observation.blocks(observation.states[0].size, "broadcast noise"), [(length - 1, length)]
+        ):
+            noise = (observation.published[first:last] - observation.states[first:last]) / deviation
+            flat = noise.transpose(1, 0, 2).reshape(agents, -1)
+            self.scatter += flat @ flat.T
+
+    @classmethod
+    def of(cls, observation: Observation) -> BroadcastSums | None:
+        """Sums of a run; None without broadcast noise."""
+        noisy = observation.prediction.experiment.noise.broadcast
+        return cls(observation) if noisy and observation.published is not None else None
+
+    def merge(self, other: BroadcastSums) -> None:
+        """Add the sums of another run of the same experiment, with another seed."""
+        self.scatter += other.scatter
+        self.samples += other.samples
+
+    def p_value(self) -> float:
+        """p-value of published - state being N(0, s^2 I), s = ``noise.broadcast``."""
+        statistic, dof = covariance_statistic(self.scatter, self.samples)
+        return float(chi2_tail(statistic, dof))
+
+
+LARGE = 4.0  # standard deviations; smaller innovations have the evidence 0
+
+
+class LargestInnovation(Departure):
+    """Every innovation by itself, N(0, 1) after division by its standard deviation.
+
+    The test is that of the largest, with their number as a factor (Bonferroni). The evidence is the mean over all
+    innovations of a run of that of each one against a larger variance; those to come count 1. Half of the whole always
+    counts 1.
+    """
+
+    test = "innovations: largest"
+
+    def __init__(self, law: Law) -> None:
+        self._agents = np.flatnonzero(law.noisy)
+        self._evidence = EventEvidence(law.planned * law.replicas * len(self._agents))
+        self._samples = 0
+        self._largest, self._agent, self._place, self._runs = 0.0, 0, Place(0, 0), 1
+
+    def add(self, block: Block) -> FloatArray:
+        """Look at the innovations of a block."""
+        white, looks = block.white[:, self._agents], block.looks
+        if not white.size:
+            return np.empty((looks.count, 0, 1))
+        self._samples += white.size
+        sizes = np.abs(white)
+        large = sizes > LARGE
+        logarithms = variance_evidence(np.ones(int(large.sum())), sizes[large] ** 2)[:, 0]
+        seen, when = looks.lengths * white[0].size, looks.after(np.nonzero(large)[0])
+        at = int(np.argmax(sizes))
+        if not sizes.flat[at] <= abs(self._largest):  # also a NaN
+            step, place, _ = np.unravel_index(at, white.shape)
+            self._largest, self._agent = float(white.flat[at]), int(self._agents[place])
+            self._place = Place(block.first + int(step) + 1, block.first + int(step) + 1)
+        return self._evidence.add(seen, logarithms, when)[:, None, None]
+
+    def merge(self, other: Self) -> None:
+        """The larger one."""
+        self._evidence.merge(other._evidence)
+        self._samples += other._samples
+        if abs(other._largest) > abs(self._largest):
+            self._largest, self._agent, self._place = other._largest, other._agent, other._place.later(self._runs)
+        self._runs += other._runs
+
+    def finding(self) -> Finding | None:
+        """The largest."""
+        if not self._samples:
+            return None
+        log_p = math.log(2.0 * self._samples) + float(log_normal_tail(abs(self._largest)))
+        return Finding(
+            self.test, min(0.0, log_p), agent=self._agent, place=self._place, estimate=self._largest, expected=0.0
+        )
+
+    def evidence(self) -> FloatArray:
+        """(1, 1)."""
+        return np.array([[self._evidence.logarithm()]]) if self._evidence.planned else np.empty((0, 1))
+
+    def questions(self) -> list[Question]:
+        """One, about all agents."""
+        return [("largest innovation", ())]

@@ -1,0 +1,275 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Timing of steps in real time, with exact quantiles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from msg_analysis.inference.messages import UnheardMessages, unheard_messages
+from msg_analysis.inference.observation import Observation
+from msg_analysis.model.phases import phases
+from msg_analysis.model.reception import MessagesUsed, neighbour_tables
+from msg_analysis.model.step_model import ideal_uses
+
+AT_ONCE = 2**21  # numbers that are sorted together
+QUANTILE_BINS = 2**14
+
+Pieces = Callable[[], Iterable[AnyArray]]
+"""Gives the numbers from the beginning, in pieces of any size; the same ones each time."""
+
+
+def extent(pieces: Pieces) -> tuple[int, float, float]:
+    """How many numbers there are, the smallest one and the largest one (infinite where there are none)."""
+    count, low, high = 0, np.inf, -np.inf
+    for piece in pieces():
+        if piece.size:
+            count, low, high = count + piece.size, min(low, float(piece.min())), max(high, float(piece.max()))
+    return count, low, high
+
+
+def quantiles(pieces: Pieces, shares: Sequence[float]) -> list[float]:
+    """Quantiles of all numbers, between neighbours linearly: as ``numpy.quantile``; empty where there are none."""
+    count, low, high = extent(pieces)
+    if not count:
+        return []
+    place = np.array(shares) * (count - 1)
+    below = np.floor(place).astype(np.int64)
+    ranks = np.unique(np.concatenate([below, np.minimum(below + 1, count - 1)]))
+    found = dict(zip(ranks.tolist(), _of_ranks(pieces, ranks, count, low, high).tolist(), strict=True))
+    values = []
+    for rank, part in zip(below.tolist(), (place - below).tolist(), strict=True):
+        one, next_one = found[rank], found[min(rank + 1, count - 1)]
+        values.append(one + (next_one - one) * part if part < 0.5 else next_one - (next_one - one) * (1.0 - part))
+    return values
+
+
+def _of_ranks(pieces: Pieces, ranks: IntArray, count: int, low: float, high: float) -> FloatArray:
+    """The numbers with these ranks, from 0, of ``count`` numbers from ``low`` to ``high``."""
+    if low == high:
+        return np.full(len(ranks), low)
+    if count <= AT_ONCE:
+        return np.sort(np.concatenate([np.ravel(piece) for piece in pieces()]).astype(np.float64))[ranks]
+
+    def bins(piece: AnyArray) -> IntArray:
+        return np.minimum((np.ravel(piece) - low) * (QUANTILE_BINS / (high - low)), QUANTILE_BINS - 1).astype(np.int64)
+
+    counts = sum(
+        (np.bincount(bins(piece), minlength=QUANTILE_BINS) for piece in pieces()), np.zeros(QUANTILE_BINS, np.int64)
+    )
+    ends = np.cumsum(counts)
+    chosen = np.searchsorted(ends, ranks, side="right")
+    found = np.empty(len(ranks))
+    for one in np.unique(chosen).tolist():
+
+        def inside(one: int = one) -> Iterable[AnyArray]:
+            return (np.ravel(piece)[bins(piece) == one] for piece in pieces())
+
+        wanted = chosen == one
+        found[wanted] = _of_ranks(inside, ranks[wanted] - (ends[one] - counts[one]), *extent(inside))
+    return found
+
+
+BINS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Quantiles:
+    """Quantiles of a measure; None where there was nothing to measure."""
+
+    p50: float | None
+    p95: float | None
+    p99: float | None
+    max: float | None
+
+    @classmethod
+    def of(cls, values: Pieces) -> Quantiles:
+        """Of all numbers."""
+        found = quantiles(values, (0.5, 0.95, 0.99, 1.0))
+        return cls(*found) if found else cls(None, None, None, None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Timing:
+    """Timing of a run in real time.
+
+    Times in ms are those of the agents' clock: simulated time over the speed of the run.
+    """
+
+    period_ms: float  # nominal time between two steps of an agent
+    lateness_ms: Quantiles  # of a step after it was due
+    steps: int  # of all agents
+    missed: int  # steps made more than a period after they were due
+    jitter_ms: Quantiles  # |time between two successive steps of an agent - period|
+    staleness_ms: Quantiles  # age of the values at the time of use
+    staleness_steps: Quantiles  # step of the new state - step of the value; 0 or 1 with ideal timers
+    uses: int  # neighbours' values that steps needed, those never heard or lost included
+    ideal_uses: int  # uses of the value that ideal timers would have used, the own one for a lost one included
+    never_heard: int  # uses in which nothing had been heard yet of the neighbour
+    unheard: UnheardMessages
+    outdated_graphs: int  # steps made with another graph than the network's at that time
+    histogram: tuple[FloatArray, AnyArray]  # of lateness: edges [ms] (BINS + 1,) and counts (BINS,); covers all values
+    ages: tuple[FloatArray, AnyArray]  # the same of ``staleness_ms``
+
+    @property
+    def missed_share(self) -> float:
+        """Of all steps."""
+        return self.missed / max(self.steps, 1)
+
+    @property
+    def ideal_share(self) -> float:
+        """Of all uses, those that ideal timers would have made; 1 where no agent hears another."""
+        return self.ideal_uses / self.uses if self.uses else 1.0
+
+    @property
+    def outdated_share(self) -> float:
+        """Of all steps, those with another graph than the network's."""
+        return self.outdated_graphs / max(self.steps, 1)
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON document."""
+        (edges, counts), (age_edges, age_counts) = self.histogram, self.ages
+        return {
+            "period_ms": self.period_ms,
+            "lateness_ms": _document(self.lateness_ms),
+            "deadlines": {"steps": self.steps, "missed": self.missed, "share": self.missed_share},
+            "jitter_ms": _document(self.jitter_ms),
+            "staleness_ms": _document(self.staleness_ms),
+            "staleness_steps": _document(self.staleness_steps),
+            "ideal_uses": {"uses": self.uses, "ideal": self.ideal_uses, "share": self.ideal_share},
+            "never_heard": self.never_heard,
+            "unheard": self.unheard.to_json(),
+            "outdated_graph": {"steps": self.outdated_graphs, "share": self.outdated_share},
+            "histogram": {
+                "lateness_ms": edges.tolist(),
+                "steps": counts.tolist(),
+                "staleness_ms": age_edges.tolist(),
+                "uses": age_counts.tolist(),
+            },
+        }
+
+
+def measure_timing(observation: Observation) -> Timing:
+    """Measure the timing of a run in real time, in passes over blocks of steps."""
+    log = _TimingLog(observation)
+    counts = np.zeros(5, dtype=np.int64)
+    for first, last in log.blocks():
+        counts += log.counts(first, last)
+    missed, uses, ideal_uses, never_heard, outdated = counts.tolist()
+    steps, m = observation.steps, observation.step.agents
+    return Timing(
+        period_ms=log.period * log.milliseconds,
+        lateness_ms=Quantiles.of(log.pieces(log.lateness)),
+        steps=steps * m,
+        missed=missed,
+        jitter_ms=Quantiles.of(log.pieces(log.jitter)),
+        staleness_ms=Quantiles.of(log.pieces(log.ages)),
+        staleness_steps=Quantiles.of(log.pieces(log.ages_in_steps)),
+        uses=uses,
+        ideal_uses=ideal_uses,
+        never_heard=never_heard,
+        unheard=unheard_messages(observation),
+        outdated_graphs=outdated,
+        histogram=_histogram(log.pieces(log.lateness)),
+        ages=_histogram(log.pieces(log.ages)),
+    )
+
+
+class _TimingLog:
+    """What blocks of steps say about timing, times in ms of the agents' clock."""
+
+    def __init__(self, observation: Observation) -> None:
+        assert observation.timers is not None
+        self._observation, self._timers, self._step = observation, observation.timers, observation.step
+        experiment = observation.prediction.experiment
+        self.milliseconds = 1e-6 / experiment.run.speed  # of the agents' clock, in a nanosecond of simulated time
+        self.period = observation.step.dt * 1e9
+        phase = phases(experiment)
+        self._clocks = [StepClock(observation.step.dt, phi) for phi in phase.tolist()]
+        self._tables = neighbour_tables(observation.step)
+        # Which messages are lost is in the seed; else steps from the step to what ideal timers use.
+        self._messages = MessagesUsed(experiment, observation.step) if experiment.noise.steps_only else None
+        self._ideal_uses = None if self._messages else ideal_uses(observation.step, phase)
+
+    def blocks(self) -> Iterator[tuple[int, int]]:
+        """Blocks of steps."""
+        return self._observation.blocks(8 * self._timers.used[:1].size, "timing")
+
+    def pieces(self, measure: Callable[[int, int], AnyArray]) -> Pieces:
+        """A measure of all steps."""
+        return lambda: (measure(first, last) for first, last in self.blocks())
+
+    def lateness(self, first: int, last: int) -> FloatArray:
+        """Of the steps first..last-1, (b, m)."""
+        return np.asarray(self._late(first, last) * self.milliseconds)
+
+    def jitter(self, first: int, last: int) -> FloatArray:
+        """The same of the time since the step before."""
+        made = self._timers.made[max(first, 1) : last + 1]
+        return np.asarray(np.abs(np.diff(made, axis=0) - self.period) * self.milliseconds)
+
+    def ages(self, first: int, last: int) -> FloatArray:
+        """(uses,) of the values that were used."""
+        heard, senders, used = self._heard(first, last)
+        made = self._timers.made
+        age = made[first + 1 : last + 1, :, None] - made[used, senders]
+        return np.asarray(age[heard] * self.milliseconds)
+
+    def ages_in_steps(self, first: int, last: int) -> IntArray:
+        """The same in steps."""
+        heard, _, used = self._heard(first, last)
+        return np.asarray((np.arange(first + 1, last + 1)[:, None, None] - used)[heard])
+
+    def counts(self, first: int, last: int) -> IntArray:
+        """Missed deadlines, uses, those of ideal timers, and of what was never heard, steps with an outdated graph."""
+        used, graphs, modes = self._timers.used[first:last], self._timers.graphs[first:last], self._observation.modes
+        there, ideal = self._there(graphs), self._ideal(first, last)
+        never = there & (used < 0) & (ideal >= 0)
+        outdated = graphs != modes[first:last, None]
+        missed = self._late(first, last) > self.period
+        return np.array([each.sum() for each in (missed, there, there & (used == ideal), never, outdated)])
+
+    def _late(self, first: int, last: int) -> IntArray:
+        steps = np.arange(first, last)
+        due = np.stack([clock.times(steps) for clock in self._clocks], axis=1)
+        return np.asarray(self._timers.made[first + 1 : last + 1] - due)
+
+    def _there(self, graphs: IntArray) -> BoolArray:
+        """(b, m, D): which neighbours there are."""
+        count = self._tables.count[graphs, np.arange(self._step.agents)]
+        return np.asarray(np.arange(self._step.most_neighbours) < count[:, :, None])
+
+    def _heard(self, first: int, last: int) -> tuple[BoolArray, IntArray, IntArray]:
+        """(b, m, D) each: of which neighbours a value was used, the neighbours, and the steps of the values."""
+        used, graphs = self._timers.used[first:last], self._timers.graphs[first:last]
+        senders = self._tables.senders[graphs, np.arange(self._step.agents)]
+        return self._there(graphs) & (used >= 0), senders, used
+
+    def _ideal(self, first: int, last: int) -> IntArray:
+        """(b, m, D) steps of the values that ideal timers would have used; -1: the own value, -2: not known."""
+        graphs, modes = self._timers.graphs[first:last], self._observation.modes[first:last]
+        if self._messages is None:
+            assert self._ideal_uses is not None
+            steps = np.arange(first, last)[:, None, None]
+            return np.asarray(self._ideal_uses[graphs, np.arange(self._step.agents)] + steps)
+        # Under another graph than the network's the neighbours are others.
+        used = self._messages.used(first, modes)
+        return np.where((graphs == modes[:, None])[:, :, None], used, -2)
+
+
+def _histogram(values: Pieces) -> tuple[FloatArray, AnyArray]:
+    _, low, high = extent(values)
+    ends = min(0.0, low), max(high, 1e-3)
+    counts = sum((np.histogram(piece, BINS, ends)[0] for piece in values()), np.zeros(BINS, np.int64))
+    return np.histogram_bin_edges(np.empty(0), BINS, ends), counts
+
+
+def _document(quantiles: Quantiles) -> dict[str, float | None]:
+    return {"p50": quantiles.p50, "p95": quantiles.p95, "p99": quantiles.p99, "max": quantiles.max}

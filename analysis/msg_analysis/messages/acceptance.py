@@ -1,0 +1,231 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Which messages of a run are accepted, and why others are rejected.
+
+Why messages are refused: the reasons that all receivers, the bag reader and the documentation use.
+
+They are keys in results (``refused``, ``strangers``) and in diagnostics: docs/faults.md and docs/messages.md list them.
+
+Signatures of the messages that steer a run: only processes that have the run's record with its key can make them.
+
+Progress, end, epoch, leave and requests to resend cannot be compared with the record as the graph can. Who forges one
+could end the run for all.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+from collections.abc import Callable
+from dataclasses import fields, replace
+from functools import cached_property
+from typing import TypeVar
+
+from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.arithmetic.update_law import all_finite
+from msg_analysis.messages.cdr import CdrError
+from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, StateFrame, decode_string, encode_string
+from msg_analysis.messages.topics import END, EPOCH, STOP, Topic
+from msg_analysis.model.graph_path import PathWindow, Sojourn
+from msg_analysis.model.run_record import RunRecord
+from msg_analysis.model.step_model import first_graph
+
+
+class Refusal:
+    """A reason for each kind of message, from general to particular."""
+
+    OTHER_RUN = "other run"
+    OTHER_EPOCH = "other epoch"
+    UNDECODABLE = "undecodable"
+    COMPRESSED = "compressed message"
+    REPEATED = "received again"  # harmless: nodes send again what a restarted one may have missed
+    CONTRADICTION = "contradicts an earlier copy"
+    NOT_OF_RECORD = "contradicts the run record"
+    NOT_SIGNED = "not signed with the key of the run"
+    DUPLICATE_NAME = "duplicate node name"  # not of a message
+
+    # States
+    UNKNOWN_AGENT = "unknown agent"
+    OTHER_AGENT = "of another agent than its topic"
+    NOT_A_PEER = "not a peer"
+    WRONG_LENGTH = "wrong length"
+    OTHER_LAYOUT = "not in the layout of the agents"
+    NOT_FINITE = "not finite"
+    UNKNOWN_MODE = "unknown mode"
+    OTHER_MODES = "agents used different graphs"
+    BAD_HEARD = "impossible entry in heard"
+    BEFORE_START = "stamped before the start"
+    OUT_OF_RANGE = "step out of range"
+    TOO_OLD = "step too old"
+    TOO_NEW = "a step that a peer cannot have reached"
+    TOO_LATE = "too late"
+
+    # Sojourns of the graph
+    OUT_OF_SEQUENCE = "a sojourn out of sequence"
+    TOO_EARLY = "a sojourn before its time"
+    GRAPH_OUT_OF_RANGE = "graph out of range"
+    OTHER_GRAPH = "graph of a step that its states contradict"
+
+    # Files of a bag
+    UNREADABLE_FILE = "unreadable file"
+    TORN_FILE = "torn file"
+    DAMAGED_CHUNK = "damaged chunk"
+
+
+SIZE = 16  # bytes of the HMAC-SHA256 that are sent, as hexadecimal digits in ``frame_id``
+
+
+def sign(message: Progress, topic: Topic, key: bytes | None) -> Progress:
+    """The message with its signature for a topic; without a key, as it is."""
+    return message if key is None else replace(message, frame_id=_signature(message, topic, key))
+
+
+def genuine(message: Progress, topic: Topic, key: bytes | None) -> bool:
+    """Whether the signature is right; without a key, every message passes."""
+    return key is None or hmac.compare_digest(message.frame_id.encode(), _signature(message, topic, key).encode())
+
+
+def _signature(message: Progress, topic: Topic, key: bytes) -> str:
+    unsigned = replace(message, frame_id="").encode()
+    return hmac.digest(key, topic.name.encode() + b"\0" + unsigned, "sha256")[:SIZE].hex()
+
+
+Message = TypeVar("Message", ActiveGraph, Progress)
+
+
+class RunRules:
+    """Which messages belong to a run: the rules of all its nodes, for all topics but those of the states.
+
+    What follows from the run record is compared with it; what does not is signed with its key.
+    """
+
+    def __init__(self, record: RunRecord) -> None:
+        self._record = record
+        self._graphs = [(graph.name, tuple(graph.arcs)) for graph in record.experiment.graph_list]
+        self._clock = StepClock(record.experiment.step_length)
+        self._path = PathWindow(record.experiment, first_graph(record.experiment))
+
+    @cached_property
+    def _experiment(self) -> bytes:
+        """The message on the topic ``experiment``: only the recorder compares it, so others do not make it."""
+        return encode_string(self._record.to_json())
+
+    def experiment(self, data: bytes) -> str | None:
+        """The ``Refusal`` of a message on the topic ``experiment``; None: it is the record of this run."""
+        if data.rstrip(b"\0") == self._experiment.rstrip(b"\0"):  # middleware pads messages to a multiple of four
+            return None
+        try:
+            run = json.loads(decode_string(data))["run"]
+        except (ValueError, KeyError, TypeError, RecursionError):  # CdrError and JSON's own among them
+            return Refusal.UNDECODABLE
+        return Refusal.NOT_OF_RECORD if run == str(self._record.run) else Refusal.OTHER_RUN
+
+    def forget(self, step: int) -> None:
+        """From now on, sojourns that end before a step are refused as repeated."""
+        self._path.forget(step)
+
+    def graph(self, data: bytes) -> ActiveGraph | str:
+        """A sojourn of the graph, or a ``Refusal``."""
+        message = decode_of_run(ActiveGraph, data, self._record.run.bytes)
+        if isinstance(message, str):
+            return message
+        if message.sequence < self._path.first:
+            return Refusal.REPEATED
+        if message.sequence > self._path.first + self._path.MOST_AHEAD:
+            return Refusal.TOO_EARLY
+        sojourn = self._path.sojourn(message.sequence)
+        if sojourn is None:
+            return Refusal.GRAPH_OUT_OF_RANGE
+        true = self.sojourn_message(sojourn)
+        same = all(getattr(message, field.name) == getattr(true, field.name) for field in fields(ActiveGraph))
+        return message if same else Refusal.NOT_OF_RECORD
+
+    def sojourn_message(self, sojourn: Sojourn) -> ActiveGraph:
+        """What the switcher publishes of a sojourn."""
+        name, arcs = self._graphs[sojourn.mode]
+        return ActiveGraph(
+            stamp=self._clock.nanoseconds(sojourn.first_step),
+            run=self._record.run.bytes,
+            sequence=sojourn.sequence,
+            mode=sojourn.mode + 1,
+            name=name,
+            first_step=sojourn.first_step,
+            last_step=sojourn.last_step,
+            arcs=arcs,
+        )
+
+    def progress(self, data: bytes, topic: Topic) -> Progress | str:
+        """A message on one of the topics of type Progress, or a ``Refusal``."""
+        message = decode_of_run(Progress, data, self._record.run.bytes)
+        if isinstance(message, str):
+            return message
+        if message.agent > (0 if topic in (END, EPOCH, STOP) else self._record.experiment.agents):
+            return Refusal.UNKNOWN_AGENT
+        if message.step > self._record.experiment.steps:
+            return Refusal.OUT_OF_RANGE
+        return message if genuine(message, topic, self._record.key) else Refusal.NOT_SIGNED
+
+
+def decode_of_run(kind: type[Message], data: bytes, run: bytes) -> Message | str:
+    """A message of the run with this id (16 bytes), or a ``Refusal``."""
+    try:
+        message = kind.decode(data)
+    except CdrError:
+        return Refusal.UNDECODABLE
+    return message if message.run == run else Refusal.OTHER_RUN
+
+
+def state_frame(record: RunRecord, *, whole: bool) -> StateFrame:
+    """Reads the states of a run: the whole ones, or those that agents publish on the topic ``state``."""
+    experiment = record.experiment
+    lists_heard = experiment.noise.loss.any or experiment.run.pace == "realtime"
+    width = experiment.width if whole else experiment.run.replicas
+    return StateFrame(record.run.bytes, width, experiment.agents - 1 if lists_heard else 0)
+
+
+def why_refused(data: bytes, record: RunRecord, agent: int | None, frame: StateFrame) -> str:
+    """The ``Refusal`` of bytes that are not a state of this agent (index from 0; None: of any agent)."""
+    try:
+        message = AgentState.decode(data)
+    except CdrError:
+        return Refusal.UNDECODABLE
+    if message.run != record.run.bytes:
+        return Refusal.OTHER_RUN
+    if not 1 <= message.agent <= record.experiment.agents:
+        return Refusal.UNKNOWN_AGENT
+    if agent is not None and message.agent != agent + 1:
+        return Refusal.OTHER_AGENT
+    return Refusal.WRONG_LENGTH if len(message.state) != frame.replicas else Refusal.OTHER_LAYOUT
+
+
+def fault_of(step: int, mode: int, state: bytes, graphs: int) -> str | None:
+    """The ``Refusal`` of a state that no agent can have in a run with so many graphs; None: it is possible."""
+    if mode > graphs or (mode == 0) != (step == 0):
+        return Refusal.UNKNOWN_MODE
+    return None if all_finite(state) else Refusal.NOT_FINITE
+
+
+def state_receiver(
+    record: RunRecord,
+    agent: int,  # index from 0
+    frame: StateFrame,
+    take: Callable[[int, int, int, bytes, bytes], str | None],  # of agent, step, mode, state, message; may refuse it
+    refuse: Callable[[str], None],
+    *,
+    possible: bool = False,  # whether to refuse states that ``fault_of`` finds impossible
+) -> Callable[[bytes], None]:
+    """The callback for the topic of an agent's states. Hot path."""
+    unwrap, number, graphs = frame.unwrap, agent + 1, len(record.experiment.graph_list)
+
+    def receive(data: bytes) -> None:
+        found = unwrap(data)
+        if found is None or found[0] != number:
+            refuse(why_refused(data, record, agent, frame))
+            return
+        _, step, mode, state = found
+        reason = (possible and fault_of(step, mode, state, graphs)) or take(agent, step, mode, state, data)
+        if reason:
+            refuse(reason)
+
+    return receive

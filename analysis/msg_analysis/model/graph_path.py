@@ -1,0 +1,117 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The graph path of a run: which graph each step uses."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from msg_analysis.arithmetic.random_streams import Stream, generator
+from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.experiment.markov_chain import MarkovChain
+
+if TYPE_CHECKING:
+    from msg_analysis.experiment.experiment import ValidExperiment
+
+
+@dataclass(frozen=True, slots=True)
+class Sojourn:
+    """A stretch of steps with one graph."""
+
+    sequence: int  # its number, from 0
+    mode: int  # from 0
+    first_step: int  # the steps k -> k+1 with first_step <= k <= last_step use this graph
+    last_step: int
+
+
+def sojourns(experiment: ValidExperiment, initial: FloatArray) -> Iterator[Sojourn]:
+    """The graph path of a run of N steps, drawn from the experiment's seed; ``initial`` (n,) is the law of g(0).
+
+    Step k uses the graph of the chain at time k dt, so successive graphs are a Markov chain with P = expm(Gamma dt),
+    exactly. A sojourn between two sampling times, which no step uses, is left out.
+    """
+    random = generator(experiment.run.seed, Stream.SWITCHING)
+    return _sampled(experiment.chain, initial, random, experiment.steps, experiment.step_length)
+
+
+def _sampled(
+    chain: MarkovChain, initial: FloatArray, random: np.random.Generator, steps: int, dt: float
+) -> Iterator[Sojourn]:
+    """The chain at the times 0, dt, ..., (steps - 1) dt."""
+    time = 0.0
+    first = 0
+    sequence = 0
+    for mode, held in chain.sojourns(initial, random):
+        time += held
+        end = steps if math.isinf(time) else min(steps, math.ceil(time / dt))
+        if end > first:
+            yield Sojourn(sequence, mode, first, end - 1)
+            sequence += 1
+            first = end
+        if end >= steps:
+            return
+
+
+class PathWindow:
+    """The sojourns of a graph path by number, drawn as far as they are asked for, without those that are forgotten."""
+
+    MOST_AHEAD = 10_000  # sojourns beyond the first one that is kept; more are never published ahead
+
+    def __init__(self, experiment: ValidExperiment, initial: FloatArray) -> None:
+        self._path = sojourns(experiment, initial)
+        self._kept: deque[Sojourn] = deque()
+        self.first = 0  # number of the first sojourn that is kept
+
+    def forget(self, step: int) -> None:
+        """Keep only the sojourns that end at a step or later."""
+        while (self._kept or self._draw()) and self._kept[0].last_step < step:
+            self._kept.popleft()
+            self.first += 1
+
+    def sojourn(self, number: int) -> Sojourn | None:
+        """A sojourn; None for one that is not there, not kept any more, or too far ahead."""
+        index = number - self.first
+        if not 0 <= index <= self.MOST_AHEAD:
+            return None
+        while len(self._kept) <= index:
+            if not self._draw():
+                return None
+        return self._kept[index]
+
+    def _draw(self) -> bool:
+        sojourn = next(self._path, None)
+        if sojourn is not None:
+            self._kept.append(sojourn)
+        return sojourn is not None
+
+
+def mode_path(experiment: ValidExperiment, initial: FloatArray) -> IntArray:
+    """(N,) index of the graph of each step k -> k+1; ``initial`` (n,) is the law of g(0)."""
+    return _modes(sojourns(experiment, initial), experiment.steps)
+
+
+def past_modes(experiment: ValidExperiment, first_mode: int, steps: int) -> IntArray:
+    """(steps,) g(-steps), ..., g(-1): the graphs before a run, given that it begins with g(0) = ``first_mode``.
+
+    Drawn backwards by the reversed chain, so that the graphs before and after time 0 are one stationary path. A longer
+    past ends with the same graphs as a shorter one.
+    """
+    chain = experiment.chain.reversed
+    start = np.eye(chain.modes)[first_mode]
+    random = generator(experiment.run.seed, Stream.PAST)
+    backwards = _modes(_sampled(chain, start, random, steps + 1, experiment.step_length), steps + 1)
+    return backwards[:0:-1]
+
+
+def _modes(path: Iterator[Sojourn], steps: int) -> IntArray:
+    modes = np.empty(steps, dtype=np.int64)
+    for sojourn in path:
+        modes[sojourn.first_step : sojourn.last_step + 1] = sojourn.mode
+    return modes

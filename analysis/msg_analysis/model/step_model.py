@@ -1,0 +1,322 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Agents that step one after the other: what a period of a run in real time does when no agent is late.
+
+With g the graph of the period, an agent uses the new states of the agents that are due before it and the old states of
+the others. Row by row, in the order of the phases,
+
+    A_i = W_ii e_i + sum_earlier W_ij A_j + sum_later W_ij e_j,    B_i = F_i + sum_earlier W_ij B_j,
+
+and offsets like B. Rows of A sum to 1 where those of W do, so consensus stays consensus; but A is not symmetric.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from msg_analysis.arithmetic.matrix_exponential import exponential
+from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.common.resources import one_blas_thread
+from msg_analysis.experiment.markov_chain import MarkovChain
+from msg_analysis.model.phases import phases
+
+if TYPE_CHECKING:
+    from msg_analysis.experiment.experiment import ValidExperiment
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Wiring:
+    """Which agent uses the values of which agents in which graph, and the law of the graphs: all that any law has.
+
+    Modes and agents count from 0.
+    """
+
+    links: BoolArray  # (n, m, m) whether agent i uses what agent j publishes; the diagonal has no meaning
+    chain: MarkovChain  # switches between the graphs
+    initial: FloatArray  # (n,) law of g(0)
+    dt: float  # simulated time of a step
+    losses: FloatArray  # (m, m) probability that a message from agent j (column) to agent i (row) is lost
+    burst: float | None  # mean number of messages of a link that are lost in a row; None: losses are independent
+
+    @property
+    def loss(self) -> float:
+        """Largest probability of any link that a message is lost."""
+        return float(self.losses.max())
+
+    @property
+    def modes(self) -> int:
+        """Number of graphs n."""
+        return int(self.links.shape[0])
+
+    @property
+    def agents(self) -> int:
+        """Number of agents m."""
+        return int(self.links.shape[1])
+
+    @property
+    def transition(self) -> FloatArray:
+        """(n, n) P, the law of the graph one step later."""
+        return _transition(self.chain, self.dt)
+
+    @property
+    def stationary(self) -> FloatArray:
+        """(n,) stationary law pi of the graph."""
+        return self.chain.stationary
+
+    def inputs(self, mode: int, agent: int) -> IntArray:
+        """(d,) agents, ascending, with values that an agent uses under a mode; the agent itself is always included."""
+        used = self.links[mode, agent].copy()
+        used[agent] = True
+        return np.flatnonzero(used)
+
+    def neighbours(self, mode: int, agent: int) -> IntArray:
+        """(d,) the other agents, ascending, with values that an agent uses under a mode."""
+        used = self.inputs(mode, agent)
+        return np.asarray(used[used != agent])
+
+    @property
+    def most_neighbours(self) -> int:
+        """Largest number D of neighbours that any agent has in any graph."""
+        return _most_neighbours(self)
+
+    def listens(self) -> BoolArray:
+        """(m, m): whether agent i uses the state of agent j != i in any graph."""
+        used: BoolArray = np.asarray(self.links.any(axis=0))
+        np.fill_diagonal(used, False)
+        return used
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepModel(Wiring):
+    """x(k+1) = W_g(k) x(k) + offset_g(k) + noise, then g jumps with P: "what the network actually does".
+
+    Convention: the step k -> k+1 uses g(k). With a delay d, the entries of W_g(k) off the diagonal take x(k - d)
+    instead of x(k), and x(k) = x(0) before the start. ``weights``, ``noise`` and ``loss_variance`` are for agents that
+    step all at once and lose messages independently, each replaced by the agent's own value.
+    """
+
+    # (n, m, m) W_g with its mean over lost messages: where one is lost, its weight falls to the agent itself
+    weights: FloatArray
+    # (n, m, m) W_g when nothing is lost: I - dt Z_g (continuous time, Euler) or exp(-Z_g) (discrete time), or what a
+    # linear protocol says; rows of grounded leaders are zero
+    nominal: FloatArray
+    offsets: FloatArray  # (n, m) what the reference adds, so that the reference is a fixed point
+    # (n, m, m) B_g: the process noise of a step is B_g v with v ~ N(0, I), the same v whatever g
+    noise_gain: FloatArray
+    noise: FloatArray  # (n, m, m) covariance N_g of all that is random in a step: B_g B_g^T plus noise on the air
+    delay: int  # age d, in steps, of the states of others that a step uses
+    # (n, m, m) p_ij (1 - p_ij) (nominal W_g)_ij^2 off the diagonal: ``weights`` is the mean over losses, and their
+    # spread adds sum_ij variance_g[i, j] (x_i - x_j)^2 e_i e_i^T to the second moment
+    loss_variance: FloatArray
+    grounded: BoolArray  # (m,) True for leaders of infinite gain
+    reference: float  # what tracking agents should hold; 0 for consensus
+    broadcast: float  # standard deviation of the noise in what an agent publishes
+    link: float  # standard deviation of the noise that a receiver adds
+    holds: bool  # whether the last value heard takes the place of a lost one, and not the agent's own
+    turns: IntArray | None = None  # (m,) agents in the order of their steps in a period; None: all at once
+
+    @property
+    def by_message(self) -> bool:
+        """Whether ``weights``, ``noise`` and ``loss_variance`` are not all: values are kept from step to step."""
+        bursts = self.burst is not None and self.loss > 0.0
+        return self.holds or bursts or self.turns is not None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepMatrices:
+    """The numbers of a linear step.
+
+    In discrete time and with a protocol they are results of linear algebra, whose last bits may depend on processor and
+    libraries. So a run computes them once, and its record carries them.
+    """
+
+    weights: FloatArray  # (n, m, m) W_g when nothing is lost: ``StepModel.nominal``
+    noise_gain: FloatArray  # (n, m, m) B_g
+
+
+@lru_cache(maxsize=4)
+def _most_neighbours(wiring: Wiring) -> int:
+    return int(wiring.links.sum(axis=2, where=~np.eye(wiring.agents, dtype=bool)).max())
+
+
+@lru_cache(maxsize=16)
+def _transition(chain: MarkovChain, dt: float) -> FloatArray:
+    with one_blas_thread():
+        transition = chain.transition(dt)
+    transition.flags.writeable = False
+    return transition
+
+
+def build_model(experiment: ValidExperiment, matrices: StepMatrices | None = None) -> Wiring:
+    """A ``StepModel`` where the law is linear, else the wiring alone; ``matrices`` are those of the run record."""
+    if experiment.protocol is None or experiment.protocol.linear:
+        return build_step_model(experiment, matrices)
+    return Wiring(
+        links=_arcs(experiment),
+        chain=experiment.chain,
+        initial=first_graph(experiment),
+        dt=experiment.step_length,
+        losses=experiment.loss,
+        burst=experiment.noise.burst,
+    )
+
+
+def step_matrices(experiment: ValidExperiment) -> StepMatrices:
+    """Compute the matrices of a step.
+
+    InputError: the experiment has a protocol that is not linear, is not available, or fails.
+    """
+    agents, dt = experiment.agents, experiment.step_length
+    grounded = np.isinf(experiment.leader_gains)
+    if experiment.protocol:
+        weights, gain = experiment.protocol.matrices()
+        weights[:, range(agents), range(agents)] -= dt * np.where(grounded, 0.0, experiment.leader_gains)
+        weights[:, grounded] = 0.0
+    else:
+        weights, gain = _built_in(experiment), experiment.step_noise_gain
+    if experiment.time == "continuous":
+        gain[:, grounded] = 0.0  # a leader held at the reference has no noise either
+    return StepMatrices(weights, gain)
+
+
+def build_step_model(experiment: ValidExperiment, matrices: StepMatrices | None = None) -> StepModel:
+    """What one step of an experiment does; ``matrices`` are those of the run record, computed if not given.
+
+    InputError: as of ``step_matrices``.
+    """
+    if matrices is None:
+        matrices = step_matrices(experiment)
+    weights, gain = matrices.weights, matrices.noise_gain
+    agents, dt = experiment.agents, experiment.step_length
+    grounded = np.isinf(experiment.leader_gains)
+    links = _arcs(experiment) & ~grounded[:, None] if experiment.protocol else weights != 0.0
+    reference = experiment.reference
+    offsets = reference * (1.0 - weights.sum(axis=2)) if reference else np.zeros(weights.shape[:2])
+
+    coupling = weights * ~np.eye(agents, dtype=bool)
+    loss = experiment.loss  # (m, m)
+    noise = gain @ gain.transpose(0, 2, 1)
+    for mode, a in enumerate(coupling):
+        kept = (1 - loss) * a
+        noise[mode] += experiment.noise.link**2 * np.diag((kept * a).sum(axis=1))
+        noise[mode] += experiment.noise.broadcast**2 * (kept @ kept.T + np.diag((loss * kept * a).sum(axis=1)))
+    lost = loss * coupling
+    mean = weights - lost
+    mean[:, range(agents), range(agents)] += lost.sum(axis=2)
+    return StepModel(
+        links=links,
+        weights=mean,
+        nominal=weights,
+        offsets=offsets,
+        noise_gain=gain,
+        noise=noise,
+        delay=experiment.noise.delay,
+        losses=loss,
+        burst=experiment.noise.burst,
+        loss_variance=loss * (1 - loss) * coupling**2,
+        chain=experiment.chain,
+        initial=first_graph(experiment),
+        grounded=grounded,
+        reference=reference,
+        dt=dt,
+        broadcast=experiment.noise.broadcast,
+        link=experiment.noise.link,
+        holds=experiment.noise.holds,
+    )
+
+
+def _built_in(experiment: ValidExperiment) -> FloatArray:
+    """(n, m, m): W_g of the law that the agents have by themselves, with its leaders."""
+    gains, agents = experiment.leader_gains, experiment.agents
+    grounded = np.isinf(gains)
+    follows = ~grounded
+    weights = np.zeros((len(experiment.graph_list), agents, agents))
+    for mode, graph in enumerate(experiment.graph_list):
+        z = graph.laplacian + np.diag(np.where(grounded, 0.0, gains))
+        if experiment.time == "continuous":
+            weights[mode] = np.eye(agents) - experiment.step_length * z
+            weights[mode, grounded] = 0.0
+        else:
+            # The limit of exp(-(L + K)) for gains to infinity: leaders forget, followers no longer hear them.
+            block = np.ix_(follows, follows)
+            weights[mode][block] = exponential(-z[block])
+    return weights
+
+
+def first_graph(experiment: ValidExperiment) -> FloatArray:
+    """(n,): the law of g(0)."""
+    first = experiment.switching.initial
+    if first == "stationary":
+        return experiment.chain.stationary
+    return np.array([float(graph.name == first) for graph in experiment.graph_list])
+
+
+def _arcs(experiment: ValidExperiment) -> BoolArray:
+    """(n, m, m): whether agent i hears agent j, as the graphs say."""
+    return np.array([graph.adjacency != 0.0 for graph in experiment.graph_list])
+
+
+StepLaw = Literal["synchronous", "sequential"]
+
+
+def step_law(experiment: ValidExperiment) -> StepLaw:
+    """Whether the agents of a run step all at once (lockstep) or one after the other (real time)."""
+    return "sequential" if experiment.run.pace == "realtime" else "synchronous"
+
+
+def build_run_model(experiment: ValidExperiment, step: StepModel | None = None) -> StepModel:
+    """What a step of all agents of a run with a linear law does to x(k), as one jump linear system.
+
+    In real time the law is sequential: noise of an agent reaches those that are due later. With messages that are
+    noisy, late or lost, the micro-steps stay apart (``turns``). ``step``: the model of the experiment, if it is known.
+    """
+    step = step or build_step_model(experiment)
+    if step_law(experiment) == "synchronous":
+        return step
+    phase = phases(experiment)
+    if experiment.noise.steps_only:
+        return dataclasses.replace(step, turns=np.argsort(phase))
+    return sequential(step, phase)
+
+
+def sequential(step: StepModel, phase: FloatArray) -> StepModel:
+    """The agents' micro-steps of one period, in the order of their phases (m,), all different, as one step.
+
+    ``step`` is the synchronous step, without loss, delay or noise on the air.
+    """
+    weights, offsets, gain = np.empty_like(step.weights), np.empty_like(step.offsets), np.empty_like(step.noise_gain)
+    done = np.zeros(step.agents, dtype=bool)
+    for i in np.argsort(phase).tolist():
+        row = step.nominal[:, i]
+        new = row * done
+        weights[:, i] = (row - new) + np.einsum("nj,njk->nk", new[:, done], weights[:, done])
+        gain[:, i] = step.noise_gain[:, i] + np.einsum("nj,njk->nk", new[:, done], gain[:, done])
+        offsets[:, i] = step.offsets[:, i] + np.einsum("nj,nj->n", new[:, done], offsets[:, done])
+        done[i] = True
+    return dataclasses.replace(
+        step,
+        weights=weights,
+        nominal=weights,
+        offsets=offsets,
+        noise_gain=gain,
+        noise=gain @ gain.transpose(0, 2, 1),
+    )
+
+
+def ideal_uses(model: StepModel, phase: FloatArray) -> IntArray:
+    """(n, m, D) how many steps after x_i(k) the value of the d-th neighbour of agent i is, with ideal timers.
+
+    1 for neighbours that are due earlier in the period, 0 for others; -1 where there is no d-th neighbour.
+    """
+    ahead = np.full((model.modes, model.agents, model.most_neighbours), -1, dtype=np.int64)
+    for mode in range(model.modes):
+        for i in range(model.agents):
+            neighbours = model.neighbours(mode, i)
+            ahead[mode, i, : len(neighbours)] = phase[neighbours] < phase[i]
+    return ahead

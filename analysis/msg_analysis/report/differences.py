@@ -1,0 +1,365 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Differences of two runs: experiments, bags, states."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray, release
+from msg_analysis.common.files import RESULT_FILE
+from msg_analysis.common.resources import tell
+from msg_analysis.common.text import HALF_WIDTH_95
+from msg_analysis.errors import InputError
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.comparison import flat
+from msg_analysis.inference.verdict import compare
+from msg_analysis.model.run import Trajectory
+from msg_analysis.report.wording import agent_errors
+from msg_analysis.runs import read_document, result_row, tested_error
+from msg_analysis.theory.leader_search import SearchProgress, ignore
+from msg_analysis.theory.leaders import AUTO_SETS, select_leaders
+from msg_analysis.theory.prediction import Moments, Prediction, predict
+from msg_analysis.theory.settling import asymptotic_rates
+
+
+def state_difference(a: Trajectory, b: Trajectory) -> dict[str, Any]:
+    """The key ``states`` of the difference of two runs; steps count from 0, agents and replicas from 1.
+
+    States of a step count as equal if both are missing; +0 and -0 are different.
+    """
+    if a.states.shape[1:] != b.states.shape[1:]:
+        why = f"{_shape(a)} and {_shape(b)}"
+        return {"compared": None, "why": why, "equal": None, **dict.fromkeys(_KEYS)}
+    steps = min(len(a.states), len(b.states)) - 1
+    found = _Differences(a.record.experiment.step_length)
+    numbers = 4 * max(1, a.states[:1].size)
+    length = max(1, BLOCK_NUMBERS // numbers)
+    for first in range(0, steps + 1, length):
+        tell("comparing states", first, steps + 1)
+        block = slice(first, min(first + length, steps + 1))
+        found.add(first, a.states[block], b.states[block])
+        for array in (a.states, b.states):
+            release(array)
+    return {
+        "compared": steps,
+        "why": None,
+        "equal": not found.states and not found.only_a and not found.only_b and len(a.states) == len(b.states),
+        **{key: getattr(found, key) for key in _KEYS},
+    }
+
+
+def graph_difference(a: Trajectory, b: Trajectory) -> dict[str, Any] | None:
+    """First step in which the runs used different graphs, and the names of these; None: there is none."""
+    names_a, names_b = ([graph.name for graph in run.record.experiment.graph_list] for run in (a, b))
+    steps = min(len(a.modes), len(b.modes))
+    places = np.array([names_a.index(name) if name in names_a else -2 for name in names_b] + [-1])  # -1: not known
+    there: IntArray = places[b.modes[:steps]]
+    known = (a.modes[:steps] >= 0) & (b.modes[:steps] >= 0)
+    differs = known & (a.modes[:steps] != there)
+    if not differs.any():
+        return None
+    step = int(np.argmax(differs))
+    return {"step": step, "a": names_a[a.modes[step]], "b": names_b[b.modes[step]], "steps": int(differs.sum())}
+
+
+def _shape(run: Trajectory) -> str:
+    agents, width = run.states.shape[1:]
+    return f"{agents} agents with {width} {'number' if width == 1 else 'numbers'} each"
+
+
+_KEYS = ("first", "largest", "last", "steps", "states", "only_a", "only_b")
+
+
+@dataclass(slots=True)
+class _Differences:
+    """What the blocks so far have shown."""
+
+    step_length: float
+    first: dict[str, Any] | None = None  # step that differs: its time, agents, and largest difference
+    largest: dict[str, Any] | None = None  # difference of all
+    last: dict[str, Any] | None = None  # the newest step of which both runs have all states: largest difference
+    steps: int = 0  # that differ
+    states: int = 0  # that differ, of one agent each
+    only_a: int = 0  # states that only one run has
+    only_b: int = 0
+
+    def add(self, begin: int, a: FloatArray, b: FloatArray) -> None:
+        """Take the states (steps, agents, width) of both runs, from step ``begin`` on."""
+        has_a, has_b = _there(a), _there(b)
+        self.only_a += int((has_a & ~has_b).sum())
+        self.only_b += int((has_b & ~has_a).sum())
+        both = has_a & has_b
+        bits = (np.ascontiguousarray(a).view(np.int64) != np.ascontiguousarray(b).view(np.int64)).any(axis=2)
+        differs: BoolArray = both & bits
+        whole = np.flatnonzero(both.all(axis=1))
+        if len(whole):
+            end = int(whole[-1])
+            self.last = {"step": begin + end, "difference": float(np.abs(a[end] - b[end]).max(initial=0.0))}
+        if not differs.any():
+            return
+        self.states += int(differs.sum())
+        self.steps += int(differs.any(axis=1).sum())
+        sizes = np.where(differs[:, :, None], np.abs(a - b), -1.0)
+        if self.first is None:
+            step = int(np.argmax(differs.any(axis=1)))
+            self.first = {
+                "step": begin + step,
+                "time": (begin + step) * self.step_length,
+                "agents": (np.flatnonzero(differs[step]) + 1).tolist(),
+                "difference": float(sizes[step].max()),
+            }
+        size = float(sizes.max())
+        if self.largest is None or size > self.largest["difference"]:
+            place = [int(index) for index in np.unravel_index(int(np.argmax(sizes)), sizes.shape)]
+            self.largest = {"step": begin + place[0], "agent": place[1] + 1, "number": place[2] + 1, "difference": size}
+
+
+def _there(states: FloatArray) -> BoolArray:
+    """(steps, agents) which states are not missing."""
+    return np.asarray(~np.isnan(states).any(axis=2))
+
+
+def differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The keys whose values differ, in the order of ``a``: ``key``, ``a``, ``b``; None where one does not have it."""
+    return [
+        {"key": key, "a": a.get(key), "b": b.get(key)}
+        for key in [*a, *(key for key in b if key not in a)]
+        if a.get(key) != b.get(key)
+    ]
+
+
+def relative(a: float | None, b: float | None) -> dict[str, float | None]:
+    """Two numbers, and their difference relative to ``a``; None where that is 0, or one is not there."""
+    known = a is not None and b is not None
+    return {"a": a, "b": b, "relative": (b - a) / abs(a) if known and a and b is not None else None}
+
+
+def measured(a: Mapping[str, Any] | None, b: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Two measured errors with ``measured`` and ``standard_error``: their difference, and it in standard errors, ``z``.
+
+    The standard error of the difference is that of independent runs; None where one is not known.
+    """
+    one, other = a or {}, b or {}
+    difference = error = None
+    if one.get("measured") is not None and other.get("measured") is not None:
+        difference = other["measured"] - one["measured"]
+    if one.get("standard_error") is not None and other.get("standard_error") is not None:
+        error = math.hypot(one["standard_error"], other["standard_error"])
+    z = difference / error if difference is not None and error else None
+    return {"a": a, "b": b, "difference": difference, "standard_error": error, "z": z}
+
+
+MOST_AGENTS = 100  # with which leaders are searched: each set takes up to half a second
+_RATES = ("mean", "second_moment", "graph")
+
+
+def experiment_difference(a: ValidExperiment, b: ValidExperiment, watch: SearchProgress = ignore) -> dict[str, Any]:
+    """The document of ``msg-analysis diff`` of two experiments; keys in docs/commands.md.
+
+    An experiment without a prediction has the reason instead. ``watch``: of the search of leaders.
+    """
+    pair = (a, b)
+    found = [_prediction(experiment) for experiment in pair]
+    laws = [_laws(prediction) if isinstance(prediction, Prediction) else {} for prediction in found]
+    rates = [_rates(prediction) if isinstance(prediction, Prediction) else {} for prediction in found]
+    return {
+        "kind": "experiments",
+        "a": _side(a, found[0]),
+        "b": _side(b, found[1]),
+        "keys": differing(*(flat(experiment.to_document()) for experiment in pair)),
+        "predictions": {law: _errors(*(side.get(law) for side in laws)) for law in {**laws[0], **laws[1]}},
+        "rates": {key: relative(*(side.get(key) for side in rates)) for key in _RATES},
+        "leaders": dict(zip("ab", _leaders(a, b, found, watch), strict=True)),
+    }
+
+
+def _side(experiment: ValidExperiment, prediction: Prediction | str) -> dict[str, Any]:
+    return {
+        "file": experiment.source,
+        "name": experiment.name,
+        "problem": experiment.problem,
+        "time": experiment.time,
+        "agents": experiment.agents,
+        "names": experiment.names,
+        "unpredicted": prediction if isinstance(prediction, str) else None,
+    }
+
+
+def _prediction(experiment: ValidExperiment) -> Prediction | str:
+    """The prediction, or why there is none."""
+    try:
+        experiment.require_available("predict")
+        return predict(experiment)
+    except InputError as error:
+        return str(error)
+
+
+def _laws(prediction: Prediction) -> dict[str, Moments]:
+    """By their names in ``msg-analysis predict --json``."""
+    steps = "discrete" if prediction.experiment.time == "discrete" else "emulated"
+    laws = {
+        "continuous": prediction.continuous_moments,
+        steps: prediction.emulated,
+        "static": prediction.static_moments,
+    }
+    return {name: moments for name, moments in laws.items() if moments is not None}
+
+
+def _errors(a: Moments | None, b: Moments | None) -> dict[str, Any]:
+    nodes_a, nodes_b = (moments.node_errors.tolist() if moments else [] for moments in (a, b))
+    return {
+        "system_error": relative(*(moments.system_error if moments else None for moments in (a, b))),
+        # Agents of networks of different sizes have nothing in common but their numbers.
+        "node_errors": [relative(*pair) for pair in zip(nodes_a, nodes_b, strict=True)]
+        if len(nodes_a) == len(nodes_b)
+        else [],
+    }
+
+
+def _rates(prediction: Prediction) -> dict[str, float | None]:
+    """Final decay rates of the steps of the run, per unit of time; None: not found, infinite, or no such thing."""
+    unit = prediction.experiment.step_length
+    rates = dataclasses.asdict(asymptotic_rates(prediction.system))
+    return {key: rate / unit if rate is not None and math.isfinite(rate) else None for key, rate in rates.items()}
+
+
+def _leaders(
+    a: ValidExperiment, b: ValidExperiment, found: list[Prediction | str], watch: SearchProgress
+) -> list[dict[str, Any]]:
+    """Leaders of each, and the best set of as many; one without leaders gets as many, and the gain, of the other."""
+    sides = []
+    for experiment, other, prediction in ((a, b, found[0]), (b, a, found[1])):
+        own = experiment.spec.leaders
+        pattern = own or other.spec.leaders
+        count, gain = (len(pattern.agents), pattern.gain) if pattern else (1, math.inf)
+        side: dict[str, Any] = {
+            "agents": list(own.agents) if own else None,
+            "gain": _gain(own.gain) if own else None,
+            "system_error": None,
+            "best": None,
+            "note": None,
+        }
+        sides.append(side)
+        if isinstance(prediction, str):
+            side["note"] = "no prediction"
+        elif experiment.agents > MOST_AGENTS or math.comb(experiment.agents, count) > AUTO_SETS:
+            side["note"] = f"not searched: use msg-analysis leaders {experiment.source}"
+        else:
+            try:
+                selection = select_leaders(experiment, count, gain=gain, method="exhaustive", top=1, watch=watch)
+            except InputError as error:
+                side["note"] = str(error)
+                continue
+            document = selection.to_json()
+            best = document["sets"][0]
+            side["best"] = {
+                "agents": best["agents"],
+                "system_error": best["system_error"],
+                "gain": document["gain"],
+                "law": document["law"],
+            }
+            side["system_error"] = document["present"]["system_error"] if document["present"] else None
+    return sides
+
+
+def _gain(gain: float) -> float | str:
+    return "inf" if math.isinf(gain) else gain
+
+
+_NUMBERS = ("measured", "standard_error", "predicted")
+
+
+def bag_difference(a: Path, b: Path) -> dict[str, Any]:
+    """The document of ``msg-analysis diff`` of two bags; keys in docs/commands.md. Differences are B - A.
+
+    BagError or InputError: a bag or its run record cannot be read. Verdict and errors come from the saved result of
+    the run, if there is one, else they are computed.
+    """
+    runs = [read_bag(path) for path in (a, b)]
+    results = [_result(path, run) for path, run in zip((a, b), runs, strict=True)]
+    one, other = (run.record for run in runs)
+    sides = [_bag_side(*each) for each in zip((a, b), runs, results, strict=True)]
+    return {
+        "kind": "bags",
+        "a": sides[0],
+        "b": sides[1],
+        "keys": differing(*(flat(record.experiment.to_document()) for record in (one, other))),
+        "versions": differing(one.versions, other.versions),
+        "states": state_difference(*runs),
+        "graphs": graph_difference(*runs),
+        "errors": {
+            "independent": one.experiment.run.seed != other.experiment.run.seed,
+            "system": measured(*(side["system_error"] for side in sides)),
+            "agents": _agents(*(_agent_errors(result) for result in results)),
+        },
+    }
+
+
+def _bag_side(path: Path, run: Trajectory, result: dict[str, Any]) -> dict[str, Any]:
+    record, completeness = run.record, run.completeness
+    tested = tested_error(result, path / RESULT_FILE)
+    given = tested is not None and result["system_error"]["standard_error"] is None
+    errors = tested or {key: (result.get("system_error") or {}).get(key) for key in _NUMBERS}
+    return {
+        "bag": str(path),
+        "run": str(record.run),
+        "experiment": record.experiment.name,
+        "seed": record.experiment.run.seed,
+        "agents": record.experiment.agents,
+        "names": record.experiment.names,
+        "steps": record.experiment.steps,
+        "simulated_time": record.experiment.run.duration,
+        "complete": completeness.complete,
+        "completeness": asdict(completeness),
+        "prefix": run.prefix,
+        "verdict": result.get("verdict"),
+        "unpredicted": result.get("unpredicted"),
+        "system_error": _with_interval(errors) | {"given_path": given},
+    }
+
+
+def _result(path: Path, run: Trajectory) -> dict[str, Any]:
+    """The comparison of a run: as saved beside its bag, or made now; only the reason where there is none."""
+    folder = path if path.is_dir() else path.parent
+    try:
+        document = read_document(folder)
+        result_row(folder, document)
+        if document.get("run") == str(run.record.run) and "node_errors" in document:
+            return document
+    except InputError:  # none, or not one
+        pass
+    try:
+        return compare(run).to_json()
+    except InputError as error:
+        return {"verdict": None, "unpredicted": str(error)}
+
+
+def _agent_errors(result: dict[str, Any]) -> list[dict[str, Any]]:
+    if "node_errors" not in result:
+        return []
+    return [_with_interval(node) for node in agent_errors(result)[0]]
+
+
+def _agents(a: list[dict[str, Any]], b: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Side by side, where both runs have as many agents; empty otherwise."""
+    return [measured(*pair) for pair in zip(a, b, strict=True)] if len(a) == len(b) else []
+
+
+def _with_interval(error: dict[str, Any]) -> dict[str, Any]:
+    """Measured, standard error and prediction, with the 95 % interval."""
+    value, deviation = error.get("measured"), error.get("standard_error")
+    numbers = {key: error.get(key) for key in _NUMBERS}
+    if value is None or deviation is None:
+        return numbers | {"low": None, "high": None}
+    half = HALF_WIDTH_95 * deviation
+    return numbers | {"low": value - half, "high": value + half}

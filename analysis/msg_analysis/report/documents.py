@@ -1,0 +1,462 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Results as JSON documents."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import numpy as np
+
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.text import agent_name, markdown_table
+from msg_analysis.errors import InputError
+from msg_analysis.experiment import loading, validation
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.graphs import Graph
+from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
+from msg_analysis.inference.autocovariance import (
+    LoggedAutocovariance,
+    LoggedDensity,
+    logged_autocovariance,
+    why_not_tested,
+)
+from msg_analysis.inference.observation import Observation
+from msg_analysis.protocol import Protocol
+from msg_analysis.theory import jump_system as systems
+from msg_analysis.theory.facts import check_facts
+from msg_analysis.theory.graph_indices import algebraic_connectivity, error_bounds, graph_indices
+from msg_analysis.theory.jump_system import JumpSystem
+from msg_analysis.theory.prediction import predict
+from msg_analysis.theory.settling import asymptotic_rates, settling_time
+from msg_analysis.theory.spectrum import Spectrum, spectrum
+from msg_analysis.theory.transient import TransientLaw, point_start, solve_transient, start_of
+from msg_analysis.theory.two_graphs import two_topology
+
+if TYPE_CHECKING:
+    from msg_analysis.bags.files import FileInventory, Inventory
+    from msg_analysis.bags.salvage import SalvageReport
+
+
+Pace = Literal["lockstep", "realtime"]
+
+_OWN, _BURSTS = {"loss": 0.2}, {"loss": 0.2, "burst": 5}
+_BY_LINK = {"loss": {"default": 0.1, "arcs": [[1, 2, 0.5]]}}
+_HOLD: dict[str, Any] = {"on_loss": "hold"}
+MESSAGES: dict[str, dict[str, Any]] = {
+    "as they are": {},
+    "`broadcast` noise": {"broadcast": 0.5},
+    "`link` noise": {"link": 0.5},
+    "`loss`, own value": _OWN,
+    "`loss`, last value heard": _OWN | _HOLD,
+    "`loss` by link, own value": _BY_LINK,
+    "`loss` by link, last value heard": _BY_LINK | _HOLD,
+    "`loss` in bursts, own value": _BURSTS,
+    "`loss` in bursts, last value heard": _BURSTS | _HOLD,
+    "`delay`": {"delay": 2},
+    "all of these, own value": {"broadcast": 0.5, "link": 0.5, "delay": 2, **_BY_LINK, "burst": 5},
+    "all of these, last value heard": {"broadcast": 0.5, "link": 0.5, "delay": 2, **_BY_LINK, "burst": 5, **_HOLD},
+}
+"""Sections ``noise``, beside the process noise, by what they make of messages."""
+
+LAWS: dict[str, dict[str, Any]] = {
+    "consensus": {},
+    "leaders": {"problem": "tracking", "leaders": {"agents": [1], "gain": 1.0}},
+    "leaders held at the reference": {"problem": "tracking", "leaders": {"agents": [1], "gain": "inf"}},
+    "linear protocol": {},
+    "protocol that is not linear": {"run": {"start": "zero"}},
+}
+PROCESS_NOISE: tuple[Any, ...] = (0.0, 1.0, [1.0, 0.5], [[1.0, 0.2], [0.0, 1.0]], {"a": 1.0, "b": 2.0})
+
+
+def experiment(messages: str, law: str, pace: Pace, process: Any = 1.0) -> ValidExperiment:
+    """One with these messages and this law; only asked what is available, since its protocol does nothing."""
+    document: dict[str, Any] = {"name": "any", "graphs": {"a": {"path": [1, 2]}, "b": {"arcs": [[1, 2], [2, 1]]}}}
+    document |= {"switching": {"generator": [[-1, 1], [1, -1]]}, **LAWS[law]}
+    document["noise"] = {"process": process, **MESSAGES[messages]}
+    document["run"] = {"pace": pace, **document.get("run", {})}
+    found = ValidExperiment.parse(document)
+    if "protocol" not in law:
+        return found
+    info = ProtocolInfo(name="any", package="any", version="1", linear=law == "linear protocol")
+    return dataclasses.replace(found, protocol=ChosenProtocol(info, kind=Protocol))
+
+
+def availability_table() -> str:
+    """As Markdown; every kind of process noise is in every cell."""
+    head = ("messages", "lockstep: run, twin", "lockstep: predicted", "real time: run, twin", "real time: predicted")
+    paces: tuple[Pace, ...] = ("lockstep", "realtime")
+    rows = [
+        (messages, *(_cell(messages, pace, purpose) for pace in paces for purpose in ("run", "predict")))
+        for messages in MESSAGES
+    ]
+    return markdown_table(head, rows, names=len(head))
+
+
+def _cell(messages: str, pace: Pace, purpose: Any) -> str:
+    missing = [
+        law
+        for law in LAWS
+        if any(experiment(messages, law, pace, process).unavailable(purpose) for process in PROCESS_NOISE)
+    ]
+    if not missing:
+        return "all laws"
+    if len(missing) == len(LAWS):
+        return "no"
+    return "linear laws" if missing == ["protocol that is not linear"] else "all but " + ", ".join(missing)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredSpectrum:
+    """A predicted spectrum, and what a log says of it."""
+
+    predicted: Spectrum
+    level: float | None = None
+    log: LoggedAutocovariance | None = None
+    density: LoggedDensity | None = None
+    note: str | None = None  # why the log is not tested, or not all of it
+    complete: bool = True
+
+    @property
+    def disagrees(self) -> bool:
+        """Whether the test rejects."""
+        return self.log is not None and self.log.p is not None and self.level is not None and self.log.p < self.level
+
+    def to_json(self) -> dict[str, Any]:
+        """The document."""
+        return self.predicted.to_json() | {
+            "level": self.level,
+            "agrees": None if self.log is None or self.log.p is None else not self.disagrees,
+            "log": self.log and self.log.to_json(),
+            "log_density": self.density
+            and {"frequencies": self.density.frequencies.tolist(), "system": self.density.system.tolist()},
+            "note": self.note,
+        }
+
+
+def predicted_spectrum(experiment: ValidExperiment) -> MeasuredSpectrum:
+    """Of an experiment; errors as of ``spectrum`` and ``predict``."""
+    experiment.require_available("predict")
+    return MeasuredSpectrum(spectrum(predict(experiment)))
+
+
+def measure_spectrum(bag: Path, level: float) -> MeasuredSpectrum:
+    """Of the run in a bag, of a torn one of what is before the first gap."""
+    trajectory = read_bag(bag)
+    experiment = trajectory.record.experiment
+    experiment.require_available("predict")
+    prediction = predict(experiment, trajectory.record.step_model)
+    predicted, complete = spectrum(prediction), trajectory.completeness.complete
+    observation = Observation.of(trajectory, prediction)
+    reason = why_not_tested(observation)
+    density = LoggedDensity.of(observation) if observation.steps >= 8 else None
+    log = logged_autocovariance(observation) if reason is None else None
+    note = None
+    if reason is not None:
+        note = f"the log is not tested: {reason}"
+    elif log is None:
+        note = "the log is not tested: lost messages make too many kinds of steps"
+    elif log.steps < observation.steps:
+        note = f"the first {log.steps} of {observation.steps} steps are tested"
+    return MeasuredSpectrum(predicted, level, log, density, note, complete)
+
+
+Result = TypeVar("Result")
+
+
+def describe_transient(
+    experiment: ValidExperiment,
+    times: FloatArray,  # (T,) ascending [units of simulated time]
+    *,
+    law: TransientLaw = "emulated",
+    unreduced: bool = False,
+    moments: bool = False,
+    fraction: float = 0.05,  # of the steady system error, for the settling time
+) -> dict[str, Any]:
+    """The document of ``msg-analysis transient``: moments, settling time, rates; arguments of ``solve_transient``.
+
+    In discrete time its law is "discrete". With ``moments``, nu(t) and c(t) of every mode are in it, too.
+    """
+    solved = solve_transient(experiment, times, law=law, unreduced=unreduced)
+    found = solved.course
+    document: dict[str, Any] = {
+        "law": "discrete" if experiment.time == "discrete" else law,
+        "unreduced": unreduced,
+        "agents": experiment.agents,
+        "names": experiment.names,
+        "modes": [graph.name for graph in experiment.graph_list],
+        "times": times.tolist(),
+        "graph_law": found.laws.tolist(),
+        "mean": found.mean.tolist(),
+    }
+    document |= dict(
+        zip(_mean_squares(document), (found.system_error.tolist(), found.node_errors.tolist()), strict=True)
+    )
+    document |= _settling(experiment, solved.system, solved.steady, solved.unit or 1.0, fraction)
+    if moments:
+        document["mode_means"] = found.mode_means.tolist()
+        document["mode_second_moments"] = found.mode_second_moments.tolist()
+    return document
+
+
+def _settling(
+    experiment: ValidExperiment, system: JumpSystem, steady: FloatArray, unit: float, fraction: float
+) -> dict[str, Any]:
+    """Keys ``steady_system_error``, ``settling`` [units of simulated time] and ``rates`` [1 / unit]."""
+    error = float(np.trace(system.lifted(steady.sum(axis=0))))
+    starts = {
+        "from_start": start_of(experiment, system, steady),
+        "from_zero": point_start(system, np.zeros(experiment.agents)),
+    }
+    rates = asymptotic_rates(system)
+    return {
+        "steady_system_error": error,
+        "settling": {
+            "fraction": fraction,
+            # Without noise there is no steady error to settle at.
+            **{
+                key: unit * settling_time(system, steady, start, fraction) if error > 0.0 else None
+                for key, start in starts.items()
+            },
+        },
+        "rates": {key: None if rate is None else rate / unit for key, rate in dataclasses.asdict(rates).items()},
+    }
+
+
+def describe_facts(experiment: ValidExperiment) -> dict[str, Any]:
+    """The document of ``msg-analysis facts``: lemmas, bounds, indices of the graphs, two graphs in closed form.
+
+    None: a graph that is directed or disconnected; the closed form unless two graphs can each be held fixed; what the
+    network is too large for, with the reason in ``notes``.
+    """
+    prediction = predict(experiment)
+    laws = {"discrete" if experiment.time == "discrete" else "emulated": prediction.system}
+    if prediction.continuous_moments is not None:
+        laws = {"continuous": systems.continuous(experiment)} | laws
+    notes: list[str] = []
+
+    def unless_refused(compute: Callable[[], Result]) -> Result | None:
+        try:
+            return compute()
+        except InputError as error:
+            notes.append(str(error))
+            return None
+
+    facts = unless_refused(lambda: [fact.to_json() for fact in check_facts(experiment)])
+    forms = None
+    if len(experiment.graph_list) == 2 and prediction.static_moments is not None:
+        forms = unless_refused(lambda: {law: two_topology(system).to_json() for law, system in laws.items()})
+    indices = [graph_indices(graph) for graph in experiment.graph_list]
+    return {
+        "names": experiment.names,
+        "modes": [graph.name for graph in experiment.graph_list],
+        "facts": facts,
+        "bounds": error_bounds(prediction).to_json(),
+        "graphs": [None if entry is None else entry.to_json() for entry in indices],
+        "two_topology": forms,
+        "notes": notes,
+    }
+
+
+def write_transient_csv(document: dict[str, Any], path: Path) -> None:
+    """Write a row per time: the law of the graph, means and mean squares of the agents; whole or not at all."""
+    system, nodes = _mean_squares(document)
+    agents = [agent_name(i, document["names"]) for i in range(1, document["agents"] + 1)]
+    header = ["time", *(f"probability of {name}" for name in document["modes"])]
+    header += [*(f"mean of agent {i}" for i in agents), system.replace("_", " ")]
+    header += [f"{nodes.removesuffix('s').replace('_', ' ')} of agent {i}" for i in agents]
+    keys = ("times", "graph_law", "mean", system, nodes)
+    rows = zip(*(document[key] for key in keys), strict=True)
+    temporary = path.with_name(path.name + ".part")
+    try:
+        with temporary.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(header)
+            writer.writerows([time, *law, *mean, error, *errors] for time, law, mean, error, errors in rows)
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"{path}: cannot be written ({error.strerror}): choose another place") from error
+
+
+def _mean_squares(document: dict[str, Any]) -> tuple[str, str]:
+    kind = "second_moment" if document["unreduced"] else "error"
+    return f"system_{kind}", f"node_{kind}s"
+
+
+def describe_experiment(experiment: ValidExperiment) -> dict[str, Any]:
+    """The document of ``msg-analysis info EXPERIMENT --json``; the experiment need not be one that can be run.
+
+    None: infinite or not computable; a stability limit with a delay or a protocol is not known. Memory in bytes.
+    """
+    document = experiment.to_document()
+    chain = experiment.chain
+    states, matrices = loading.memory_needed(
+        experiment.agents,
+        chain.modes,
+        experiment.steps,
+        experiment.width,
+        experiment.noise.delay,
+        experiment.truth,
+    )
+    limits = [_stability_limit(experiment, graph) for graph in experiment.graph_list]
+    return {
+        "name": experiment.name,
+        "problem": experiment.problem,
+        "time": experiment.time,
+        "agents": experiment.agents,
+        "names": experiment.names,
+        "leaders": document.get("leaders"),
+        "protocol": _protocol(experiment),
+        "noise": document["noise"],
+        "run": document["run"] | {"steps": experiment.steps},
+        "switching": {"matrix": chain.matrix.tolist(), "initial": experiment.switching.initial},
+        "graphs": [
+            {
+                "name": graph.name,
+                "edges": graph.edges if graph.symmetric else None,
+                "arcs": None if graph.symmetric else graph.arcs,
+                "algebraic_connectivity": algebraic_connectivity(graph),
+                "stationary": float(share),
+                "mean_holding_time": holding_time,
+                "stability_limit": limit,
+            }
+            for graph, share, holding_time, limit in zip(
+                experiment.graph_list, chain.stationary, chain.holding_times, limits, strict=True
+            )
+        ],
+        "stability_limit": min((limit for limit in limits if limit is not None), default=None),
+        "predicted_system_error": _predicted_system_error(experiment),
+        "memory": {"states": states, "matrices": matrices},
+        "unavailable": experiment.unavailable(),
+    }
+
+
+def describe_bag(path: Path) -> dict[str, Any]:
+    """The document of ``msg-analysis info BAG --json``, for a whole or a torn bag; keys in docs/commands.md.
+
+    InputError if no file of it can be read; a bag that is not a run has a ``problem``, and None for the run's keys.
+    """
+    from msg_analysis.bags.files import (
+        Inventory,  # imported here: experiments do not need it
+        total_channels,
+    )
+    from msg_analysis.bags.writing import recording_pid
+
+    inventory = Inventory()
+    run = _describe_run(path, inventory)
+    entries = {entry.file.path: entry for entry in inventory.files}
+    others = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else []
+    files = [*entries, *(file for file in others if file not in entries)]
+    return {
+        "bag": str(path),
+        "recording": recording_pid(path),
+        **run,
+        "topics": [
+            {"name": topic.topic, "type": topic.type_name, "messages": topic.messages}
+            for topic in total_channels([entry.count for entry in inventory.files]).values()
+        ],
+        "files": [
+            {"name": file.name, "size": file.stat().st_size}
+            | (_describe_file(entries[file]) if file in entries else {})
+            for file in files
+        ],
+    }
+
+
+def _describe_run(path: Path, inventory: Inventory) -> dict[str, Any]:
+    from msg_analysis.bags.reading import read_bag
+
+    try:
+        trajectory = read_bag(path, inventory)
+    except InputError as error:
+        if all(entry.problem for entry in inventory.files):
+            raise
+        keys = (
+            "run",
+            "experiment",
+            "seed",
+            "agents",
+            "names",
+            "replicas",
+            "steps",
+            "simulated_time",
+            "completeness",
+            "prefix",
+        )
+        return {"problem": str(error), **dict.fromkeys(keys), "protocol": None, "versions": {}}
+    record = trajectory.record
+    run = record.experiment.run
+    completeness = trajectory.completeness
+    return {
+        "problem": None,
+        "run": str(record.run),
+        "experiment": record.experiment.name,
+        "seed": run.seed,
+        "agents": record.experiment.agents,
+        "names": record.experiment.names,
+        "replicas": run.replicas,
+        "steps": record.experiment.steps,
+        "simulated_time": run.duration,
+        "completeness": dataclasses.asdict(completeness)
+        | {"complete": completeness.complete, "stretch": trajectory.stretch},
+        "prefix": trajectory.prefix,
+        "protocol": _protocol(record.experiment),
+        "versions": record.versions,
+    }
+
+
+def _describe_file(entry: FileInventory) -> dict[str, Any]:
+    count, some = entry.count, entry.count.messages > 0
+    return {
+        "messages": count.messages,
+        "start": count.start if some else None,
+        "end": count.end if some else None,
+        "compression": entry.compression,
+        "torn": entry.file.torn,
+        "damaged_chunks": entry.file.damaged_chunks,
+        "lost_messages": entry.lost_messages,
+        "problem": entry.problem,
+    }
+
+
+def describe_salvage(out: Path, report: SalvageReport) -> dict[str, Any]:
+    """The document of ``msg-analysis salvage --json``: the report's fields, and the run read from the new bag."""
+    from msg_analysis.bags.files import Inventory
+
+    return {"bag": str(out), **dataclasses.asdict(report), **_describe_run(out, Inventory())}
+
+
+def _protocol(experiment: ValidExperiment) -> dict[str, Any] | None:
+    """The protocol of the agents; None for the built-in law."""
+    protocol = experiment.protocol
+    if protocol is None:
+        return None
+    parameters = experiment.to_document()["protocol"]
+    return protocol.info.to_json() | {
+        "parameters": {key: value for key, value in parameters.items() if key != "name"},
+        "absent": protocol.absent,
+    }
+
+
+def _stability_limit(experiment: ValidExperiment, graph: Graph) -> float | None:
+    if experiment.time == "discrete" or experiment.noise.delay or experiment.protocol:
+        return None
+    limit = validation.stability_limit(graph, experiment.leader_gains)
+    return limit if math.isfinite(limit) else None
+
+
+def _predicted_system_error(experiment: ValidExperiment) -> float | None:
+    try:
+        experiment.require_available("predict")
+        return predict(experiment).emulated.system_error
+    except InputError:  # experiments without a prediction are described, too
+        return None

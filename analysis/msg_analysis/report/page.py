@@ -1,0 +1,407 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+import base64
+import datetime
+import gzip
+import platform
+import shlex
+import sys
+import types
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+import yaml
+from bokeh.core.json_encoder import serialize_json
+from bokeh.document import Document
+from bokeh.models import ColumnDataSource, UIElement
+from bokeh.resources import Resources
+from jinja2.bccache import Bucket
+from markupsafe import Markup
+
+from msg_analysis.common.files import write_whole
+from msg_analysis.common.text import counted, p_text, with_names
+from msg_analysis.errors import InputError
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.inference.comparison import Comparison
+from msg_analysis.inference.observation import bounded
+from msg_analysis.inference.realtime_laws import SUPPORT
+from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run_record import RunRecord
+from msg_analysis.report import drawings, error_plots, plot_style, run_plots
+from msg_analysis.report.drawings import interval_bars, plus_minus
+from msg_analysis.report.error_plots import covariances
+from msg_analysis.report.plot_style import Accused
+from msg_analysis.report.run_plots import Event, run_events
+from msg_analysis.report.wording import (
+    QUANTILES,
+    REAL_TIME_LAWS,
+    TIMES,
+    agent_errors,
+    agent_order,
+    any_time_words,
+    explain,
+    furthest,
+    graph_facts,
+    sentence,
+    timing_facts,
+    trust_words,
+    unheard_words,
+    verdict_line,
+)
+from msg_analysis.theory.prediction import LAW_NAMES
+
+
+class _Compiled(jinja2.BytecodeCache):
+    """Templates that are compiled once in a process."""
+
+    def __init__(self) -> None:
+        self._code: dict[str, types.CodeType] = {}
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        bucket.code = self._code.get(bucket.checksum)
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        if bucket.code is not None:
+            self._code[bucket.checksum] = bucket.code
+
+
+_COMPILED = _Compiled()
+
+
+def page_template(name: str, filters: Mapping[str, Callable[..., Any]] | None = None) -> jinja2.Template:
+    """A template of this folder, which escapes what is put into it, and fails where something is missing."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("msg_analysis.report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        bytecode_cache=_COMPILED,
+    )
+    environment.filters |= filters or {}
+    return environment.get_template(name)
+
+
+def pack(models: Mapping[str, UIElement]) -> tuple[dict[str, Markup], Markup]:
+    """The place of each figure, and what follows once in a page, before its scripts."""
+    document = Document()
+    shelf = ColumnDataSource(name="figures", tags=list(models.values()))  # no figure is a root: none is drawn at once
+    with document.models.freeze():
+        document.add_root(shelf)
+    places = {
+        name: Markup('<div class="figure" data-figure="{}" style="height: {}px"></div>').format(model.id, model.height)
+        for name, model in models.items()
+    }
+    blocks = {"library": _library(), "figures": _packed(serialize_json(document.to_json(deferred=False)).encode())}
+    block = Markup('<script type="text/plain" id="{}">{}</script>\n')
+    return places, Markup().join(block.format(name, text) for name, text in blocks.items())
+
+
+@cache
+def _library() -> str:
+    return _packed(Resources(mode="inline", components=["bokeh"]).js_raw[0].encode())
+
+
+def _packed(content: bytes) -> str:
+    """As gzip in base64; the same bytes give the same text."""
+    return base64.b64encode(gzip.compress(content, mtime=0)).decode()
+
+
+SYMBOLS = {"agrees": "✓", "disagrees": "✗", "incomplete": "?", "unpredicted": "–"}
+_SHOWN_SEEDS = 8
+
+
+def page_title(comparison: Comparison) -> str:
+    """The title of the tab, what differs between runs first: verdict, name, seed, date."""
+    records = _records(comparison)
+    parts = [records[0].experiment.name]
+    if len(records) > 1:
+        parts.append(counted(len(records), "run"))
+    parts += [_seeds(records), _dates(records)[0]]
+    return f"{SYMBOLS[comparison.verdict]} {', '.join(parts)}: {comparison.verdict}"
+
+
+def run_facts(comparison: Comparison, wall_time: float | None) -> list[tuple[str, str]]:
+    """Seed, date, duration and pace of the run or the runs; ``wall_time`` [s] if it is known."""
+    records = _records(comparison)
+    experiment = records[0].experiment
+    facts = [("seed" if len(records) == 1 else "seeds", _seeds(records).partition(" ")[2])]
+    dates = _dates(records)
+    facts.append(("date", " to ".join(dict.fromkeys((dates[0], dates[-1]))) + " UTC"))
+    durations = sorted({record.experiment.run.duration for record in records})
+    time = " to ".join(f"{each:g}" for each in dict.fromkeys((durations[0], durations[-1])))
+    steps = f", {counted(experiment.steps, 'step')} of {experiment.step_length:g}" if len(durations) == 1 else ""
+    each = " each" if len(records) > 1 else ""
+    facts.append(("duration", f"{time} units of time{steps}{each}" + (f", in {wall_time:.3g} s" if wall_time else "")))
+    facts.append(("pace", _pace(experiment)))
+    return facts
+
+
+def _records(comparison: Comparison) -> list[RunRecord]:
+    pool = comparison.pool
+    return [member.record for member in pool.members] if pool else [comparison.trajectory.record]
+
+
+def _seeds(records: Sequence[RunRecord]) -> str:
+    seeds = [str(record.experiment.run.seed) for record in records]
+    shown = ", ".join(seeds[:_SHOWN_SEEDS]) + (", …" if len(seeds) > _SHOWN_SEEDS else "")
+    return f"{'seed' if len(seeds) == 1 else 'seeds'} {shown}"
+
+
+def _dates(records: Sequence[RunRecord]) -> list[str]:
+    """Ascending, to the minute."""
+    dates = sorted(record.started for record in records)
+    return [date.astimezone(datetime.UTC).strftime("%Y-%m-%d %H:%M") for date in dates]
+
+
+def _pace(experiment: ValidExperiment) -> str:
+    run = experiment.run
+    if run.pace == "lockstep":
+        return "lockstep"
+    return f"real time, {run.speed:g} units of time per second"
+
+
+_OPEN_TABLE = 12  # most agents with which the table of the nodes is open at first
+_SMALL_CHAIN = 8  # most graphs whose transitions are listed
+_FIRST_LINES, _FIRST_TRAJECTORIES = 5, 8
+_NODE_TEST = "error of agent "  # beginning of the names of the tests of the nodes
+
+
+def write_report(
+    comparison: Comparison,
+    trajectory: Trajectory,
+    path: str | Path,
+    *,
+    restarts: Sequence[str] = (),
+    strangers: Sequence[Mapping[str, Any]] = (),
+    events: Sequence[Mapping[str, Any]] = (),
+    wall_time: float | None = None,
+    channel: Mapping[str, Any] | None = None,
+) -> None:
+    """Write the report of a comparison, whole or not at all; InputError if that fails. Arguments as in ``render``."""
+    path = Path(path)
+    html = render(
+        comparison,
+        trajectory,
+        restarts=restarts,
+        strangers=strangers,
+        events=events,
+        wall_time=wall_time,
+        channel=channel,
+    )
+    try:
+        write_whole(path, html.encode())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}): choose another place") from error
+
+
+def render(
+    comparison: Comparison,
+    trajectory: Trajectory,
+    *,
+    restarts: Sequence[str] = (),  # one line per process that was restarted
+    strangers: Sequence[Mapping[str, Any]] = (),  # refused messages: node, topic, reason, count
+    events: Sequence[Mapping[str, Any]] = (),  # of processes and refused messages: kind, step, node, words
+    wall_time: float | None = None,  # [s] that the run took, if known
+    channel: Mapping[str, Any] | None = None,  # hosts, and packets of each pair of them, as in result.json
+    host: str | None = None,  # where the report is written and by which command; None: here, and by this one
+    command: str | None = None,
+) -> str:
+    """The report as HTML text."""
+    document = comparison.to_json()
+    experiment = trajectory.record.experiment
+    filters: dict[str, Callable[..., Any]] = {"number": _number, "p": _p, "named": _namer(experiment)}
+    names = [graph.name for graph in experiment.graph_list]
+    accused = Accused.of(document["blame"])
+    happened, more_events = run_events(trajectory, events)
+    models, drawn = _models(document, comparison, trajectory, accused, happened)
+    places, packed = pack(models)
+    timing = document["timing"]
+    return page_template("report.html.j2", filters).render(
+        document=document,
+        title=page_title(comparison),
+        run_facts=run_facts(comparison, wall_time),
+        symbol=SYMBOLS[document["verdict"]],
+        restarts=restarts,
+        strangers=strangers,
+        channel=channel,
+        headline=verdict_line(document),
+        timing_facts=timing_facts(timing) if timing else [],
+        unheard_words=unheard_words(document),
+        times=TIMES,
+        quantiles=QUANTILES,
+        laws=REAL_TIME_LAWS,
+        law_bars=interval_bars([document["laws"][law]["system_error"] for law in REAL_TIME_LAWS] if timing else []),
+        law_name=LAW_NAMES["emulated" if document["law"] == "synchronous" else document["law"]],
+        support=SUPPORT,
+        explanation=_explanation(document),
+        blame=[with_names(sentence(cause["words"]), experiment.names) for cause in document["blame"]],
+        cause_known=bool(document["blame"]) and document["blame"][0]["kind"] != "unknown",
+        plus_minus=plus_minus,
+        interval_bars=interval_bars,
+        heat_maps=[name for name in models if name.startswith("covariance_")],
+        order=agent_order(document),
+        any_time=" ".join(any_time_words(document)),
+        trust=" ".join(trust_words(document)),
+        agents=agent_errors(document),
+        experiment=experiment,
+        versions=trajectory.record.versions,
+        plots=places,
+        packed=packed,
+        first_agents=_first_agents(document, accused.involved),
+        line_colours=plot_style.LINES,
+        graph_colours=plot_style.GRAPHS,
+        dark=plot_style.DARK,
+        most_lines=error_plots.MOST_LINES,
+        drawn=drawn,
+        shown=_shown_agents(experiment.agents, accused.involved),
+        accused=accused,
+        events=happened,
+        more_events=more_events,
+        step_length=experiment.step_length,
+        room=run_plots.OTHER_REPLICAS,
+        explained=explain(experiment),
+        drawings=drawings.graph_drawings(experiment, accused),
+        graph_facts=graph_facts(experiment),
+        chain=drawings.chain_drawing(experiment, accused),
+        yaml=yaml.safe_dump(experiment.to_document(), sort_keys=False, allow_unicode=True, default_flow_style=None),
+        host=host or platform.node() or "unnamed host",
+        tests=[
+            test | {"name": with_names(test["name"], experiment.names)}
+            for test in document["tests"]
+            if not test["name"].startswith(_NODE_TEST)
+        ],
+        agent_names=experiment.names,
+        node_tests=_node_tests(document),
+        nodes_open=experiment.agents <= _OPEN_TABLE,
+        names=names,
+        transitions=document["switching"]["counts"] is not None and 1 < len(names) <= _SMALL_CHAIN,
+        command=command or shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        written=datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
+    )
+
+
+def _models(
+    document: dict[str, Any],
+    comparison: Comparison,
+    trajectory: Trajectory,
+    accused: Accused,
+    events: Sequence[Event],
+) -> tuple[dict[str, UIElement], run_plots.Drawn]:
+    """The figures that exist, by name, and what of the run is in those of the trajectories."""
+    experiment, steps = trajectory.record.experiment, max(document["steps"], 0)
+    covariance, ratios = document["covariance"], document["innovations"]["ratios"]
+    predicted = document["system_error"]["predicted"]
+    models: dict[str, UIElement | None] = {
+        "nodes": error_plots.node_errors(agent_errors(document)[0], document["level"], accused, experiment.names),
+        **covariances(
+            _matrix(covariance["measured"]),
+            _matrix(covariance["predicted"]),
+            _matrix(covariance["z"]),
+            accused,
+            experiment.names,
+        ),
+    }
+    if len(comparison.running["time"]) > 1:
+        models["running"] = error_plots.convergence(comparison.running, predicted)
+    seen = comparison.any_time
+    if seen and seen.time is not None and seen.log_curve is not None and np.isfinite(seen.log_curve).all():
+        models["evidence"] = error_plots.evidence(seen.time, seen.log_curve, seen.threshold, seen.crossed)
+    figures, drawn = run_plots.trajectory_plots(trajectory, predicted, events)
+    models |= figures
+    known = trajectory.modes[:steps]
+    if len(known):
+        names = [graph.name for graph in experiment.graph_list]
+        models["occupancy"] = run_plots.occupancy(known, names, experiment.chain.stationary)
+        if not document["unpredicted"]:
+            reference = None if experiment.problem == "consensus" else experiment.reference
+            states = bounded(trajectory.values[:steps])
+            models["agents"] = error_plots.agent_convergence(
+                states, reference, experiment.step_length, agent_errors(document)[0]
+            )
+    if ratios is not None and any(ratio is not None for ratio in ratios):
+        sizes = np.array(ratios, dtype=float)  # None: nan
+        models["innovations"] = error_plots.innovation_sizes(
+            sizes, document["innovations"]["samples"], accused, experiment.names
+        )
+    if document["timing"]:
+        models["lateness"] = error_plots.lateness(document["timing"])
+        models["staleness"] = error_plots.staleness(document["timing"])
+    return {name: model for name, model in models.items() if model is not None}, drawn
+
+
+def _shown_agents(agents: int, accused: Sequence[int]) -> list[int]:
+    """The agents (from 1) whose trajectories are drawn at first: the accused, and the first ones."""
+    others = [agent for agent in range(1, agents + 1) if agent not in accused]
+    return sorted([*accused[:_FIRST_TRAJECTORIES], *others[: max(_FIRST_TRAJECTORIES - len(accused), 0)]])
+
+
+def _first_agents(document: dict[str, Any], accused: Sequence[int]) -> list[int]:
+    """The agents (from 1) whose convergence is drawn at first: the accused, then those with the largest abs(z)."""
+    known = [agent + 1 for agent in furthest([node["z"] for node in agent_errors(document)[0]], _FIRST_LINES)]
+    return sorted(list(dict.fromkeys([*accused, *known]))[:_FIRST_LINES])
+
+
+def _explanation(document: dict[str, Any]) -> str:
+    """The verdict in a few sentences."""
+    tests, completeness, level = document["tests"], document["completeness"], document["level"]
+    if document["verdict"] == "incomplete":
+        lost = [
+            f"{completeness['missing']} of {completeness['expected']} states" if completeness["missing"] else "",
+            f"the graph of {completeness['missing_modes']} steps" if completeness["missing_modes"] else "",
+        ]
+        numbers = (
+            f"The numbers below are those of the first {document['steps']} steps, up to the first gap."
+            if document["system_error"]["measured"] is not None
+            else "The first gap is too early to compute errors."
+        )
+        return f"Missing: {' and '.join(filter(None, lost))}. {numbers}"
+    if document["unpredicted"]:
+        results = [f"{test['name']}: {'rejected' if test['rejected'] else 'passed'}" for test in tests]
+        cut = f" Errors are measured from step {document['transient']} on." if document["transient"] else ""
+        return f"No prediction: {document['unpredicted']}. Tests: {', '.join(results) or 'none'}.{cut}"
+    chance = f"If the run follows the predicted law, the probability of a rejected test is at most {level:.2g}."
+    rejected = [test for test in tests if test["rejected"]]
+    if not rejected:
+        return f"All {len(tests)} tests passed. {chance}"
+    names = document["names"]
+    named = ", ".join(f"{with_names(test['name'], names)} (p = {_p(test['p_adjusted'])})" for test in rejected[:6])
+    more = f" and {len(rejected) - 6} more" if len(rejected) > 6 else ""
+    return f"Rejected: {len(rejected)} of {len(tests)} tests: {named}{more}. {chance}"
+
+
+def _node_tests(document: dict[str, Any]) -> dict[str, Any] | None:
+    """The tests of all nodes as one row; None where there are none."""
+    tests = [test for test in document["tests"] if test["name"].startswith(_NODE_TEST)]
+    if not tests:
+        return None
+    smallest = min(tests, key=lambda test: float(test["p"]))
+    return {"count": len(tests), "rejected": sum(test["rejected"] for test in tests), "smallest": smallest}
+
+
+def _number(value: float | None, digits: int = 4) -> str:
+    return "–" if value is None else _typeset(f"{value:#.{digits}g}".rstrip("."))
+
+
+def _namer(experiment: ValidExperiment) -> Callable[[str], str]:
+    return lambda text: with_names(text, experiment.names)
+
+
+def _p(p: float | None) -> str:
+    return _typeset(p_text(p))
+
+
+def _typeset(number: str) -> str:
+    """With a dash where there is no number, and a minus sign."""
+    return "–" if number == "-" else number.replace("-", "−")
+
+
+def _matrix(rows: list[list[float]] | None) -> Any:
+    return None if rows is None else np.array(rows, dtype=float)

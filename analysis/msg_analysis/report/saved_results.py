@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Saved results side by side, and which of their system errors differ significantly."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.text import Text
+
+from msg_analysis.common.files import RESULT_FILE
+from msg_analysis.common.text import half_width_text, markdown_table, measured_text, number_text, p_text, z_text
+from msg_analysis.inference.estimates import Estimate, Ranking, rank_estimates
+from msg_analysis.inference.statistics import two_sided
+from msg_analysis.report.tables import number_table, print_table, room_for_names
+from msg_analysis.report.wording import order_statements
+from msg_analysis.runs import Result
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """Results of the same law as one; every unit of simulated time has the same weight."""
+
+    experiment: str  # name in the first
+    files: tuple[str, ...]
+    simulated_time: float  # of all [units of simulated time]
+    measured: float  # system error, like the next four
+    standard_error: float
+    predicted: float
+    z: float
+    p: float
+
+
+def merge_results(rows: Sequence[Result]) -> list[Merged]:
+    """Results of the same law as one, where there are two or more.
+
+    Left out: those without a number, and those with the seed of an earlier row.
+    """
+    groups: dict[str, list[Result]] = {}
+    for row in rows:
+        if row.identity is None or row.measured is None or row.predicted is None or not row.standard_error:
+            continue
+        group = groups.setdefault(row.identity, [])
+        if not any(set(row.seeds.split()) & set(other.seeds.split()) for other in group):
+            group.append(row)
+    found = []
+    for group in groups.values():
+        if len(group) < 2:
+            continue
+        time = np.array([row.simulated_time for row in group])
+        share = time / time.sum()
+        measured = float(share @ [row.measured for row in group])
+        predicted = float(share @ [row.predicted for row in group])
+        error = float(np.linalg.norm(share * [row.standard_error for row in group]))
+        z = (measured - predicted) / error
+        files = tuple(row.file for row in group)
+        p = float(two_sided(z))
+        found.append(Merged(group[0].experiment, files, float(time.sum()), measured, error, predicted, z, p))
+    return found
+
+
+def order_of_results(rows: Sequence[Result], level: float) -> Ranking | None:
+    """Which system errors of independent runs are smaller than which; numbers are places in ``rows``, from 1.
+
+    With leaders of infinite gain in every row, that is the order of their joint robustness centrality. None unless
+    every row has a measured error with a standard error, and where ``rank_estimates`` gives none.
+    """
+    errors = [(row.measured, row.standard_error) for row in rows]
+    known = [(measured, error) for measured, error in errors if measured is not None and error is not None]
+    if len(known) < len(rows):
+        return None
+    measured, deviations = np.array(known).T
+    predicted = [row.predicted for row in rows if row.predicted is not None]
+    return rank_estimates(
+        measured, np.diag(deviations**2), np.array(predicted) if len(predicted) == len(rows) else None, level
+    )
+
+
+def to_json(rows: Sequence[Result], level: float) -> dict[str, Any]:
+    """The document: ``results``, ``merged``, and ``order``, whose numbers are places among the results, from 1."""
+    order = order_of_results(rows, level)
+    return {
+        "results": [asdict(row) for row in rows],
+        "merged": [asdict(one) for one in merge_results(rows)],
+        "order": order.to_json() if order else None,
+    }
+
+
+def to_csv(rows: Sequence[Result]) -> str:
+    """A line per result under the names of the columns, with all digits."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow([field.name for field in fields(Result)])
+    for row in rows:
+        writer.writerow(["" if value is None else value for value in asdict(row).values()])
+    return stream.getvalue()
+
+
+def to_markdown(rows: Sequence[Result]) -> str:
+    """The results as a Markdown table."""
+    heads, body = _shown(rows)
+    return markdown_table(heads, body, names=4)
+
+
+def print_results(rows: Sequence[Result], level: float, console: Console) -> None:
+    """Print the results as a table, and which system errors differ at ``level`` (all pairs together)."""
+    heads, body = _shown(rows)
+    wide = ("experiment", "seed", "time", "smallest p")  # too much for 80 columns
+    kept = [place for place, head in enumerate(heads) if head not in wide and {line[place] for line in body} != {"-"}]
+    table = number_table(console, "Results", *(heads[place] for place in kept))
+    numbers = [[line[place] for place in kept[1:]] for line in body]
+    room = room_for_names(console, [heads[place] for place in kept[1:]], numbers)
+    names = [
+        name if len(name) <= room else f"…{name[1 - room :]}"  # the end tells them apart
+        for name in short_names([row.file for row in rows])
+    ]
+    table.columns[0].min_width = max(map(len, names), default=0)
+    for line, name in zip(numbers, names, strict=True):
+        table.add_row(Text(name), *map(Text, line))
+    print_table(console, table)
+    for row in rows:
+        if row.blame:
+            console.print(Text(f"{row.file}: {row.blame}."))
+    for one in merge_results(rows):
+        interval = Estimate(one.measured, standard_error=one.standard_error).interval
+        console.print(
+            Text(
+                f"{one.experiment}, {len(one.files)} results merged ({number_text(one.simulated_time)} units of time): "
+                f"{measured_text(one.measured, interval)}, predicted {number_text(one.predicted)}, "
+                f"z = {z_text(one.z)}, p = {p_text(one.p)}."
+            )
+        )
+    order = order_of_results(rows, level)
+    if order:
+        for sentence in order_statements(
+            order.to_json(), [row.file for row in rows], "has a smaller system error than"
+        ):
+            console.print(Text(sentence))
+
+
+def short_names(files: Sequence[str]) -> list[str]:
+    """The files without what all of them begin with, and without the name that a result has in its folder."""
+    parts = [Path(file).parts for file in files]
+    parts = [each[:-1] if each[-1:] == (RESULT_FILE,) and len(each) > 1 else each for each in parts]
+    common = 0
+    while len(parts) > 1 and all(len(each) > common + 1 and each[common] == parts[0][common] for each in parts):
+        common += 1
+    return [str(Path(*each[common:])) for each in parts]
+
+
+def _shown(rows: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
+    heads = ["result", "experiment", "leaders", "verdict", "seed", "time"]
+    heads += ["system error", "± (95 %)", "predicted", "z", "smallest p"]
+    body = []
+    for row in rows:
+        seed = f"{row.bags} runs" if row.bags > 1 else row.seeds or "-"
+        names = [row.file, row.experiment, row.leaders or "-", row.verdict, seed]
+        numbers = [number_text(row.simulated_time), number_text(row.measured), half_width_text((row.low, row.high))]
+        body.append([*names, *numbers, number_text(row.predicted), z_text(row.z), p_text(row.least_p)])
+    return heads, body

@@ -1,0 +1,321 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Plots of a sweep: lines with intervals over one key, heat maps over two. Hover shows values, as do arrow keys."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from bokeh.models import (
+    ColorBar,
+    ColumnDataSource,
+    FixedTicker,
+    HoverTool,
+    LinearColorMapper,
+    LogColorMapper,
+    PlainText,
+    Range1d,
+    UIElement,
+    Whisker,
+)
+from bokeh.palettes import interp_palette
+
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.text import measured_text, number_text
+from msg_analysis.experiment.problems import show
+from msg_analysis.report.figures import shifted, shorten
+from msg_analysis.report.plot_style import BLACK, DARK_SCALE, GREY, INK, LINES, SANS, SCALE, new_figure
+from msg_analysis.sweep.figure_series import Picture, Place, Series, value_text
+from msg_analysis.sweep.grid import axis_name, column_words, key_words
+from msg_analysis.theory.prediction import LAW_NAMES
+
+MOST_LINES = 8  # series of one figure; of more values, some
+MOST_PANELS = 12  # figures side by side; of more combinations, the first
+MARKERS = {
+    "circle": "M2 6a4 4 0 1 0 8 0a4 4 0 1 0-8 0Z",
+    "square": "M2 2H10V10H2Z",
+    "triangle": "M6 1.5L10.5 10H1.5Z",
+    "inverted_triangle": "M6 10.5L10.5 2H1.5Z",
+    "diamond": "M6 .5L10 6L6 11.5L2 6Z",
+    "hex": "M3.5 2H8.5L11 6L8.5 10H3.5L1 6Z",
+    "plus": "M4.5 1H7.5V4.5H11V7.5H7.5V11H4.5V7.5H1V4.5H4.5Z",
+    "square_pin": "M1 1Q6 4 11 1Q8 6 11 11Q6 8 1 11Q4 6 1 1Z",
+}
+"""Of the series of a figure, with their outlines in a square of 12 by 12."""
+_WIDE = 10.0  # ratio of results from which on the colours of heat maps are on a logarithmic scale
+_NUMBERED = 8  # most columns of a heat map with numbers
+_TICKS = 10  # most values written along an axis; fewer on narrow screens, by the page's script
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """The series that have the same values of all keys but two."""
+
+    title: str  # these values, in words; empty where there are none
+    series: tuple[Series, ...]  # one for each value of the second key; one alone without a second key
+
+
+def key_of_lines(picture: Picture) -> tuple[str, list[str]] | None:
+    """The key whose values the lines of a figure have, in words, and these values; None with one line."""
+    chosen = _some(panels(picture)[0].series)
+    if not chosen[0].values:
+        return None
+    return key_words(chosen[0].values[0][0], picture.names), [value_text(series.values[0][1]) for series in chosen]
+
+
+def panels(picture: Picture) -> list[Panel]:
+    """Series by the values of the third key and those after it."""
+    found: dict[tuple[str, ...], list[Series]] = {}
+    for series in picture.series:
+        found.setdefault(tuple(show(value) for _, value in series.values[1:]), []).append(series)
+    return [Panel(picture.words(group[0].values[1:]), tuple(group)) for group in found.values()]
+
+
+def lines(picture: Picture, panel: Panel, name: str) -> UIElement:
+    """Lines over the key along the axis; measured values with intervals, beside each other; ``name`` for the page."""
+    chosen = _some(panel.series)
+    labels = list(dict.fromkeys(show(place.x) for series in picture.series for place in series.places))
+    logarithmic = picture.numeric and picture.logarithmic
+    along = [_along(picture, series, labels) for series in chosen]
+    every = np.concatenate(along)
+    drawn = [shifted(x, every, i, len(chosen), logarithmic=logarithmic) for i, x in enumerate(along)]
+    plot = new_figure(330, x_axis_type="log" if logarithmic else "linear", x_range=_reach(every, drawn, logarithmic))
+    _name_axes(plot, axis_name(picture.x, picture.names), column_words(picture.y, picture.names))
+    if not picture.numeric:
+        _name_values(plot.xaxis, [shorten(label, 12) for label in labels])
+        plot.xgrid.grid_line_color = None
+    points: dict[str, list[Any]] = {key: [] for key in ("x", "value", "words")}
+    hovered = []
+    low, high = _span(picture)
+    for number, (series, true, beside) in enumerate(zip(chosen, along, drawn, strict=True)):
+        order = np.argsort(true, kind="stable")
+        places = [series.places[i] for i in order]
+        words = [_place_words(picture, series, place) for place in places]
+        data: dict[str, Any] = {
+            "second": [value_text(series.values[0][1]) if series.values else ""] * len(places),
+            "x": true[order],
+            "beside": beside[order],
+            "words": words,
+            **{key: _column(places, key) for key in ("value", "low", "high", "predicted", "reference")},
+            "known": [value_text(place.x) for place in places],
+            "shown": [_value_words(place) for place in places],
+            "expected": [number_text(place.predicted if picture.measured else place.reference) for place in places],
+        }
+        hovered.append(_series(plot, picture, ColumnDataSource(data), number))
+        there = ~np.isnan(data["value"])
+        lost = ColumnDataSource(
+            {
+                "x": data["x"][~there],
+                "y": np.full((~there).sum(), low),
+                "words": [words[i] for i in np.flatnonzero(~there)],
+            }
+        )
+        if len(lost.data["words"]):
+            crosses = plot.scatter("x", "y", source=lost, marker="x", size=9, color=BLACK, line_width=2)
+            plot.add_tools(HoverTool(renderers=[crosses], tooltips=[("", "@words")]))
+        points["x"] += data["beside"].tolist()
+        points["value"] += [value if known else low for value, known in zip(data["value"].tolist(), there, strict=True)]
+        points["words"] += words
+    rows = [(key_words(picture.x, picture.names), "@known"), (_result_words(picture), "@shown")]
+    if picture.measured:
+        rows.append(("predicted", "@expected"))
+    elif any(place.reference is not None for series in chosen for place in series.places):
+        rows.append((LAW_NAMES["continuous"], "@expected"))
+    if chosen[0].values:
+        rows.insert(0, (key_words(chosen[0].values[0][0], picture.names), "@second"))
+    plot.add_tools(HoverTool(renderers=hovered, tooltips=rows))
+    plot.y_range = Range1d(low, high)
+    _add_focus(plot, points, name)
+    return plot
+
+
+def _series(plot: Any, picture: Picture, source: ColumnDataSource, number: int) -> Any:
+    """Draw one series; the points that show values under the pointer."""
+    colour, marker = LINES[number], list(MARKERS)[number]
+    if picture.measured:
+        plot.line("x", "predicted", source=source, color=colour, line_width=1.5)
+        whisker = Whisker(source=source, base="beside", lower="low", upper="high", line_color=colour, level="glyph")
+        whisker.line_width = 1.5
+        whisker.upper_head.size = whisker.lower_head.size = 5
+        whisker.upper_head.line_color = whisker.lower_head.line_color = colour
+        plot.add_layout(whisker)
+    else:
+        plot.line("x", "value", source=source, color=colour, line_width=1.8)
+        plot.line("x", "reference", source=source, color=colour, line_dash="dashed")
+    return plot.scatter(
+        "beside" if picture.measured else "x",
+        "value",
+        source=source,
+        marker=marker,
+        size=7,
+        color=colour,
+    )
+
+
+def dashed(picture: Picture) -> bool:
+    """Whether a figure has a dashed line: of a reference at two places of a line that is drawn, or more."""
+    drawn = [series for panel in panels(picture)[:MOST_PANELS] for series in _some(panel.series)]
+    return not picture.measured and any(
+        sum(place.reference is not None for place in series.places) > 1 for series in drawn
+    )
+
+
+def by_factors(picture: Picture) -> bool:
+    """Whether the colours of its heat maps are on a logarithmic scale: results > 0 that differ much."""
+    known = [place.value for series in picture.series for place in series.places if place.value is not None]
+    return bool(known) and min(known) > 0 and max(known) / min(known) >= _WIDE
+
+
+def heat_map(picture: Picture, panel: Panel, name: str) -> UIElement:
+    """Values over two keys; cells without a result have a cross; ``name`` for the page."""
+    second = panel.series[0].values[0][0]
+    columns = list(dict.fromkeys(show(place.x) for series in picture.series for place in series.places))
+    across = {show(place.x): _short(place.x) for series in picture.series for place in series.places}
+    down = [value_text(series.values[0][1]) for series in panel.series]
+    known = [place.value for series in picture.series for place in series.places if place.value is not None]
+    low, high = (min(known), max(known)) if known else (0.0, 1.0)
+    mapper = (LogColorMapper if by_factors(picture) else LinearColorMapper)(
+        palette=interp_palette(SCALE, 255), low=low, high=high if high > low else low + 1.0,
+        nan_color="rgba(0, 0, 0, 0)", tags=[interp_palette(DARK_SCALE, 255)],
+    )  # fmt: skip
+    cells: dict[str, list[Any]] = {
+        key: [] for key in ("x", "y", "value", "words", "text", "along", "second", "shown", "expected")
+    }
+    for row, series in enumerate(panel.series):
+        for place in series.places:
+            cells["x"].append(columns.index(show(place.x)))
+            cells["y"].append(row)
+            cells["value"].append(math.nan if place.value is None else place.value)
+            cells["words"].append(_place_words(picture, series, place))
+            cells["text"].append("×" if place.value is None else f"{place.value:.3g}")
+            cells["along"].append(value_text(place.x))
+            cells["second"].append(down[row])
+            cells["shown"].append(_value_words(place))
+            cells["expected"].append(number_text(place.predicted if picture.measured else place.reference))
+    if len(columns) > _NUMBERED:  # no room for numbers
+        cells["text"] = ["×" if text == "×" else "" for text in cells["text"]]
+    plot = new_figure(
+        100 + int(np.clip(34 * len(down), 200, 420)), "box_zoom,pan,wheel_zoom,reset,save",
+        x_range=Range1d(-0.5, len(columns) - 0.5), y_range=Range1d(-0.5, len(down) - 0.5),
+    )  # fmt: skip
+    plot.grid.grid_line_color = None
+    _name_axes(plot, axis_name(picture.x, picture.names), axis_name(second, picture.names).replace(" [", "\n["))
+    _name_values(plot.xaxis, [across[column] for column in columns])
+    _name_values(plot.yaxis, [_short(series.values[0][1]) for series in panel.series])
+    source = ColumnDataSource(cells)
+    drawn = plot.rect(
+        "x",
+        "y",
+        1,
+        1,
+        source=source,
+        fill_color={"field": "value", "transform": mapper},
+        line_color=GREY,
+        line_width=0.5,
+    )
+    if any(cells["text"]):
+        plot.text(
+            "x", "y", "text", source=source, text_color=BLACK, text_align="center", text_baseline="middle",
+            text_font={"value": SANS}, text_font_size="11px",
+        )  # fmt: skip
+    rows = [(key_words(picture.x, picture.names), "@along"), (key_words(second, picture.names), "@second")]
+    rows.append((_result_words(picture), "@shown"))
+    if picture.measured:
+        rows.append(("predicted", "@expected"))
+    plot.add_tools(HoverTool(renderers=[drawn], tooltips=rows))
+    bar = ColorBar(color_mapper=mapper, height=8, label_standoff=5, border_line_color=None, padding=3)
+    bar.major_label_text_font, bar.major_label_text_color, bar.background_fill_color = SANS, INK, None
+    plot.add_layout(bar, "above")
+    _add_focus(plot, {key: cells[key] for key in ("x", "value", "words")} | {"value": cells["y"]}, name)
+    return plot
+
+
+def _some(series: Sequence[Series]) -> list[Series]:
+    """At most MOST_LINES of them, the first and the last included."""
+    places = np.unique(np.linspace(0, len(series) - 1, min(len(series), MOST_LINES)).round().astype(int))
+    return [series[place] for place in places]
+
+
+def _along(picture: Picture, series: Series, labels: Sequence[str]) -> FloatArray:
+    """Places of a series along the axis: numbers, or the numbers of the values, from 0."""
+    return np.array(
+        [float(place.x) if picture.numeric else labels.index(show(place.x)) for place in series.places], dtype=float
+    )
+
+
+def _reach(every: FloatArray, drawn: Sequence[FloatArray], logarithmic: bool) -> Range1d:
+    """All places and a margin."""
+    every = np.concatenate([every, *drawn])
+    ends = np.array([every.min(), every.max()])
+    if logarithmic:
+        ends = np.log(ends)
+    margin = 0.04 * float(ends[1] - ends[0]) or 0.5
+    ends = ends + np.array([-margin, margin])
+    return Range1d(*(np.exp(ends) if logarithmic else ends).tolist())
+
+
+def _span(picture: Picture) -> tuple[float, float]:
+    """Ends of the vertical axis: all panels have the same."""
+    numbers = [
+        number
+        for series in picture.series
+        for place in series.places
+        for number in (place.value, place.low, place.high, place.predicted, place.reference)
+        if number is not None
+    ]
+    low, high = (min(numbers), max(numbers)) if numbers else (0.0, 1.0)
+    margin = 0.08 * (high - low) or 0.5
+    return low - margin, high + margin
+
+
+def _name_axes(plot: Any, across: str, up: str) -> None:
+    plot.xaxis.axis_label, plot.yaxis.axis_label = PlainText(text=across), PlainText(text=up)
+
+
+def _name_values(axis: Any, labels: Sequence[str]) -> None:
+    """Write values at 0, 1, …: all, or some of many."""
+    ticks = list(range(0, len(labels), math.ceil(len(labels) / _TICKS)))
+    axis.ticker = FixedTicker(ticks=ticks, tags=["values", ticks])
+    axis.major_label_overrides = {tick: PlainText(text=labels[tick]) for tick in ticks}
+
+
+def _short(value: Any) -> str:
+    """A value beside an axis."""
+    return f"{value:.3g}" if isinstance(value, float) else shorten(show(value), 12)
+
+
+def _add_focus(plot: Any, points: dict[str, list[Any]], name: str) -> None:
+    """Points that the arrow keys visit, and a ring around the present one; both are found by name."""
+    plot.tags = [ColumnDataSource(points, name=f"{name} points")]
+    ring = ColumnDataSource({"x": [], "value": []}, name=f"{name} ring")
+    plot.scatter("x", "value", source=ring, size=18, fill_color=None, line_color=BLACK, line_width=2.5)
+
+
+def _column(places: Sequence[Place], key: str) -> FloatArray:
+    return np.array([getattr(place, key) for place in places], dtype=float)  # None: nan
+
+
+def _result_words(picture: Picture) -> str:
+    return "measured" if picture.measured else column_words(picture.y, picture.names)
+
+
+def _value_words(place: Place) -> str:
+    """A result with its interval, or why there is none."""
+    if place.value is None:
+        return f"no result: {place.reason or 'not done'}"
+    return measured_text(place.value, (place.low, place.high))
+
+
+def _place_words(picture: Picture, series: Series, place: Place) -> str:
+    """All of a point in one line."""
+    text = f"{picture.words([(picture.x, place.x), *series.values])}: {_value_words(place)}"
+    if picture.measured and place.predicted is not None:
+        text += f", predicted {number_text(place.predicted)}"
+    if place.reference is not None:
+        text += f", {LAW_NAMES['continuous']} {number_text(place.reference)}"
+    return text

@@ -1,0 +1,282 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Predictions, leaders, transients, facts, plans and spectra as terminal tables, from the documents of ``--json``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.text import Text
+
+from msg_analysis.common.text import agent_name, agent_text, duration_text, listed, number_text, p_text, percent, z_text
+from msg_analysis.report.tables import fact_table, first_rows, interval_text, number_table, print_table
+from msg_analysis.theory.prediction import LAW_NAMES
+
+_METHODS = {
+    "exhaustive": "exhaustive search",
+    "greedy": "greedy selection",
+    "swap": "greedy selection with exchanges",
+}
+
+
+def print_prediction(document: dict[str, Any], console: Console) -> None:
+    """Print the steady errors of every predicted law, and the share of time of every graph."""
+    laws = {
+        LAW_NAMES["sequential"] if document[key].get("law") == "sequential" else LAW_NAMES[key]: document[key]
+        for key in LAW_NAMES
+        if document.get(key) is not None
+    }
+    errors = number_table(console, "Mean-square error in the steady state", "", *laws)
+    errors.add_row("system", *(number_text(law["system_error"]) for law in laws.values()), end_section=True)
+    for agent in first_rows(errors, range(document["agents"]), "agents"):
+        name = Text(agent_text(agent + 1, document.get("names")))
+        errors.add_row(name, *(number_text(law["node_errors"][agent]) for law in laws.values()))
+    errors.add_section()
+    errors.add_row("certainty", *(number_text(law["system_certainty"]) for law in laws.values()))
+    console.print(errors)
+    modes = number_table(console, "Graphs", "graph", "share of time")
+    for name, share in zip(document["modes"], document["stationary"], strict=True):
+        modes.add_row(Text(name), number_text(share))
+    console.print(modes)
+    for key, title in LAW_NAMES.items():
+        if key in document and document[key] is None:
+            console.print(f"{title}: not finite, or not defined with this noise", style="dim")
+    for line in tails_words(document):
+        console.print(Text(line, style="yellow"))
+
+
+def tails_words(document: dict[str, Any]) -> list[str]:
+    """What follows from the fourth moments of a prediction, in sentences; empty where they are finite."""
+    fourth = document["fourth_moment"]
+    if fourth["finite"]:
+        return []
+    what = "Whether the fourth moments of the states are finite is not known"
+    if fourth["finite"] is False:
+        grow = number_text(fourth["lower"], 3)
+        least = "" if fourth["radius"] is not None else "at least "
+        what = f"The fourth moments of the states are infinite: they grow {least}{grow} times per step"
+    return [
+        f"{what}. Then most runs measure less than these errors, which rare large values make, and a run's errors over "
+        "all paths of the graphs have no standard error. A smaller run.dt helps."
+    ]
+
+
+def _named(entry: dict[str, Any], document: dict[str, Any]) -> str:
+    return listed([agent_name(agent, document.get("names")) for agent in entry["agents"]])
+
+
+def print_leaders(document: dict[str, Any], console: Console) -> None:
+    """Print a document of ``Selection.to_json()``: the best sets of leaders, and how good the first is."""
+    gain = "held at the reference" if document["gain"] == "inf" else f"gain {document['gain']:g}"
+    law = LAW_NAMES[document["law"]]
+    what = "Single leaders" if document["count"] == 1 else f"Sets of {document['count']} leaders"
+    title = f"{what}, {gain}, {law}"
+    centrality = "joint centrality" if document["gain"] == "inf" else "certainty"
+    table = number_table(console, title, "agents", "system error", centrality)
+    for entry in first_rows(table, document["sets"], "sets"):
+        row = (
+            Text(_named(entry, document)),
+            number_text(entry["system_error"]),
+            number_text(entry["joint_centrality"]),
+        )
+        table.add_row(*row)
+    print_table(console, table)
+    facts = fact_table(console, f"Method: {_METHODS[document['method']]}")
+    facts.add_row("system errors computed", str(document["evaluations"]))
+    bound, gap = document["bound"]["system_error"], document["bound"]["gap"]
+    if gap is not None and gap < 1e-8:
+        facts.add_row("guarantee", "no better set exists")
+    elif bound is not None:
+        above = "" if gap is None else f": this one is at most {100 * gap:.3g} % above the best"
+        facts.add_row("guarantee", f"every set has at least {number_text(bound)}{above}")
+    else:
+        facts.add_row("guarantee", f"none: {document['note']}")
+    if present := document["present"]:
+        facts.add_row(Text(f"leaders now: {_named(present, document)}"), number_text(present["system_error"]))
+    console.print(facts)
+
+
+def print_transient(document: dict[str, Any], console: Console) -> None:
+    """Print the system error over time with the law of the graph; settling time and rates."""
+    key = "system_second_moment" if document["unreduced"] else "system_error"
+    title = f"Transient from the start of the run, {LAW_NAMES[document['law']]}"
+    columns = [key.replace("_", " ")]
+    few = len(document["modes"]) <= 6
+    if few:
+        columns += [f"P({name})" for name in document["modes"]]
+    table = number_table(console, title, "time", *columns)
+    rows = list(zip(document["times"], document[key], document["graph_law"], strict=True))
+    for time, error, law in first_rows(table, rows, "times", "--json or --csv"):
+        table.add_row(number_text(time), number_text(error), *map(number_text, law if few else []))
+    print_table(console, table)
+    settling, rates = document["settling"], document["rates"]
+    share = f"{100 * settling['fraction']:g} %"
+    facts = fact_table(console, "Steady state and rates")
+    facts.add_row("system error in the steady state", number_text(document["steady_system_error"]))
+    facts.add_row(f"settling time ({share}), from this start", number_text(settling["from_start"]))
+    facts.add_row(f"settling time ({share}), from zero", number_text(settling["from_zero"]))
+    facts.add_row("decay rate of means", number_text(rates["mean"]))
+    facts.add_row("decay rate of second moments", number_text(rates["second_moment"]))
+    facts.add_row("decay rate of graph probabilities", number_text(rates["graph"]))
+    console.print(facts)
+
+
+def print_facts(document: dict[str, Any], console: Console) -> None:
+    """Print the lemmas, the bounds, the indices of the graphs, and the closed form of two graphs."""
+    if document["facts"]:
+        _print_lemmas(document["facts"], console)
+    bounds = document["bounds"]
+    if bounds["lower"] is None and bounds["upper"] is None:
+        console.print(Text(f"No bounds of the system error: {bounds['note']}", style="dim"))
+    else:
+        console.print(Text("Bounds of the system error for all switching rates", style="bold"))
+        console.print(
+            Text(f"  {number_text(bounds['lower'])} <= E <= {number_text(bounds['upper'])}   ({bounds['note']})")
+        )
+    _print_graphs(document, console)
+    for law, form in (document["two_topology"] or {}).items():
+        _print_form(law, form, document.get("names"), console)
+    for note in document["notes"]:
+        console.print(Text(note, style="yellow"))
+
+
+def _print_lemmas(facts: list[dict[str, Any]], console: Console) -> None:
+    table = number_table(console, "Eigenvalues of the paper's matrices", "matrix")
+    table.add_column("lemma (corrected)", overflow="fold")
+    for heading in ("count", "others", ""):
+        table.add_column(heading, justify="right")
+    for fact in facts:
+        holds = Text("holds", style="green") if fact["holds"] else Text("does not hold", style="bold red")
+        table.add_row(fact["name"], fact["statement"], str(fact["multiplicity"]), number_text(fact["others"]), holds)
+    print_table(console, table)
+
+
+def _print_graphs(document: dict[str, Any], console: Console) -> None:
+    shown = [entry for entry in document["graphs"] if entry]
+    if not shown:
+        return
+    table = number_table(console, "Undirected connected graphs", "graph")
+    table.add_column("Kirchhoff index", justify="right")
+    first = ", ".join(agent_name(agent, document.get("names")) for agent in (1, 2))
+    table.add_column(Text(f"information centrality of agents {first}, ..."), overflow="fold")
+    for entry in shown:
+        centrality = entry["information_centrality"]
+        values = listed([number_text(value) for value in centrality])
+        table.add_row(Text(entry["name"]), number_text(entry["kirchhoff_index"]), values)
+    print_table(console, table)
+
+
+def _print_form(law: str, form: dict[str, Any], names: Sequence[str] | None, console: Console) -> None:
+    title = f"Two graphs in closed form, {LAW_NAMES[law]}, beta = {number_text(form['rate'])}"
+    table = number_table(console, title, "", "static", "switching adds", "error", "fastest adds")
+    keys = ("static", "switching", "error", "fast")
+    table.add_row("system", *(number_text(form["system"][key]) for key in keys), end_section=True)
+    rows = [
+        # Rounding errors, for agents for which nothing changes.
+        [0.0 if abs(value) < 1e-14 * abs(row[0]) else value for value in row]
+        for row in zip(*(form["nodes"][key] for key in keys), strict=True)
+    ]
+    for agent, row in enumerate(first_rows(table, rows, "agents"), start=1):
+        table.add_row(Text(agent_text(agent, names)), *map(number_text, row))
+    print_table(console, table)
+
+
+def print_plan(document: dict[str, Any], console: Console) -> None:
+    """Print a document of ``RunPlan.to_json()``: the run of the file, lengths for the precision, power for faults."""
+    rate, sought = document["rate"], percent(document["precision"])
+    facts = fact_table(console, f"Plan of {document['experiment']}")
+    facts.add_row("predicted system error", number_text(document["system_error"]))
+    facts.add_row("run of the file", _run_text(document["file"]))
+    if document["budget"]:
+        budget = document["budget"]
+        facts.add_row(f"best run in {duration_text(budget['time'])}", _run_text(budget))
+    if document["warm_up"]:
+        facts.add_row("warm-up", f"{document['warm_up']} steps, in every length below")
+    if rate:
+        facts.add_row("speed", f"{number_text(rate)} steps per second")
+    else:
+        facts.add_row("speed", "not known: --speed gives the wall time")
+    console.print(facts)
+    table = number_table(
+        console,
+        f"Length for a 95 % interval of ± {sought} of the system error, at one time and at all times",
+        "replicas",
+        *("steps", "duration", "wall time"),
+        *("steps, all times", "wall time, all times"),
+    )
+    table.columns[0].justify = "right"
+    for row in document["lengths"]:
+        table.add_row(
+            str(row["replicas"]),
+            _count(row["steps"]),
+            number_text(row["duration"]),
+            _time(row["wall_time"]),
+            _count(row["any_time_steps"]),
+            _time(row["any_time_wall_time"]),
+        )
+    print_table(console, table)
+    steps = document["file"]["steps"]
+    title = f"Faults, and the power of the tests in {steps} steps, level {percent(document['level'])}"
+    table = number_table(console, title, "fault", "power", "steps for 99 %", "steps, any time")
+    for row in document["faults"]:
+        table.add_row(Text(row["fault"]), percent(row["power"]), _count(row["steps"]), _count(row["any_time_steps"]))
+    if document["faults"]:
+        print_table(console, table)
+    for note in document["notes"]:
+        console.print(Text(f"Note: {note}", style="yellow"))
+
+
+def _run_text(run: dict[str, Any]) -> str:
+    text = f"{run['steps']} steps, replicas {run['replicas']}"
+    if run["wall_time"] is not None:
+        text += f", {duration_text(run['wall_time'])}"
+    if not math.isfinite(run["half_width"]):
+        return f"{text}: ends before the effect of the start does"
+    text += f": ± {percent(run['half_width'])} (95 %)"
+    uniform = run["any_time_half_width"]
+    return text if uniform is None else f"{text}, ± {percent(uniform)} at all times"
+
+
+def _time(seconds: float | None) -> str:
+    return "-" if seconds is None else duration_text(seconds)
+
+
+def _count(steps: float | None) -> str:
+    return "-" if steps is None else f"{steps:.0f}"
+
+
+def print_spectrum(document: dict[str, Any], console: Console) -> None:
+    """Print a document of ``MeasuredSpectrum.to_json()``: some lags and frequencies, and the test of a log."""
+    lags = number_table(console, f"Autocovariance of {document['experiment']}", "lag", "system", "correlation")
+    course, error = document["system_autocovariance"], document["system_error"]
+    for place in _some(len(course)):
+        share = "-" if not error else number_text(course[place] / error, 3)
+        lags.add_row(number_text(document["lags"][place]), number_text(course[place]), share)
+    console.print(lags)
+    density = number_table(console, "Spectral density, one-sided", "frequency", "system")
+    for place in _some(len(document["frequencies"])):
+        density.add_row(number_text(document["frequencies"][place], 3), number_text(document["system_density"][place]))
+    console.print(density)
+    log = document["log"]
+    if log:
+        heads = ("predicted", "measured", "corrected for the path", "95 % interval", "z")
+        table = number_table(console, f"The log, {log['steps']} steps", "lag", *heads)
+        keys = ("lags", "predicted", "measured", "corrected", "intervals", "z")
+        for lag, *numbers, interval, z in zip(*(log[key] for key in keys), strict=True):
+            cells = (*map(number_text, numbers), interval_text(interval), z_text(z))
+            table.add_row(number_text(lag), *cells)
+        print_table(console, table)
+        if log["p"] is not None:
+            verdict = "agrees with" if log["p"] >= document["level"] else "disagrees with"
+            console.print(f"The log {verdict} the predicted autocovariance: p = {p_text(log['p'])}.")
+    if document["note"]:
+        console.print(Text(f"Note: {document['note']}", style="yellow"))
+
+
+def _some(count: int, most: int = 12) -> list[int]:
+    """Places of some of so many rows, at equal distances."""
+    return sorted({round(k * (count - 1) / (most - 1)) for k in range(most)}) if count else []

@@ -1,0 +1,371 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The runs in a folder: found, filtered, with their results."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime, timedelta
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, Literal
+
+from msg_analysis.bags.files import METADATA_FILE, first_file, starting_time
+from msg_analysis.bags.mcap_chunks import BAG_SUFFIXES
+from msg_analysis.common.files import REPORT_FILE, RESULT_FILE, read_text
+from msg_analysis.common.text import HALF_WIDTH_95, agent_name, with_names
+from msg_analysis.errors import BagError, InputError
+
+_WANTED = "expected what `msg-analysis compare --json` or `msg-agents run` wrote"
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """A row: one saved comparison; None where it has no such number."""
+
+    file: str
+    experiment: str
+    seeds: str  # of all runs: "1 2"
+    bags: int  # number of runs
+    leaders: str  # names, or numbers from 1: "3" or "1 4"; empty without
+    verdict: str
+    simulated_time: float  # of all runs [units of simulated time]
+    measured: float | None  # system error, like the next five
+    standard_error: float | None
+    low: float | None  # to high: the 95 % interval
+    high: float | None
+    predicted: float | None
+    z: float | None
+    least_p: float | None  # least adjusted p of the tests
+    blame: str  # causes, separated by "; "; empty where nothing is wrong
+    identity: str | None  # equal for runs of the same law
+
+
+def read_result(path: Path) -> Result:
+    """Read a saved result, from a file or the directory of a run; InputError if it is not there or not a result."""
+    return result_row(path, read_document(path))
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """The document of a saved result, which only ``result_row`` checks; arguments and errors as of ``read_result``."""
+    file = _file(path)
+    try:
+        document = json.loads(read_text(file))
+    except OSError as error:
+        raise InputError(f"{file}: {error.strerror}: {_WANTED}") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{file}: not JSON ({error}): {_WANTED}") from error
+    if not isinstance(document, dict):
+        raise InputError(f"{file}: not a JSON object: {_WANTED}")
+    return document
+
+
+def _file(path: Path) -> Path:
+    return path / RESULT_FILE if path.is_dir() else path
+
+
+def result_row(path: Path, document: dict[str, Any]) -> Result:
+    """The row of a document of ``read_document``; InputError if it is not a result."""
+    file = _file(path)
+    total = _part(document, "system_error", dict, file)
+    interval = total.get("interval")
+    if not isinstance(interval, list) or len(interval) != 2:
+        raise InputError(f"{file}: system_error.interval: {interval!r}: {_WANTED}")
+    bags = _parts(document, "bags", file)
+    seeds = [run.get("seed") for run in bags or [document]]
+    tests = [_number(test, "p_adjusted", file) for test in _parts(document, "tests", file)]
+    given = document.get("names")
+    names = list(map(str, given)) if isinstance(given, list) else None
+    blame = [with_names(str(cause.get("words")), names) for cause in _parts(document, "blame", file)]
+    leaders = document.get("leaders")
+    identity = document.get("experiment_identity")
+    return Result(
+        file=str(path),
+        experiment=_part(document, "experiment", str, file),
+        seeds=" ".join(str(seed) for seed in seeds if seed is not None),
+        bags=len(bags) or 1,
+        leaders=" ".join(_leader(leader, names) for leader in leaders) if isinstance(leaders, list) else "",
+        verdict=_part(document, "verdict", str, file),
+        simulated_time=_number(document, "simulated_time", file) or 0.0,
+        measured=_number(total, "measured", file),
+        standard_error=_number(total, "standard_error", file),
+        low=_number({"interval": interval[0]}, "interval", file),
+        high=_number({"interval": interval[1]}, "interval", file),
+        predicted=_number(total, "predicted", file),
+        z=_number(total, "z", file),
+        least_p=min((p for p in tests if p is not None), default=None),
+        blame="; ".join(blame),
+        identity=identity if isinstance(identity, str) else None,
+    )
+
+
+def _part(document: dict[str, Any], key: str, kind: type, file: Path) -> Any:
+    value = document.get(key)
+    if not isinstance(value, kind):
+        raise InputError(f"{file}: {key}: {value!r}: expected that of a result of `msg-analysis compare --json`")
+    return value
+
+
+def _parts(document: dict[str, Any], key: str, file: Path) -> list[dict[str, Any]]:
+    """The objects of a list; none where it is null or not there."""
+    value = document.get(key) or []
+    if not isinstance(value, list) or not all(isinstance(part, dict) for part in value):
+        raise InputError(f"{file}: {key}: expected a list of objects, as `msg-analysis compare --json` writes it")
+    return value
+
+
+def _number(document: Any, key: str, file: Path) -> float | None:
+    value = document.get(key) if isinstance(document, dict) else document
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{file}: {key}: {value!r}: expected a number")
+    return float(value)
+
+
+def tested_error(document: dict[str, Any], file: Path) -> dict[str, float | None] | None:
+    """The system error of a document with the standard error that tests use; None where it has none.
+
+    In runs that are too short for one over all paths of the graphs, that is the one given the path; then the measured
+    error is corrected for the path. Keys: ``measured``, ``standard_error``, ``predicted``.
+    """
+    given = document.get("given_path")
+    for part in (document, given if isinstance(given, dict) else {}):
+        error = part.get("system_error")
+        if isinstance(error, dict) and error.get("standard_error") is not None:
+            return {key: _number(error, key, file) for key in ("measured", "standard_error", "predicted")}
+    return None
+
+
+def _leader(leader: object, names: Sequence[str] | None) -> str:
+    return agent_name(leader, names) if isinstance(leader, int) else str(leader)
+
+
+Status = Literal["compared", "not compared", "recording", "torn", "empty", "foreign", "damaged"]
+
+_STAMP = re.compile(r"_(\d{8}_\d{6})(?:_\d+)?$")  # of the folder of a run: its start, by the clock of its machine
+_CLOCKS = 10**18  # ns: a bag that starts earlier, in 2001, has the simulated time of the twin
+_OURS = {"log", ".recording"}  # what a run makes before anything is recorded
+
+
+@dataclass(frozen=True, slots=True)
+class RunEntry:
+    """A folder of a run; None where it has no such thing.
+
+    The system error is that of the saved result, with the standard error that tests use (``given_path``: given the path
+    of the graphs).
+    """
+
+    folder: str
+    status: Status
+    date: datetime  # of the start, in local time
+    problem: str | None = None  # why the folder is foreign or damaged
+    name: str | None = None  # of the experiment
+    seed: int | None = None
+    run: str | None = None  # id
+    verdict: str | None = None
+    simulated_time: float | None = None  # that was compared
+    measured: float | None = None
+    standard_error: float | None = None
+    low: float | None = None  # to high: the 95 % interval
+    high: float | None = None
+    predicted: float | None = None
+    z: float | None = None
+    given_path: bool = False
+    report: str | None = None  # file
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of one run."""
+        return asdict(self) | {"date": self.date.isoformat(timespec="seconds")}
+
+
+def list_runs(folder: Path) -> list[RunEntry]:
+    """The runs in a folder, oldest first: each of its folders, whatever is in it.
+
+    InputError: it is not there, not a folder, or a bag itself.
+    """
+    try:
+        with os.scandir(folder) as entries:
+            inside = list(entries)
+    except NotADirectoryError as error:
+        raise InputError(f"{folder}: a file: expected a folder with the folders of runs in it") from error
+    except OSError as error:
+        raise InputError(
+            f"{folder}: {error.strerror}: expected a folder with the folders of runs in it, as `msg-agents run --out` "
+            "makes it"
+        ) from error
+    if any(entry.name == METADATA_FILE or entry.name.endswith(BAG_SUFFIXES) for entry in inside):
+        raise InputError(f"{folder}: a bag: give the folder it is in: {folder.absolute().parent}")
+    inner = (Path(entry) for entry in inside if entry.is_dir() and not entry.name.startswith("."))
+    return sorted(map(_entry, inner), key=lambda entry: (entry.date, entry.folder))
+
+
+def _entry(folder: Path) -> RunEntry:
+    try:
+        names = {entry.name for entry in folder.iterdir()}
+        date = _date(folder, names)
+    except OSError as error:
+        return RunEntry(str(folder), "damaged", datetime.now().astimezone(), error.strerror)
+    report = str(folder / REPORT_FILE) if REPORT_FILE in names else None
+    problem = None
+    if RESULT_FILE in names:
+        try:
+            return _compared(folder, date, report)
+        except InputError as error:
+            problem = str(error)
+    status, found = _recorded(folder, names)
+    if problem:
+        status, found = "damaged", found | {"problem": problem}
+    return RunEntry(str(folder), status, date, report=report, **found)
+
+
+def _date(folder: Path, names: set[str]) -> datetime:
+    """When the run began: by the name of its folder, its record, its bag, or when the bag was last changed."""
+    stamp = _STAMP.search(folder.name)
+    if stamp:
+        try:
+            return datetime.strptime(stamp[1], "%Y%m%d_%H%M%S").astimezone()
+        except ValueError:  # no date
+            pass
+    from msg_analysis.bags.reading import started  # here: where all folders have dates, no bag is touched
+
+    if (recorded := started(folder)) is not None:
+        return recorded.astimezone()
+    start = starting_time(folder) if METADATA_FILE in names else None
+    if start is not None and start > _CLOCKS:
+        return datetime.fromtimestamp(start / 1e9, UTC).astimezone()
+    return datetime.fromtimestamp((first_file(folder) or folder).stat().st_mtime).astimezone()
+
+
+def _compared(folder: Path, date: datetime, report: str | None) -> RunEntry:
+    """By the saved result; InputError: it cannot be used."""
+    document = read_document(folder)
+    row = result_row(folder, document)
+    tested = tested_error(document, folder / RESULT_FILE)
+    given = tested is not None and row.standard_error is None
+    measured = tested["measured"] if tested else row.measured
+    error = tested["standard_error"] if tested else None
+    predicted = tested["predicted"] if tested else row.predicted
+    known = measured is not None and error is not None
+    half = HALF_WIDTH_95 * error if error is not None else 0.0
+    return RunEntry(
+        str(folder),
+        "compared",
+        date,
+        name=row.experiment,
+        seed=_whole(document.get("seed")),
+        run=_text(document.get("run")),
+        verdict=row.verdict,
+        simulated_time=row.simulated_time,
+        measured=measured,
+        standard_error=error,
+        low=measured - half if known and measured is not None else None,
+        high=measured + half if known and measured is not None else None,
+        predicted=predicted,
+        z=(measured - predicted) / error if measured is not None and predicted is not None and error else None,
+        given_path=given,
+        report=report,
+    )
+
+
+def _recorded(folder: Path, names: set[str]) -> tuple[Status, dict[str, Any]]:
+    """Status of a folder without a result, and what its run record says."""
+    from msg_analysis.bags.writing import recording_pid  # here: where all runs have results, no bag is touched
+
+    recording = recording_pid(folder) is not None
+    if not any(name.endswith(BAG_SUFFIXES) for name in names):
+        if recording:
+            return "recording", {}
+        return ("empty", {}) if names <= _OURS else ("foreign", {"problem": "no bag"})
+    status: Status = "recording" if recording else "not compared" if METADATA_FILE in names else "torn"
+    from msg_analysis.bags.reading import record_document
+
+    try:
+        document = record_document(folder)
+        experiment = document["experiment"]
+        found = {"name": experiment["name"], "seed": experiment["run"]["seed"], "run": document["run"]}
+        if not isinstance(found["name"], str):
+            raise TypeError
+    except BagError as error:
+        return (status if recording else "foreign"), {"problem": str(error)}
+    except InputError as error:
+        return "damaged", {"problem": str(error)}
+    except (KeyError, TypeError):
+        return "damaged", {"problem": f"{folder}: its run record has no name, seed or id"}
+    return status, found | {"seed": _whole(found["seed"]), "run": _text(found["run"])}
+
+
+def _whole(value: Any) -> int | None:
+    return value if isinstance(value, int) and not isinstance(value, bool) else None
+
+
+def _text(value: Any) -> str | None:
+    return value if isinstance(value, str) else None
+
+
+SortKey = Literal["date", "name", "seed", "verdict", "error"]
+NO_VERDICT = "none"
+
+_AGE = re.compile(r"(\d{1,6})([mhd])")
+_UNITS = {"m": "minutes", "h": "hours", "d": "days"}
+_SORT_KEYS: dict[SortKey, Callable[[RunEntry], Any]] = {
+    "date": lambda run: (run.date, run.folder),
+    "name": lambda run: (run.name is None, run.name),
+    "seed": lambda run: (run.seed is None, run.seed),
+    "verdict": lambda run: (run.verdict is None, run.verdict),
+    "error": lambda run: math.inf if run.measured is None else run.measured,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RunFilter:
+    """What a run must have; empty or None: anything."""
+
+    name: str | None = None  # of the experiment, or a pattern such as line_*
+    verdicts: tuple[str, ...] = ()  # one of them; ``NO_VERDICT``: none
+    since: datetime | None = None
+    until: datetime | None = None  # not included
+    seed: int | None = None
+    last: int | None = None  # how many at most: the newest
+
+    def choose(self, runs: Sequence[RunEntry], sort: SortKey = "date") -> list[RunEntry]:
+        """Those that have it, sorted; runs without the key come last, equal ones are in the order of their dates."""
+        chosen = sorted(filter(self._has, runs), key=_SORT_KEYS["date"])
+        if self.last is not None:
+            chosen = chosen[max(0, len(chosen) - self.last) :]
+        return sorted(chosen, key=_SORT_KEYS[sort])
+
+    def _has(self, run: RunEntry) -> bool:
+        return (
+            (self.name is None or (run.name is not None and fnmatchcase(run.name, self.name)))
+            and (not self.verdicts or (run.verdict or NO_VERDICT) in self.verdicts)
+            and (self.since is None or run.date >= self.since)
+            and (self.until is None or run.date < self.until)
+            and (self.seed is None or run.seed == self.seed)
+        )
+
+
+def moment(text: str, option: str, now: datetime, *, end: bool = False) -> datetime:
+    """A date, a date with a time, or an age before ``now``, as a time with its zone; without one it is local.
+
+    A date alone is its beginning, or with ``end`` its end. InputError: ``text`` of the ``option`` is none of these.
+    """
+    age = _AGE.fullmatch(text)
+    try:
+        if age:
+            return now - timedelta(**{_UNITS[age[2]]: int(age[1])})
+        found = datetime.fromisoformat(text)
+        if end and not re.search(r"[T: ]", text):
+            found += timedelta(days=1)
+        return found if found.tzinfo else found.astimezone()
+    except (ValueError, OverflowError):
+        raise InputError(
+            f"{option} {text}: expected a date (2026-11-25), a date and a time (2026-11-25T14:30), or an age in "
+            "minutes, hours or days (30m, 12h, 7d)"
+        ) from None

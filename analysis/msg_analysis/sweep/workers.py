@@ -1,0 +1,340 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Worker pool: processes of this machine, or a Dask cluster; a worker that dies is replaced.
+
+Items are sent in batches of about half a second of work. What kills workers is tried again alone, then given up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import logging
+import math
+import multiprocessing
+import os
+import signal
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+
+from msg_analysis.common.resources import SINGLE_THREAD, count_cores, one_blas_thread
+from msg_analysis.errors import InputError
+from msg_analysis.sweep.points import installed_software
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+BATCH_SECONDS = 0.5  # s of work per task, next to which the few milliseconds that Dask needs for it do not matter
+MOST_IN_BATCH = 500
+QUEUED = 2  # tasks sent per thread of the workers: one that is worked on, one that is ready after it
+NOTICE = 0.5  # s between two checks of a worker whether the work is being ended
+# Signals that end a sweep as Ctrl-C does: that of a cluster's queue, and that of a terminal that is closed.
+ENDING = (signal.SIGTERM, signal.SIGHUP)
+_CONNECT = 10.0  # s
+# Less of what Dask does besides the work, which costs time on two cores.
+_QUIET = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.admin.tick.interval": "1s",
+}
+_NEEDED = ("msg_analysis.theory.prediction", "msg_analysis.inference.verdict", "msg_analysis.twin.simulate")
+
+# What is done with an item; the second argument says whether the work is being ended.
+Function = Callable[[T, Callable[[], bool]], R]
+
+
+class WorkersLostError(Exception):
+    """The cluster went away in the middle of the work."""
+
+
+class Lost:
+    """In place of a result: the item killed every worker that tried it; ``reason`` is a text for the user."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
+
+
+def warm_up() -> None:
+    """Begin to start the server that workers are forked from: it imports while this process does other things.
+
+    It ignores Ctrl-C, and so do the workers: this process ends them.
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return
+    from multiprocessing import forkserver
+
+    with _environment(SINGLE_THREAD), _ignoring(signal.SIGINT):
+        multiprocessing.get_context("forkserver").set_forkserver_preload(["distributed", *_NEEDED])
+        forkserver.ensure_running()
+
+
+class Workers:
+    """Worker processes of this machine (None: one per CPU), or those of the Dask scheduler at an address.
+
+    To be used with ``with``, which raises InputError where no scheduler answers or its workers have other software.
+    """
+
+    def __init__(self, count: int | None = None, scheduler: str | None = None) -> None:
+        self._count = count or count_cores()
+        self._scheduler = scheduler
+        self._client: Client | None = None
+        self._cluster: Any = None
+        self._stop_name = f"msg-sweep-stop-{uuid.uuid4().hex}"
+
+    def __enter__(self) -> Self:
+        """Start or find the workers."""
+        import dask
+
+        if not self._scheduler:
+            warm_up()
+        import distributed
+
+        # Silence its logs: what matters to the user is raised as an error here.
+        for name in list(logging.root.manager.loggerDict):
+            if name.partition(".")[0] == "distributed":
+                logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+        if self._scheduler:
+            try:
+                self._client = distributed.Client(self._scheduler, timeout=_CONNECT, name="msg-analysis")
+            except (OSError, ValueError, TypeError) as error:
+                reason = str(error).partition(":")[0] if isinstance(error, ValueError) else "no answer"
+                wanted = "expected the address of a Dask scheduler: for example tcp://127.0.0.1:8786"
+                raise InputError(f"--scheduler {self._scheduler}: {reason}: {wanted}") from error
+            self._compare_software()
+            return self
+        method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+        dask.config.set({"distributed.worker.multiprocessing-method": method, **_QUIET})
+        try:
+            with deferring_interrupts():
+                self._cluster = distributed.LocalCluster(
+                    n_workers=self._count,
+                    threads_per_worker=1,
+                    processes=True,
+                    host="127.0.0.1",
+                    dashboard_address="127.0.0.1:0",
+                    scheduler_kwargs={"dashboard": False},
+                    silence_logs=logging.CRITICAL + 1,
+                )
+                self._client = distributed.Client(self._cluster)
+        except KeyboardInterrupt:
+            self._close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        # A second Ctrl-C must not interrupt the orderly end.
+        with _ignoring(signal.SIGINT, signal.SIGTERM), suppress(Exception):
+            if self._client is not None:
+                self._client.close(timeout=5)
+            if self._cluster is not None:
+                self._cluster.close(timeout=20)
+
+    @property
+    def threads(self) -> int:
+        """Items that can be worked on at a time now; 0 where a cluster has no worker yet."""
+        assert self._client is not None
+        return sum(self._client.nthreads().values()) if self._scheduler else self._count
+
+    def outcomes(
+        self, function: Function[T, R], items: Sequence[T], *, patience: float = 2 * NOTICE
+    ) -> Generator[list[tuple[T, R | Lost]], None, None]:
+        """Results of ``function`` (at the top of a module) for all items, in batches, as they are ready.
+
+        An item that kills its workers again when tried alone is ``Lost``. If interrupted, running work has ``patience``
+        [s] to end. WorkersLostError: the scheduler is gone; InputError: other software on a worker.
+        """
+        from distributed import as_completed
+
+        assert self._client is not None
+        pending = deque(items)
+        suspects: deque[T] = deque()
+        running: dict[Future, list[T]] = {}
+        seconds = math.inf
+        done = as_completed()
+        try:
+            while pending or suspects or running:
+                while pending and len(running) < QUEUED * max(self.threads, 1):
+                    self._submit(function, _take(pending, seconds, self.threads), running, done)
+                alone = not running
+                if alone:
+                    self._submit(function, [suspects.popleft()], running, done)
+                future = next(done)
+                batch = running.pop(future)
+                found = self._result(future)
+                if found is not None:
+                    results, took = found
+                    each = took / len(batch)
+                    seconds = each if math.isinf(seconds) else 0.7 * seconds + 0.3 * each
+                    yield list(zip(batch, results, strict=True))
+                elif alone:
+                    yield [(batch[0], Lost("killed every worker that tried it, or used up its memory"))]
+                else:
+                    suspects += batch
+        except BaseException as error:
+            self._stop(list(running), patience)
+            if isinstance(error, OSError | asyncio.CancelledError | concurrent.futures.CancelledError):
+                raise WorkersLostError("the scheduler has gone") from error
+            raise
+
+    def _submit(self, function: Function[T, R], batch: list[T], running: dict[Future, list[T]], done: Any) -> None:
+        assert self._client is not None
+        future = self._client.submit(_do, function, batch, self._stop_name, installed_software(), pure=False)
+        running[future] = batch
+        done.add(future)
+
+    def _result(self, future: Future) -> tuple[list[Any], float] | None:
+        """Results of a batch and the seconds that it took; None where workers died over and over.
+
+        An item of it may have killed them, or one that a worker had at the same time: each is then tried alone.
+        """
+        from distributed import KilledWorker
+
+        assert self._client is not None
+        if future.status == "finished":
+            found: tuple[list[Any], float] = future.result()
+            return found
+        if future.status == "error":
+            error = future.exception()
+            if isinstance(error, KilledWorker):
+                return None
+            if isinstance(error, ModuleNotFoundError | InputError):
+                raise InputError(f"a worker cannot do it: {error}: install the same software there") from error
+            assert error is not None
+            raise error
+        if self._client.status != "running":
+            raise WorkersLostError("the scheduler has gone")
+        return None  # the only worker that had the result died
+
+    def _stop(self, running: Sequence[Future], patience: float) -> None:
+        """Tell the workers to stop, and wait up to ``patience`` seconds for the running batches."""
+        from distributed import Event, wait
+
+        with _ignoring(signal.SIGINT, signal.SIGTERM), suppress(Exception):
+            assert self._client is not None
+            Event(self._stop_name, client=self._client).set()
+            wait(running, timeout=patience)
+
+    def _compare_software(self) -> None:
+        """Refuse workers with other software; those that join later refuse themselves in ``_do``."""
+        assert self._client is not None
+        try:
+            found = self._client.run(installed_software)
+        except ModuleNotFoundError as error:
+            raise InputError(
+                f"--scheduler {self._scheduler}: {error}: install the same software on its workers"
+            ) from error
+        for worker, software in found.items():
+            if software != installed_software():
+                raise InputError(
+                    f"--scheduler {self._scheduler}: worker {worker} has {software}: expected "
+                    f"{installed_software()}: install the same software there"
+                )
+
+
+def _take(pending: deque[T], seconds: float, threads: int) -> list[T]:
+    """As many items as make a batch; fewer towards the end, so that all workers end together."""
+    most = 1 if math.isinf(seconds) else int(BATCH_SECONDS / max(seconds, 1e-9))
+    most = max(1, min(most, MOST_IN_BATCH, len(pending) // (QUEUED * max(threads, 1))))
+    return [pending.popleft() for _ in range(most)]
+
+
+def _do(function: Function[T, R], batch: Sequence[T], stop_name: str, software: str) -> tuple[list[R], float]:
+    """On a worker: do a batch, and time it [s]; one thread of linear algebra, since there is a worker for every CPU."""
+    if installed_software() != software:
+        raise InputError(f"it has {installed_software()}: expected {software}")
+    stopping = _Stopping(stop_name)
+    begin = time.perf_counter()
+    results = []
+    with one_blas_thread():
+        for item in batch:
+            if stopping():
+                raise EndedError
+            results.append(function(item, stopping))
+    return results, time.perf_counter() - begin
+
+
+class EndedError(Exception):
+    """The work was ended before it was done."""
+
+
+class _Stopping:
+    """Whether the work is to end; asks the scheduler every ``NOTICE`` seconds, and is true if that has gone."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._asked = time.monotonic()
+        self._answer = False
+
+    def __call__(self) -> bool:
+        from distributed import Event
+
+        if not self._answer and time.monotonic() >= self._asked + NOTICE:
+            self._asked = time.monotonic()
+            try:
+                self._answer = bool(Event(self._name).is_set())
+            except Exception:
+                self._answer = True
+        return self._answer
+
+
+@contextmanager
+def _ignoring(*numbers: signal.Signals) -> Iterator[None]:
+    """Ignore signals for a while, if this is the main thread; processes started meanwhile ignore them for good."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def deferring_interrupts() -> Iterator[None]:
+    """Postpone signals that end the program until the block is done; then the first one is raised."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    received: list[int] = []
+    numbers = [signal.SIGINT, *(number for number in ENDING if callable(signal.getsignal(number)))]
+    previous = {number: signal.signal(number, lambda number, _: received.append(number)) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+    if received:
+        signal.raise_signal(received[0])
+
+
+@contextmanager
+def _environment(changes: dict[str, str]) -> Iterator[None]:
+    """Other values of environment variables for a while."""
+    previous = {name: os.environ.get(name) for name in changes}
+    os.environ.update(changes)
+    try:
+        yield
+    finally:
+        for name, value in previous.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

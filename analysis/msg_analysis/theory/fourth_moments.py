@@ -1,0 +1,300 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The random matrix of a step, as stages: in each, some messages may be lost, independently of each other.
+
+In a stage, z becomes (M + sum_e eta_e u_e v_e^T) z, with eta_e = 1 - p_e if message e arrives and -p_e if it is lost,
+which happens with probability p_e. M is the mean, u_e what the message acts on, v_e the difference between what it
+brings and what takes its place. The noise is left out. See docs/theory.md, "Messages one by one".
+
+Fourth moments of a jump linear system: whether they are finite.
+
+S_i = E[y y y y; mode i] follow S_j(k+1) = sum_i P_ij E[A_i^(4)] S_i(k) + terms of lower moments, with A_i the random
+matrix of a step and A^(4) its Kronecker power. They stay finite if the spectral radius of this map is below 1, as
+second moments do (Costa, Fragoso and Marques, Discrete-Time Markov Jump Linear Systems, 2005, Section 3.4).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse.linalg
+
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.model.step_model import StepModel
+from msg_analysis.theory.jump_system import JumpSystem
+from msg_analysis.theory.message_steps import Move, message_steps
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stage:
+    """Messages that are used, or lost, at the same time; E of them may be lost."""
+
+    matrix: FloatArray  # (k, k) M
+    into: FloatArray  # (E, k) u
+    differences: FloatArray  # (E, k) v
+    losses: FloatArray  # (E,) p
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RandomSteps:
+    """Steps of a jump linear system: y (d,) is embedded as z (k,), goes through the stages, and is read again."""
+
+    chain: FloatArray  # (n, n) P
+    stages: list[list[Stage]]  # of each mode
+    # (k, d) with orthonormal columns: z = embedding @ y before, y = embedding^T z after; None: z is y
+    embedding: FloatArray | None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Modes n, and dimension d."""
+        k = len(self.stages[0][0].matrix)
+        return len(self.chain), k if self.embedding is None else self.embedding.shape[1]
+
+
+def random_steps(step: StepModel, system: JumpSystem) -> RandomSteps:
+    """The steps of ``system``, which ``jump_system.emulated`` made of ``step``.
+
+    Parameters
+    ----------
+    step
+        in real time that of the sequential law
+    system
+        its reduced system, whose coordinates y are used
+
+    Raises
+    ------
+    InputError
+        as of ``message_steps``
+    """
+    if step.by_message:
+        whole = message_steps(step)
+        embedding = np.zeros((whole.entries, system.dimension))
+        embedding[whole.kept] = system.lift
+        stages = [[_stage(move, whole.entries) for move in moves] for moves in whole.moves]
+        return RandomSteps(system.chain, stages, embedding)
+    lift = system.lift
+    older = len(lift) - step.agents  # the states that others use come last; without a delay they are the only ones
+    stages = []
+    for mode, matrix in enumerate(system.matrices):
+        possible = step.loss_variance[mode] > 0.0
+        i, j = np.nonzero(possible)
+        into = step.nominal[mode][possible][:, None] * lift[i]
+        stages.append([Stage(matrix, into, lift[older + j] - lift[i], step.losses[possible])])
+    return RandomSteps(system.chain, stages, None)
+
+
+def _stage(move: Move, size: int) -> Stage:
+    matrix = np.eye(size)
+    matrix[move.rows] = move.matrix
+    into, differences = np.zeros((2, len(move.losses), size))
+    for event, (entry, brings, instead, _, weight) in enumerate(move.losses):
+        into[event, entry] = weight
+        differences[event, brings] += 1.0
+        differences[event, instead] -= 1.0
+    return Stage(matrix, into, differences, np.array([loss[3] for loss in move.losses]))
+
+
+MAX_WORK = 3e7  # multiplications of one step of all fourth moments, at most: a second for the radius
+SMALL_WORK = 1e6  # the same where it is known before that they are finite
+BOUND_FORMS = 30  # that are tried for the upper bound
+BOUND_FLOOR = 0.03  # added to them, so that they are positive
+SECOND_WORK = 3e6  # multiplications of one step of all second moments, at most, for their radius
+ROUNDING = 1e-12  # of sums of rows
+
+
+@dataclass(frozen=True, slots=True)
+class FourthMoment:
+    """Spectral radius of the map of the fourth moments over a step, and what follows from it; None: not known.
+
+    Attributes
+    ----------
+    radius
+        exact
+    lower, upper
+        bounds of it, equal to ``radius`` where that is known
+    finite
+        whether the fourth moments of the states are finite in the steady state
+    """
+
+    radius: float | None
+    lower: float | None
+    upper: float | None
+    finite: bool | None
+
+    @classmethod
+    def between(cls, lower: float | None, upper: float | None) -> FourthMoment:
+        """Of bounds that are not exact."""
+        finite = None
+        if upper is not None and upper < 1.0:
+            finite = True
+        elif lower is not None and lower >= 1.0:
+            finite = False
+        return cls(None, lower, upper, finite)
+
+    def to_json(self) -> dict[str, Any]:
+        """The document."""
+        return asdict(self)
+
+
+def fourth_moment(step: StepModel, system: JumpSystem) -> FourthMoment:
+    """The spectral radius of the fourth moments of the steps of a run, exact where that takes about a second.
+
+    Otherwise bounded: from below by r^2, r the radius of the second moments, since E[a^4] >= E[a^2]^2. From above by r
+    where every agent takes a mean with weights that are not negative: then no step, whatever is lost, makes the largest
+    difference between agents (or deviation from the reference) larger, so that E[a(k)^4] <= a(0)^2 E[a(k)^2]. Without
+    losses also by ``lyapunov_bound``.
+
+    Parameters
+    ----------
+    step
+        in real time that of the sequential law
+    system
+        its reduced system, with finite second moments
+    """
+    means = bool((step.nominal >= 0.0).all() and (step.nominal.sum(axis=2) <= 1.0 + ROUNDING).all())
+    steps = _affordable(step, system, SMALL_WORK if means else MAX_WORK)
+    radius = fourth_radius(steps) if steps else None
+    if radius is not None:
+        return FourthMoment(radius, radius, radius, radius < 1.0)
+    second = second_radius(system) if system.modes * system.dimension**3 <= SECOND_WORK else None
+    lower = None if second is None else second**2
+    if means:
+        return FourthMoment(None, lower, second, finite=True)
+    return FourthMoment.between(lower, None if system.lossy else lyapunov_bound(system))
+
+
+def fourth_radius(steps: RandomSteps) -> float | None:
+    """Spectral radius of the map of the fourth moments, by Arnoldi on tensors (n, d, d, d, d); None: not found.
+
+    The map is positive, so no other eigenvalue is larger in size.
+    """
+    n, d = steps.shape
+    form = np.eye(d)
+    start = _symmetric(np.multiply.outer(form, form))
+    return _positive_radius(lambda stack: advance(steps, stack), np.broadcast_to(start, (n, d, d, d, d)))
+
+
+def second_radius(system: JumpSystem) -> float | None:
+    """Spectral radius of the second moments, C_j -> sum_i P_ij K_i[C_i]; None: not found."""
+
+    def after(stack: FloatArray) -> FloatArray:
+        return np.asarray(np.tensordot(system.chain, system.propagate(stack), axes=(0, 0)))
+
+    return _positive_radius(after, np.broadcast_to(np.eye(system.dimension), system.matrices.shape))
+
+
+def advance(steps: RandomSteps, stack: FloatArray) -> FloatArray:
+    """(n, d, d, d, d): the symmetric tensors S_j one step later, without noise.
+
+    ``stack`` are S_i (n, d, d, d, d) = E[y y y y; mode i].
+    """
+    after = np.empty_like(stack)
+    embedding = steps.embedding
+    for mode, stages in enumerate(steps.stages):
+        tensor = stack[mode] if embedding is None else _along_all_axes(embedding, stack[mode])
+        for stage in stages:
+            tensor = _through(stage, tensor)
+        after[mode] = tensor if embedding is None else _along_all_axes(embedding.T, tensor)
+    return np.asarray(np.tensordot(steps.chain, after, axes=(0, 0)))
+
+
+def _through(stage: Stage, tensor: FloatArray) -> FloatArray:
+    """(k, k, k, k): E[A^(4)] S of A = M + sum_e eta_e u_e v_e^T, eta_e independent of mean 0.
+
+    Only products in which no eta_e occurs once are left: M four times; M twice and e twice; M once and e three times;
+    e four times; e twice and another f twice.
+    """
+    moved = _along_all_axes(stage.matrix, tensor)
+    if not len(stage.losses):
+        return moved
+    u, v, p = stage.into, stage.differences, stage.losses
+    second = p * (1.0 - p)  # moments of eta
+    third, fourth = second * (2.0 * p - 1.0), second * (1.0 - 3.0 * second)
+    size, events = len(stage.matrix), len(p)
+    pairs = (u[:, :, None] * u[:, None, :]).reshape(events, -1)
+    seen = (v[:, :, None] * v[:, None, :]).reshape(events, -1) @ tensor.reshape(size**2, -1)
+    seen = seen.reshape(events, size, size)  # S(v_e, v_e, ., .)
+    once = np.einsum("eab,eb->ea", seen, v)  # S(v_e, v_e, v_e, .)
+    both = np.einsum("eab,fa,fb->ef", seen, v, v, optimize=True)  # S(v_e, v_e, v_f, v_f)
+    rest = 6.0 * second[:, None, None] * (stage.matrix @ seen @ stage.matrix.T)
+    rest += 4.0 * third[:, None, None] * u[:, :, None] * (once @ stage.matrix.T)[:, None, :]
+    other = 3.0 * np.outer(second, second) * both
+    np.fill_diagonal(other, fourth * np.diag(both))
+    added = pairs.T @ (rest.reshape(events, -1) + other @ pairs)
+    return moved + _symmetric(added.reshape((size,) * 4))
+
+
+def lyapunov_bound(system: JumpSystem) -> float:
+    """Upper bound of the radius of the fourth moments, without losses.
+
+    With forms X_i > 0, E[(y'^T X_g' y')^2 | y, g = i] <= bound (y^T X_i y)^2 for the largest
+    sum_j P_ij lambda_max(X_i^-1 W_i^T X_j W_i)^2. X are tried in which X_i is nearly r^-1 W_i^T (sum_j P_ij X_j) W_i.
+    """
+    forms = np.broadcast_to(np.eye(system.dimension), system.matrices.shape)
+    transposed = system.matrices.transpose(0, 2, 1)
+    best = math.inf
+    for _ in range(BOUND_FORMS):
+        inverse = np.linalg.inv(np.linalg.cholesky(forms))
+        grown = (
+            inverse[:, None]
+            @ (transposed[:, None] @ forms[None] @ system.matrices[:, None])
+            @ (inverse.transpose(0, 2, 1)[:, None])
+        )
+        largest = np.linalg.eigvalsh(grown)[..., -1]  # (n, n) of i and j
+        best = min(best, float((system.chain * largest**2).sum(axis=1).max()))
+        forms = transposed @ np.tensordot(system.chain, forms, axes=1) @ system.matrices
+        size = np.trace(forms, axis1=1, axis2=2).max()
+        if size == 0.0:
+            break
+        forms = forms / size + BOUND_FLOOR * np.eye(system.dimension)
+    return best
+
+
+def _affordable(step: StepModel, system: JumpSystem, work: float) -> RandomSteps | None:
+    """The random steps, where one step of all fourth moments takes at most ``work`` multiplications."""
+    if system.modes * float(system.dimension) ** 5 > work:
+        return None
+    steps = random_steps(step, system)
+    size = len(steps.stages[0][0].matrix)
+    stages = [stage for stages in steps.stages for stage in stages]
+    needed = sum(4.0 * size + 2.0 * len(stage.losses) for stage in stages) * float(size) ** 4
+    return steps if needed <= work else None
+
+
+def _along_all_axes(matrix: FloatArray, tensor: FloatArray) -> FloatArray:
+    """(r, r, r, r): sum_efgh M_ae M_bf M_cg M_dh S_efgh; each product takes the first axis and adds the last."""
+    r, k = matrix.shape
+    for _ in range(4):
+        tensor = tensor.reshape(k, -1).T @ matrix.T
+    return tensor.reshape(r, r, r, r)
+
+
+def _symmetric(tensor: FloatArray) -> FloatArray:
+    """The mean over all orders of the axes."""
+    orders = list(itertools.permutations(range(4)))
+    return np.asarray(sum(tensor.transpose(order) for order in orders) / len(orders))
+
+
+def _positive_radius(after: Callable[[FloatArray], FloatArray], start: FloatArray) -> float | None:
+    """Largest eigenvalue in size of a positive map of stacks of this shape; None: not found."""
+    size = start.size
+    if not np.any(after(start)):
+        return 0.0
+    if size <= 4:
+        return float(np.abs(np.linalg.eigvals([after(one.reshape(start.shape)).ravel() for one in np.eye(size)])).max())
+    operator = scipy.sparse.linalg.LinearOperator(
+        (size, size), matvec=lambda packed: after(packed.reshape(start.shape)).ravel(), dtype=float
+    )
+    try:
+        values = scipy.sparse.linalg.eigs(
+            operator, k=1, v0=start.ravel(), tol=1e-9, maxiter=1000, return_eigenvectors=False
+        )
+    except scipy.sparse.linalg.ArpackError:  # also where it does not converge
+        return None
+    return float(np.abs(values).max())

@@ -1,0 +1,319 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The steps of a run whose messages are noisy, late or lost, as a jump linear system of the agents and what they heard.
+
+A period is composed of micro-steps: an agent makes its step from what it has heard, then publishes its new state, and
+every receiver hears it or not. In lockstep all agents step, then all publish; in real time one agent after the other.
+The stack z has the states x; where they differ from these, the published values y, and those that a delay makes older;
+and, where the last value heard takes the place of a lost one, what every receiver has heard, h. All entries move
+together if all agents do, so in consensus one number drops out. See docs/theory.md, "Messages one by one".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.errors import InputError
+from msg_analysis.experiment.experiment import MOST_STATES, MOST_VALUES
+from msg_analysis.model.step_model import StepModel
+from msg_analysis.theory.message_losses import LossEvents
+
+_Loss = tuple[int, int, int, float, float]
+"""Entry that it changes; the entries that the message brings, and that take its place; probability; weight."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Move:
+    """A micro-step: the entries ``rows`` of z become matrix @ z, with losses, independent of each other."""
+
+    rows: list[int]
+    matrix: FloatArray  # (r, K) mean over the losses
+    losses: list[_Loss]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MessageSteps:
+    """A jump linear system of k stacked numbers, not reduced. Modes are graphs, or graphs and states of channels."""
+
+    matrices: FloatArray  # (n, k, k) mean over losses
+    noise: FloatArray  # (n, k, k) covariance of what is random and does not depend on z
+    losses: LossEvents | None
+    chain: FloatArray  # (n, n)
+    stationary: FloatArray  # (n,)
+    graphs: IntArray  # (n,) graph of every mode
+    copies: IntArray  # (k,) the agent whose state every entry is, at some time; the first m are the agents
+    start_noise: FloatArray  # (k, k) covariance of the noise in what was heard of x(0)
+    moves: list[list[Move]]  # the micro-steps of every mode, of all K entries
+    kept: IntArray  # (k,) those of the K entries that are read from one step to the next
+    entries: int  # K
+
+
+def message_steps(step: StepModel) -> MessageSteps:
+    """The period of a run, message by message.
+
+    Parameters
+    ----------
+    step
+        the synchronous step; its ``turns`` say which agent is due when
+
+    Raises
+    ------
+    InputError
+        too many links, or too many channels
+    """
+    stack = _Stack(step)
+    channels = np.argwhere(stack.lossy) if step.burst is not None else np.empty((0, 2), np.int64)
+    states = _channel_states(step, len(channels))
+    modes = step.modes * len(states)
+    periods = []
+    for mode in range(modes):
+        graph, state = divmod(mode, len(states))
+        probability = step.losses.copy()
+        probability[channels[:, 0], channels[:, 1]] = states[state]
+        periods.append(_period(step, stack, graph, probability))
+    chain, stationary = step.transition, step.stationary
+    if len(channels):
+        for i, j in channels.tolist():
+            channel, shares = _gilbert(float(step.losses[i, j]), step.burst or 1.0)
+            chain, stationary = np.asarray(np.kron(chain, channel)), np.asarray(np.kron(stationary, shares))
+    matrices = np.stack([period.matrix for period in periods])
+    losses = _stacked(periods)
+    kept = _read(matrices, losses, step.agents)
+    square = np.ix_(np.arange(modes), kept, kept)
+    return MessageSteps(
+        matrices=matrices[square],
+        noise=np.stack([period.noise for period in periods])[square],
+        losses=losses and LossEvents(losses.into[:, :, kept], losses.differences[:, :, kept], losses.chain),
+        chain=chain,
+        stationary=stationary,
+        graphs=np.repeat(np.arange(step.modes), len(states)),
+        copies=stack.copies[kept],
+        start_noise=stack.start_noise()[np.ix_(kept, kept)],
+        moves=[period.moves for period in periods],
+        kept=kept,
+        entries=stack.size,
+    )
+
+
+class _Stack:
+    """Where the entries of z are, before those that nobody reads are left out."""
+
+    def __init__(self, step: StepModel) -> None:
+        m, lines = step.agents, range(step.delay + 1)
+        self._step = step
+        listens = step.listens()
+        self.lossy: BoolArray = listens & (step.losses > 0.0)
+        held = np.argwhere(self.lossy if step.holds else np.zeros_like(listens))
+        agents: list[int] = list(range(m))
+        # Entries of what each agent published last, and 1, ..., d messages before; of what each receiver has heard.
+        self.published = [list(range(m)) for _ in lines]
+        self.heard: list[dict[tuple[int, int], int]] = [{} for _ in lines]
+        for line in lines:
+            if line or step.broadcast:
+                self.published[line] = list(range(len(agents), len(agents) + m))
+                agents += range(m)
+            for i, j in held.tolist():
+                self.heard[line][i, j] = len(agents)
+                agents.append(j)
+        # Process noise that several agents feel must be the same for all of them, whenever they step.
+        sources = (step.noise_gain != 0.0).any(axis=0)
+        self.sources = list(range(len(agents), len(agents) + m)) if step.turns is not None else []
+        if not self.sources or not (sources.sum(axis=0) > 1).any():
+            self.sources = []
+        self.copies = np.array(agents + [-1] * len(self.sources), dtype=np.int64)
+        if len(agents) > MOST_VALUES:
+            raise InputError(
+                f"noise.on_loss: {len(held)} links of {m} agents make {len(agents)} values that are kept from step to "
+                f"step; at most {MOST_VALUES} are predicted: use fewer agents or links, or own values"
+            )
+
+    @property
+    def size(self) -> int:
+        """K."""
+        return len(self.copies)
+
+    def source(self, receiver: int, sender: int) -> int:
+        """The entry that a receiver uses of a sender."""
+        return self.heard[-1].get((receiver, sender), self.published[-1][sender])
+
+    def start_noise(self) -> FloatArray:
+        """(k, k), see ``MessageSteps``: all that was published or heard of x(0) was one message."""
+        m, noise = self._step.agents, np.zeros((self.size, self.size))
+        links: dict[tuple[int, int], list[int]] = {}
+        for line in self.heard:
+            for link, entry in line.items():
+                links.setdefault(link, []).append(entry)
+        heard = [entry for entries in links.values() for entry in entries]
+        for j in range(m):
+            same = [entry for entry in heard if self.copies[entry] == j]
+            same += [line[j] for line in self.published if line[j] >= m]
+            noise[np.ix_(same, same)] += self._step.broadcast**2
+        for same in links.values():
+            noise[np.ix_(same, same)] += self._step.link**2
+        return noise
+
+
+class _Period:
+    """The micro-steps of one period, composed: z is matrix @ (z at the beginning) + noise + the losses so far."""
+
+    def __init__(self, size: int) -> None:
+        self.matrix, self.noise = np.eye(size), np.zeros((size, size))
+        self.into, self.differences = np.empty((0, size)), np.empty((0, size))
+        self.acts: list[FloatArray] = []  # row by row, R of ``loss_events``
+        self.moves: list[Move] = []
+
+    def step(self, rows: list[int], matrix: FloatArray, noise: FloatArray, losses: Iterable[_Loss] = ()) -> None:
+        """The entries ``rows`` become matrix (r, k) @ z, with this noise (r, r), and with losses."""
+        known = list(losses)
+        self.moves.append(Move(rows, matrix, known))
+        entry, brings, instead = (np.array([loss[part] for loss in known], dtype=np.int64) for part in range(3))
+        variance = np.array([p * (1.0 - p) * weight**2 for *_, p, weight in known])
+        differences = self.matrix[brings] - self.matrix[instead]
+        acts = (self.into[:, brings] - self.into[:, instead]).T ** 2
+        n = self.noise
+        spread = variance * (n[brings, brings] + n[instead, instead] - 2.0 * n[brings, instead])
+
+        self.matrix[rows] = matrix @ self.matrix
+        self.into[:, rows] = self.into @ matrix.T
+        across = matrix @ n
+        n[rows], n[:, rows] = across, across.T
+        n[np.ix_(rows, rows)] = across @ matrix.T + noise
+        np.add.at(n, (entry, entry), spread)
+
+        into = np.zeros((len(known), len(n)))
+        into[range(len(known)), entry] = np.sqrt(variance)
+        self.into = np.concatenate([self.into, into])
+        self.differences = np.concatenate([self.differences, differences])
+        self.acts += list(acts)
+
+
+def _period(step: StepModel, stack: _Stack, graph: int, probability: FloatArray) -> _Period:
+    period, m = _Period(stack.size), step.agents
+    if stack.sources:
+        period.step(stack.sources, np.zeros((m, stack.size)), np.eye(m))
+    turns = [list(range(m))] if step.turns is None else [[i] for i in step.turns.tolist()]
+    for agents in turns:
+        _move(period, step, stack, graph, probability, agents)
+        if step.broadcast:
+            newest = [stack.published[0][j] for j in agents]
+            period.step(newest, _copies(agents, stack.size), step.broadcast**2 * np.eye(len(agents)))
+        _hear(period, step, stack, probability, agents)
+    return period
+
+
+def _move(
+    period: _Period, step: StepModel, stack: _Stack, graph: int, probability: FloatArray, agents: list[int]
+) -> None:
+    """These agents make their step, all at once; what they published before gets older."""
+    weights, gain = step.nominal[graph], step.noise_gain[graph][agents]
+    matrix, noise = np.zeros((len(agents), stack.size)), np.zeros((len(agents), len(agents)))
+    losses: list[_Loss] = []
+    for row, i in enumerate(agents):
+        matrix[row, i] += weights[i, i]
+        for j in step.neighbours(graph, i).tolist():
+            source, p, weight = stack.source(i, j), float(probability[i, j]), float(weights[i, j])
+            if (i, j) in stack.heard[-1]:
+                matrix[row, source] += weight
+                continue
+            matrix[row, source] += (1.0 - p) * weight
+            matrix[row, i] += p * weight
+            noise[row, row] += (1.0 - p) * (weight * step.link) ** 2
+            if 0.0 < p < 1.0:
+                losses.append((i, source, i, p, weight))
+    if stack.sources:
+        matrix[:, stack.sources] = gain
+    else:
+        noise += gain @ gain.T
+    rows, older = list(agents), []
+    for line in range(1, step.delay + 1):
+        rows += [stack.published[line][j] for j in agents]
+        older += [stack.published[line - 1][j] for j in agents]
+    padded = np.zeros((len(rows), len(rows)))
+    padded[: len(agents), : len(agents)] = noise
+    period.step(rows, np.concatenate([matrix, _copies(older, stack.size)]), padded, losses)
+
+
+def _hear(period: _Period, step: StepModel, stack: _Stack, probability: FloatArray, agents: list[int]) -> None:
+    """What these agents publish is heard, or what was heard before is kept; and what was heard gets older."""
+    links = [(link, entry) for link, entry in stack.heard[0].items() if link[1] in agents]
+    if not links:
+        return
+    matrix, noise = np.zeros((len(links), stack.size)), np.zeros(len(links))
+    losses: list[_Loss] = []
+    for row, (link, entry) in enumerate(links):
+        p, newest = float(probability[link]), stack.published[0][link[1]]
+        matrix[row, newest], matrix[row, entry] = 1.0 - p, p
+        noise[row] = (1.0 - p) * step.link**2
+        if 0.0 < p < 1.0:
+            losses.append((entry, newest, entry, p, 1.0))
+    rows, older = [entry for _, entry in links], []
+    for line in range(1, step.delay + 1):
+        rows += [stack.heard[line][link] for link, _ in links]
+        older += [stack.heard[line - 1][link] for link, _ in links]
+    padded = np.diag(np.concatenate([noise, np.zeros(len(older))]))
+    period.step(rows, np.concatenate([matrix, _copies(older, stack.size)]), padded, losses)
+
+
+def _copies(entries: list[int], size: int) -> FloatArray:
+    """(r, k) rows that pick entries."""
+    rows = np.zeros((len(entries), size))
+    rows[range(len(entries)), entries] = 1.0
+    return rows
+
+
+def _stacked(periods: list[_Period]) -> LossEvents | None:
+    """The losses of all modes; None where there are none."""
+    most = max(len(period.into) for period in periods)
+    if not most:
+        return None
+    shape = len(periods), most, len(periods[0].noise)
+    into, differences, acts = np.zeros(shape), np.zeros(shape), np.zeros((len(periods), most, most))
+    for mode, period in enumerate(periods):
+        count = len(period.into)
+        into[mode, :count], differences[mode, :count] = period.into, period.differences
+        for event, row in enumerate(period.acts):
+            acts[mode, event, : len(row)] = row
+    if not acts.any():
+        return LossEvents(into, differences, None)
+    eye = np.eye(most)
+    chain = [scipy.linalg.solve_triangular(eye - one, eye, lower=True, unit_diagonal=True) for one in acts]
+    return LossEvents(into, differences, np.stack(chain))
+
+
+def _read(matrices: FloatArray, losses: LossEvents | None, agents: int) -> IntArray:
+    """Entries on which a later state of an agent depends, ascending; the agents are among them."""
+    uses = (matrices != 0.0).any(axis=0)
+    if losses is not None:
+        uses |= losses.uses()
+    kept: BoolArray = np.arange(len(uses)) < agents
+    while True:
+        more = kept | uses[kept].any(axis=0)
+        if (more == kept).all():
+            return np.flatnonzero(kept)
+        kept = more
+
+
+def _gilbert(probability: float, burst: float) -> tuple[FloatArray, FloatArray]:
+    """(2, 2) transition matrix and (2,) stationary law of a channel: state 0 delivers, state 1 loses."""
+    mends = 1.0 / burst
+    fails = mends * probability / (1.0 - probability)
+    return np.array([[1.0 - fails, fails], [mends, 1.0 - mends]]), np.array([1.0 - probability, probability])
+
+
+def _channel_states(step: StepModel, channels: int) -> FloatArray:
+    """(2^c, c): 1.0 where a channel loses, for every combination of states, in the order of Kronecker products."""
+    if step.modes * 2.0**channels > MOST_STATES:
+        raise InputError(
+            f"noise.burst: {step.modes} graphs and {channels} links that lose messages make {step.modes} * "
+            f"2^{channels} states of the network; at most {MOST_STATES} are predicted: give a loss to fewer links "
+            "(noise.loss: arcs), or leave noise.burst out"
+        )
+    return np.array(
+        [[(state >> bit) & 1 for bit in range(channels)[::-1]] for state in range(2**channels)], dtype=float
+    )

@@ -1,0 +1,359 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Solvers of the moment equations: direct, and without matrices.
+
+The operators of second moments as matrices on packed moments, mode by mode: for closed forms and transients.
+
+Dense, so for small systems. Symmetric matrices are vectors of their p = d (d + 1) / 2 free entries
+(``packed_symmetric``).
+They are the paper's M and N (Proposition 1), in discrete time its A and H (Proposition 6).
+
+The coupled equations as one dense matrix on the half-vectorised unknowns: the reference for small systems.
+
+One LU factorisation serves the steady moments and every dual; the cost grows as (n d (d + 1) / 2)^3.
+The equations are those of Propositions 2 and 3 of the paper (7 and 8 in discrete time).
+
+The coupled equations solved matrix-free, by preconditioned Krylov iterations and refinement.
+
+Every cycle starts from the residual of the equations as given, in double precision: so neither the Krylov recurrences
+nor the eigenvectors limit the accuracy. A solution is accepted when the correction by one more preconditioned step is
+small in every graph: unlike the residual, this is not hidden by the rounding of large rates. See docs/accuracy.md.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Literal
+
+import numpy as np
+import scipy.linalg
+
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.errors import InputError
+from msg_analysis.theory import packed_symmetric
+from msg_analysis.theory.coupled_equations import (
+    MAX_RELATIVE_ERROR,
+    AveragedEquations,
+    CoupledEquations,
+    Method,
+    Preconditioner,
+    SolverReport,
+    singular_message,
+    suitable,
+)
+from msg_analysis.theory.jump_system import JumpSystem
+from msg_analysis.theory.krylov import (
+    Equations,
+    conjugate_gradients,
+    gmres,
+    norms,
+    plain_conjugate_gradients,
+    weighted_norm,
+)
+from msg_analysis.theory.propagator import Propagator
+
+
+def mode_operators(system: JumpSystem) -> FloatArray:
+    """(n, p, p) matrices of C -> Z_i C + C Z_i^T (continuous time) or of C -> C - K_i[C] (discrete time)."""
+    if system.time == "continuous":
+        return np.stack([packed_symmetric.lyapunov(z) for z in system.matrices])
+    p = packed_symmetric.size(system.dimension)
+    operators = np.zeros((system.modes, p, p))
+    for k, entry in enumerate(np.eye(p)):
+        basis = np.broadcast_to(packed_symmetric.unpack(entry, system.dimension), system.matrices.shape)
+        operators[:, :, k] = entry - packed_symmetric.pack(system.propagate(basis))
+    return operators
+
+
+def second_moment_propagator(system: JumpSystem) -> Propagator:
+    """Of the stack (n, p + 1) of packed C_i beside pi_i: the equations for c(t) and pi(t) in one, noise included."""
+    n, p = system.modes, packed_symmetric.size(system.dimension)
+    local = np.zeros((n, p + 1, p + 1))
+    local[:, :p, :p] = -mode_operators(system)
+    local[:, :p, p] = packed_symmetric.pack(system.noise)
+    return Propagator(system.time, system.chain, system.stationary, local)
+
+
+def homogeneous_propagator(system: JumpSystem) -> Propagator:
+    """Of the stack (n, p) of packed C_i without noise: exp(-M t), or A^k."""
+    return Propagator(system.time, system.chain, system.stationary, -mode_operators(system))
+
+
+def mean_propagator(system: JumpSystem) -> Propagator:
+    """Of the stack nu (n, d) of means: exp(-N t), or H^k."""
+    discrete = system.time == "discrete"
+    local = system.matrices - np.eye(system.dimension) if discrete else -system.matrices
+    return Propagator(system.time, system.chain, system.stationary, local)
+
+
+MAX_UNKNOWNS = 10_000  # largest system that is tried: 2.4 GB and about a minute
+
+
+class DenseSolver:
+    """The coupled equations of ``MomentSolver``, factorised. InputError: too large, singular or too ill-conditioned.
+
+    The last block row is replaced by the sum of all of them, in which the chain cancels exactly, and rows are scaled
+    to largest entry 1: so the equations stay well conditioned however fast the graphs switch.
+    """
+
+    def __init__(self, system: JumpSystem) -> None:
+        self._system = system
+        n, p = system.modes, packed_symmetric.size(system.dimension)
+        if n * p > MAX_UNKNOWNS:
+            raise InputError(
+                f"second moments: {n} graphs of {len(system.lift)} agents give {n * p} coupled unknowns, for "
+                f"which a dense solve needs about {24e-9 * (n * p) ** 2:.1f} GB; at most {MAX_UNKNOWNS} are "
+                "solved: leave the choice of the method to the program, or use fewer agents or graphs"
+            )
+        local, flow = mode_operators(system), system.chain.T
+        matrix = np.zeros((n, p, n, p))
+        for j in range(n):
+            if system.time == "continuous":
+                matrix[:, range(p), j, range(p)] = -flow[:, j, None]
+                matrix[j, :, j, :] += local[j]
+            else:
+                matrix[:, :, j, :] = flow[:, j, None, None] * (local[j] - np.eye(p))
+                matrix[j, range(p), j, range(p)] += 1.0
+            matrix[-1, :, j, :] = local[j]
+        self._matrix = matrix.reshape(n * p, n * p)
+        scale = np.maximum(self._matrix.max(axis=1, initial=0.0), -self._matrix.min(axis=1, initial=0.0))
+        self._scale = 1.0 / np.where(scale > 0.0, scale, 1.0)
+        self._matrix *= self._scale[:, None]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)  # the condition is judged below
+            self._factors = scipy.linalg.lu_factor(self._matrix)
+        self._norm = float(np.linalg.norm(self._matrix, 1)) if self._matrix.size else 0.0
+        self._condition = _reciprocal_condition(self._factors[0], self._norm)
+        self._shape = (n, p)
+        self.report: SolverReport | None = None
+        self._check(float(np.finfo(float).eps))
+
+    def steady(self) -> FloatArray:
+        """See ``MomentSolver.steady``."""
+        system = self._system
+        weighted = packed_symmetric.pack(system.stationary[:, None, None] * system.noise)
+        right = weighted.copy() if system.time == "continuous" else system.chain.T @ weighted
+        right[-1] = weighted.sum(axis=0)
+        solution, self.report = self._solve(right.reshape(-1, 1) * self._scale[:, None], trans=0)
+        return packed_symmetric.unpack(solution.reshape(self._shape), system.dimension)
+
+    def dual(self, forms: FloatArray) -> FloatArray:
+        """See ``MomentSolver.dual``."""
+        n, p = self._shape
+        right = np.tile(packed_symmetric.pack(forms), (1, n)).T
+        solution, _ = self._solve(right, trans=1)
+        blocks = (solution * self._scale[:, None]).reshape(n, p, -1)
+        blocks[:-1] += blocks[-1]  # transpose of "replace the last row by the sum"
+        return packed_symmetric.unpack(np.moveaxis(blocks, 2, 0), self._system.dimension)
+
+    def _solve(self, right: FloatArray, *, trans: Literal[0, 1]) -> tuple[FloatArray, SolverReport]:
+        matrix = self._matrix.T if trans else self._matrix
+        solution = scipy.linalg.lu_solve(self._factors, right, trans=trans)
+        residual = right - matrix @ solution
+        solution += scipy.linalg.lu_solve(self._factors, residual, trans=trans)
+        residual = np.abs(right - matrix @ solution).max(initial=0.0)
+        given = np.abs(right).max(initial=0.0)
+        size = self._norm * np.abs(solution).max(initial=0.0) + given
+        backward = float(residual / size) if size > 0.0 else 0.0
+        self._check(backward)
+        relative = float(residual / given) if given > 0.0 else 0.0
+        return np.asarray(solution), SolverReport("dense", "none", 1, relative, backward, backward / self._condition)
+
+    def _check(self, backward: float) -> None:
+        """Refuse equations that are too ill-conditioned for this backward error."""
+        # Not ">": NaN must be refused, too.
+        if self._matrix.size and not backward <= MAX_RELATIVE_ERROR * self._condition:
+            raise InputError(singular_message(f" (reciprocal condition {self._condition:.1e})"))
+
+
+def _reciprocal_condition(factors: FloatArray, norm: float) -> float:
+    if factors.size == 0:
+        return 1.0
+    reciprocal, _ = scipy.linalg.lapack.dgecon(factors, norm)
+    return float(reciprocal)
+
+
+TOLERANCE = 1e-12  # estimated relative error at which a solve stops
+MAX_ITERATIONS = 600
+MAX_CHEAP = 30  # most iterations of one cycle with the averaged preconditioner
+FINEST = 5e-7  # least relative residual asked of such a cycle, in single precision: two cycles suffice
+MAX_AMPLIFICATION = 1e14  # largest ratio of (averaged decay * solution) to right-hand side: a condition number
+CHUNK = 1_000_000  # numbers in a stack of right-hand sides that are solved together: small enough for the caches
+
+
+class IterativeSolver:
+    """Steady moments and duals of one system; starts from ``guess`` (n, d, d), steady moments of a similar one."""
+
+    def __init__(self, system: JumpSystem, guess: FloatArray | None = None) -> None:
+        self._equations = CoupledEquations(system)
+        self._averaged = _averaged(self._equations)
+        self._adjoint: CoupledEquations | None = None
+        self._averaged_adjoint: AveragedEquations | None = None
+        self._guess = guess
+        self.report: SolverReport | None = None
+
+    def steady(self, noise: FloatArray | None = None) -> FloatArray:
+        """See ``MomentSolver.steady``; ``noise``: (n, d, d), another one than that of the system."""
+        system = self._equations.system
+        right = (system.noise if noise is None else noise)[None]
+        if system.time == "discrete":
+            right = self._equations.after_jump(right)
+        weights = system.stationary[:, None, None]
+        guess = None if self._guess is None else self._guess[None] / weights
+        x, self.report = _solve(self._equations, self._averaged, right, guess)
+        return np.asarray(np.multiply(weights, x[0], out=x[0]))
+
+    def dual(self, forms: FloatArray) -> FloatArray:
+        """See ``MomentSolver.dual``."""
+        system = self._equations.system
+        if self._adjoint is None:
+            self._adjoint = self._equations.adjoint()
+            self._averaged_adjoint = _averaged(self._adjoint)
+        result = np.empty((len(forms), *system.matrices.shape))
+        together = max(1, CHUNK // system.matrices.size)
+        for first in range(0, len(forms), together):
+            chunk = forms[first : first + together, None]
+            right = np.broadcast_to(chunk, (len(chunk), *system.matrices.shape)).copy()
+            y, _ = _solve(self._adjoint, self._averaged_adjoint, right, None)
+            if system.time == "discrete":
+                y = right + self._adjoint.moved(y)
+            result[first : first + together] = y
+        return result
+
+
+def _averaged(equations: CoupledEquations) -> AveragedEquations | None:
+    """The cheaper preconditioner, where it promises to be better."""
+    if not (equations.one_level and equations.large) or equations.system.lossy:
+        return None
+    return AveragedEquations(equations) if suitable(equations) else None
+
+
+def _solve(
+    equations: CoupledEquations, averaged: AveragedEquations | None, right: FloatArray, guess: FloatArray | None
+) -> tuple[FloatArray, SolverReport]:
+    """Solve A X = B for (q, n, d, d) right-hand sides."""
+    x = None if guess is None or not guess.any() else 0.5 * (guess + guess.swapaxes(-1, -2))
+    if averaged is not None:
+        x, report = _by_average(equations, averaged, right, x)
+        if not report.error <= TOLERANCE:
+            x, report = _by_graphs(equations, right, x if np.isfinite(x).all() else None, report.iterations)
+    else:
+        x, report = _by_graphs(equations, right, x, 0)
+    # Not ">": NaN must be refused, too.
+    if not report.error <= MAX_RELATIVE_ERROR:
+        raise InputError(singular_message(f", or too ill-conditioned ({report.iterations} iterations do not converge)"))
+    size = (equations.decay * np.abs(np.diagonal(x, axis1=2, axis2=3))).max(initial=0.0)
+    if not size <= MAX_AMPLIFICATION * np.abs(right).max(initial=0.0):
+        raise InputError(singular_message(f" (amplification {size / np.abs(right).max():.1e})"))
+    for place in np.ndindex(x.shape[:2]):
+        x[place] = 0.5 * (x[place] + x[place].T)
+    return x, report
+
+
+def _by_average(
+    equations: CoupledEquations, averaged: AveragedEquations, right: FloatArray, guess: FloatArray | None
+) -> tuple[FloatArray, SolverReport]:
+    """With the averaged preconditioner, until the error is small or a cycle gains less than three digits."""
+    method, iterations, before = _method(definite=averaged.definite), 0, np.inf
+    x, known = np.zeros_like(right) if guess is None else guess, guess is not None
+    while True:
+        residual, left, backward = _residual(equations, right, x) if known else (right, 1.0, 1.0)
+        scale = _scale(residual)
+        inside, error = averaged.enter(residual, scale), np.ones(len(x))
+        del residual  # its memory is used again, and fresh memory would have to be cleared
+        if known:
+            error = _error(averaged.solution(inside), x, scale)
+            iterations += 1
+        worst = float(error.max(initial=0.0))
+        if worst <= TOLERANCE or not worst <= 1e-3 * before:
+            return x, SolverReport(method, "averaged", iterations, left, backward, worst)
+        enough = np.clip(0.5 * TOLERANCE / np.maximum(error, TOLERANCE), FINEST, 0.1)
+        if averaged.definite:
+            change, used = plain_conjugate_gradients(averaged.apply, inside, enough, MAX_CHEAP)
+        else:
+            change, used = gmres(averaged, inside, enough, MAX_CHEAP)
+        averaged.leave(change, scale, x)
+        iterations, before, known = iterations + used, worst, True
+
+
+def _by_graphs(
+    equations: CoupledEquations, right: FloatArray, x: FloatArray | None, iterations: int
+) -> tuple[FloatArray, SolverReport]:
+    """With the two-level preconditioner, until the error is small, a cycle hardly reduces it, or iterations run out."""
+    inner = equations.inner
+    method: Method = "direct" if equations.direct else _method(definite=inner.definite)
+    preconditioner: Preconditioner = "none" if equations.direct else "two-level"
+    known = x is not None
+    x = np.zeros_like(right) if x is None else x
+    residual, error, before = right, np.ones(len(right)), np.inf
+    while True:
+        if known:
+            residual, left, backward = _residual(equations, right, x)
+            scaled, scale = _scaled(residual)
+            step, moved = (part * scale for part in inner.precondition(scaled.astype(inner.drift.dtype)))
+            x, residual = x + step, residual - moved
+            error = _error(step, x)
+            worst = float(error.max(initial=0.0))
+            iterations += 1
+            if worst <= TOLERANCE or iterations >= MAX_ITERATIONS or not worst <= 0.7 * before:
+                return x, SolverReport(method, preconditioner, iterations, left, backward, worst)
+            before = worst
+        known = True
+        scaled, scale = _scaled(residual)
+        scaled = scaled.astype(inner.drift.dtype)
+        if equations.direct:
+            change, used = inner.precondition(scaled)[0], 1
+        else:
+            size = weighted_norm(x, equations.weights) / scale[:, 0, 0, 0]
+            change, used = _improved(inner, scaled, size, error, MAX_ITERATIONS)
+        x, iterations = x + change * scale, iterations + used
+
+
+def _improved(
+    equations: Equations, right: FloatArray, size: FloatArray, error: FloatArray, most: int
+) -> tuple[FloatArray, int]:
+    """(X, iterations) for A X = B, as accurate as the precision allows and the error requires."""
+    finest = 1e-6 if right.dtype == np.float32 else 1e-14
+    if equations.definite:
+        small = 0.3 * TOLERANCE
+        return conjugate_gradients(equations, right, small * size, max(small, finest), most)
+    return gmres(equations, right, np.clip(0.1 * TOLERANCE / np.maximum(error, TOLERANCE), finest, 0.1), most)
+
+
+def _residual(equations: CoupledEquations, right: FloatArray, x: FloatArray) -> tuple[FloatArray, float, float]:
+    """B - A X, in double precision; its norm relative to B, and to the sum of the norms of all terms."""
+    residual, terms = equations.apply(x)
+    np.subtract(right, residual, out=residual)
+    given, left = norms(right), norms(residual)
+    return residual, float(_ratio(left, given).max(initial=0.0)), float(_ratio(left, terms + given).max(initial=0.0))
+
+
+def _error(step: FloatArray, x: FloatArray, scale: FloatArray | float = 1.0) -> FloatArray:
+    """(q,): norm of the step (times the scale) relative to X, in the graph where it is largest."""
+    size = norms(x)
+    size = np.maximum(size, 1e-6 * size.max(axis=1, keepdims=True))
+    return np.asarray(_ratio(norms(step), size).max(axis=1) * scale)
+
+
+def _method(*, definite: bool) -> Method:
+    return "cg" if definite else "gmres"
+
+
+def _scale(residual: FloatArray) -> FloatArray:
+    """(q,): largest absolute entries; 1 where all are 0."""
+    axes = (1, 2, 3)
+    scale = np.maximum(residual.max(axis=axes, initial=0.0), -residual.min(axis=axes, initial=0.0))
+    scale[scale == 0.0] = 1.0
+    return np.asarray(scale)
+
+
+def _scaled(residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Right-hand sides with largest entry 1, and their (q, 1, 1, 1) scales."""
+    scale = _scale(residual)[:, None, None, None]
+    return residual / scale, scale
+
+
+def _ratio(part: FloatArray, whole: FloatArray) -> FloatArray:
+    """Part / whole, where 0 / 0 is 0."""
+    return np.divide(part, whole, out=np.where(part > 0.0, np.inf, 0.0), where=whole > 0.0)

@@ -1,0 +1,293 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The environment of the processes of a run."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from msg_agents.discovery.profiles import (
+    INTRODUCED_PROFILE,
+    LOOPBACK_PROFILE,
+    PROFILE_VARIABLES,
+    UDP_PROFILE,
+    domains_for,
+    has_fast_dds_3,
+)
+from msg_agents.discovery.relay import Introducer
+from msg_agents.discovery.rtps import free_domain, require_loopback
+from msg_analysis.common.resources import SINGLE_THREAD
+from msg_analysis.common.version import ros_distribution
+from msg_analysis.errors import InputError
+
+MEMORY = Path("/dev/shm")
+"""A page of a file on a disk costs about twice as much to write for the first time, and again after each time the
+system has saved it."""
+
+LEAST = 64 << 10  # bytes; where a page that ROS maps there cannot be had, the processes of a run die of SIGBUS
+
+
+def free_space(directory: Path) -> int:
+    """Bytes that we could write there."""
+    try:
+        return shutil.disk_usage(directory).free if os.access(directory, os.W_OK) else 0
+    except OSError:
+        return 0
+
+
+def require_shared_memory(directory: Path = MEMORY) -> None:
+    """InputError if it is full. Without it, or where it cannot be written, a run does without."""
+    # The library of the tracer LTTng, which rclpy loads, makes a file of one page there and writes to it.
+    if os.access(directory, os.W_OK) and (free := free_space(directory)) < LEAST:
+        raise InputError(
+            f"{directory}: full ({free} bytes free): ROS 2 processes would be killed by SIGBUS: remove what is not "
+            "used, with `fastdds shm clean` or by hand"
+        )
+
+
+# With none of these, rclpy, its libraries and its middleware can only be those of this Python.
+SUSPECTS = ("RMW_IMPLEMENTATION", "PYTHONPATH", "AMENT_PREFIX_PATH", "ROS_DISTRO")
+PATIENCE = 60.0  # s
+PROBE = """
+import importlib.util, os, warnings
+warnings.simplefilter("ignore")
+print(os.path.dirname(importlib.util.find_spec("rclpy").origin), flush=True)
+from msg_agents.nodes.ros import use_middleware
+use_middleware()
+"""
+
+
+def require_rclpy() -> Path:
+    """The folder of the rclpy that this Python finds; InputError: there is none."""
+    found = importlib.util.find_spec("rclpy")
+    if found is None or found.origin is None:
+        raise InputError(
+            f"rclpy: not found by {sys.executable}: run `make setup`, or use a terminal in which ROS 2 is sourced"
+        )
+    return Path(found.origin).parent.resolve()
+
+
+def require_middleware(environment: Mapping[str, str], forked: Callable[[], bool] = lambda: False) -> None:
+    """InputError, with the variable to unset, unless rclpy and the messages can be loaded in this environment.
+
+    It is tried, in a process of its own, only where a variable could lead to another ROS 2 than that of this Python.
+    ``forked``: whether a process could that was forked from one which has imported all; it saves the imports.
+    """
+    require_rclpy()
+    present = [name for name in SUSPECTS if environment.get(name)]
+    if not present or forked():
+        return
+    try:
+        probe = subprocess.run(
+            [sys.executable, "-P", "-c", PROBE],
+            env=dict(environment),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=PATIENCE,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return  # a busy machine: the run will say what is wrong
+    if probe.returncode == 0:
+        return
+    wanted = environment.get("RMW_IMPLEMENTATION")
+    found = re.search(r"instead found '(\w+)'", probe.stderr)
+    if wanted and (found or wanted in probe.stderr):
+        has = f"this ROS 2 has {found[1]}" if found else "this ROS 2 cannot load it"
+        raise InputError(f"RMW_IMPLEMENTATION: {wanted}: {has}: unset it, or install that middleware")
+    lines = [line for line in probe.stderr.splitlines() if line.strip()]
+    reason = lines[-1].strip() if lines else f"exit code {probe.returncode}"
+    place = probe.stdout.strip()
+    raise InputError(
+        f"{place or 'rclpy'}: cannot be used ({reason}): {' and '.join(present)} may lead to another ROS 2: unset "
+        f"{'it' if len(present) == 1 else 'them'}, or use a terminal in which no other ROS 2 is sourced"
+    )
+
+
+TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
+RESTARTS = 3  # of killed processes in a run, by default
+LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants only
+DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
+USER_TIMEOUT = 120.0  # s for which they look for others that the user starts
+RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"  # older; 1 is still stronger, and adds shared memory as LOCALHOST does
+SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
+LOGS_VARIABLE = "ROS_LOG_DIR"
+
+
+def check_domain() -> None:
+    """InputError if the environment's ROS_DOMAIN_ID is not usable; to be called before the middleware starts."""
+    value = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not value.isdecimal() or int(value) > LAST_DOMAIN:
+        raise InputError(f"ROS_DOMAIN_ID: {value}: expected a number from 0 to {LAST_DOMAIN}")
+
+
+def discovery_scope() -> str:
+    """Where the nodes of this process find others, as text."""
+    domain, reach = os.environ.get("ROS_DOMAIN_ID", "0"), os.environ.get(RANGE_VARIABLE, "SUBNET")
+    return f"in ROS_DOMAIN_ID {domain} and within ROS_AUTOMATIC_DISCOVERY_RANGE {reach}"
+
+
+def log_directory() -> Path | None:
+    """Where ROS writes its log files by the environment; None without a home."""
+    ros_home, home = os.environ.get("ROS_HOME"), os.environ.get("HOME")
+    place = os.environ.get(LOGS_VARIABLE) or (ros_home and f"{ros_home}/log") or (home and f"{home}/.ros/log")
+    return Path(place).expanduser() if place else None
+
+
+def can_log() -> bool:
+    """Whether ROS can write its log files where the environment says: not without a home, on a read-only root, ...
+
+    Without them no node starts.
+    """
+    path = log_directory()
+    if path is None:
+        return False
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(path, os.W_OK | os.X_OK)
+
+
+def other_logs(directory: Path) -> dict[str, str]:
+    """Changes to our environment that let ROS log to a directory, if it cannot write to the usual one."""
+    return {} if can_log() else {LOGS_VARIABLE: str(directory)}
+
+
+def ensure_logs() -> None:
+    """Give this process another directory for the log files of ROS if it cannot write to the usual one."""
+    os.environ.update(other_logs(Path(tempfile.gettempdir()) / f"msg_agents_log_{os.getuid()}"))
+
+
+def require_discovery(environment: Mapping[str, str]) -> None:
+    """InputError if nodes may not find each other in this environment."""
+    if environment.get(RANGE_VARIABLE) == "OFF":
+        raise InputError(f"{RANGE_VARIABLE}: OFF: the nodes of a run would not find each other: unset it")
+
+
+def tolerate_warnings() -> None:
+    """Let rclpy be imported where PYTHONWARNINGS makes errors of warnings: a package that it uses is deprecated."""
+    warnings.filterwarnings("ignore", "module 'sre_", DeprecationWarning)
+
+
+def start_environment() -> dict[str, str]:
+    """Our environment with what is read at the start of a process of nodes, whatever its network."""
+    return {
+        **SINGLE_THREAD,
+        **os.environ,
+        "PYTHONUNBUFFERED": "1",
+        # ``python -m`` would look for msg_agents in the working directory first, and find our source tree's folder.
+        "PYTHONSAFEPATH": "1",
+    }
+
+
+def profile_variables(profile: Path, distribution: str | None = None) -> dict[str, str]:
+    """What leads Fast DDS to a profile, by default that of the ROS 2 here: Fast DDS 3 warns of the old name."""
+    name = ros_distribution() if distribution is None else distribution
+    read = PROFILE_VARIABLES[1:] if has_fast_dds_3(name) else PROFILE_VARIABLES
+    return dict.fromkeys(read, str(profile))
+
+
+def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str, str]:
+    """Our environment with what the nodes need; another discovery range or profile of the user's is kept.
+
+    A discovery server is not used: with one, the nodes of a run on this machine would not find each other without it.
+    """
+    environment = start_environment() | {"ROS_DOMAIN_ID": str(domain)}
+    local = environment.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
+    if local and not any(environment.get(name) for name in PROFILE_VARIABLES):
+        environment[RANGE_VARIABLE] = "SYSTEM_DEFAULT"  # the profile decides
+        environment.update(profile_variables(profile))
+        for name in (SERVER_VARIABLE, LOCALHOST_VARIABLE):
+            environment.pop(name, None)
+    return environment
+
+
+def channel_environment(profile: Path) -> dict[str, str]:
+    """Changes to our environment that make the middleware follow a profile, whatever the user has set.
+
+    Shared memory, a discovery server or a discovery range of the user's would lead messages past the channel.
+    """
+    return {
+        **profile_variables(profile),
+        RANGE_VARIABLE: "SYSTEM_DEFAULT",
+        TRANSPORTS_VARIABLE: "",
+        LOCALHOST_VARIABLE: "",
+        SERVER_VARIABLE: "",
+    }
+
+
+def without_shared_memory() -> dict[str, str]:
+    """Changes to our environment that make the middleware use UDP only; the user's profile or transports are kept.
+
+    A process that ends at once would otherwise leave shared memory behind.
+    """
+    if any(os.environ.get(name) for name in (*PROFILE_VARIABLES, TRANSPORTS_VARIABLE)):
+        return {}
+    # Both add shared memory to any profile.
+    if os.environ.get(RANGE_VARIABLE) == "LOCALHOST" or os.environ.get(LOCALHOST_VARIABLE) == "1":
+        return {
+            RANGE_VARIABLE: "SYSTEM_DEFAULT",
+            LOCALHOST_VARIABLE: "",
+            **profile_variables(LOOPBACK_PROFILE),
+        }
+    return profile_variables(UDP_PROFILE)
+
+
+ROS_LOGS = "ros"  # folder for nodes that have no other place for the log files of ROS
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """Of one run."""
+
+    domain: int
+    environment: dict[str, str]
+    introducer: Introducer | None  # None: the processes look for each other, by the user's profile for example
+
+
+@contextmanager
+def surroundings(
+    folder: Path,  # of the run
+    domain: int | None,  # None: a free one
+    changes: Mapping[str, str],  # of the environment
+    participants: int,  # of the run
+) -> Iterator[Surroundings]:
+    """Provide them for a run; InputError: no domain is free, or processes could not meet."""
+    with ExitStack() as stack:
+        if domain is None:
+            domain = stack.enter_context(free_domain(domains_for(participants)))
+        environment = node_environment(domain, INTRODUCED_PROFILE) | dict(changes)
+        introducer = None
+        if will_introduce(changes):
+            require_loopback()
+            try:
+                introducer = stack.enter_context(Introducer(domain))
+            except OSError:  # many others are in this domain
+                environment = node_environment(domain) | dict(changes)
+        require_discovery(environment)
+        require_shared_memory()
+        environment |= other_logs(folder / ROS_LOGS)
+        yield Surroundings(domain, environment, introducer)
+
+
+def will_introduce(changes: Mapping[str, str]) -> bool:
+    """Whether the middleware will follow our profile: not if that of the user, or of several hosts, is used."""
+    environment = node_environment(0, INTRODUCED_PROFILE) | dict(changes)
+    ours = environment.get(PROFILE_VARIABLES[-1]) == str(INTRODUCED_PROFILE)
+    return ours and environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")

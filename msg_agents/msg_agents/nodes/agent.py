@@ -1,0 +1,360 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The agent node: one row of the MJLS on topics. What depends on the pace: ``lockstep_agent``, ``realtime_agent``."""
+
+from __future__ import annotations
+
+import sys
+import time
+import traceback
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+
+from msg_agents.nodes.base import NetworkNode
+from msg_agents.nodes.ros import after
+from msg_agents.process_layout import RECORDER
+from msg_agents.recovery import Checkpoint, entry_size, published_size
+from msg_agents.stepping.stall_detection import StallDetector
+from msg_agents.stepping.synchronizer import TurnQueue
+from msg_analysis.errors import InputError
+from msg_analysis.experiment.protocols import ProtocolError
+from msg_analysis.messages import topics
+from msg_analysis.messages.acceptance import state_frame, state_receiver
+from msg_analysis.messages.messages import ActiveGraph, StateCodec, with_state
+from msg_analysis.messages.topics import Qos, agent_node_name
+from msg_analysis.model.agent_law import agent_law
+from msg_analysis.model.run_record import RunRecord
+from msg_analysis.model.step_model import Wiring
+
+RETURN_TIME = 2.0  # s for which states are not repeated yet, because a reader is missing
+RETURN_POLL = 0.02  # s
+PASSIVE_GRACE = 0.3  # s that a reader with best effort has for the last state before its writer leaves
+ANSWER_PERIOD = 0.5  # s between two repetitions of states for peers
+
+
+class Group(Protocol):
+    """What an agent needs from the agents of its process together: see AgentGroup."""
+
+    turns: TurnQueue
+    progress_period: float
+
+    def record_state(self, message: bytes) -> None:
+        """See AgentGroup."""
+
+    def record_truth(self, message: bytes) -> None:
+        """See AgentGroup."""
+
+    def record_contradiction(self, message: bytes, state: bytes) -> None:
+        """See AgentGroup."""
+
+    def send_batches(self) -> None:
+        """See AgentGroup."""
+
+    def missing_recorder(self) -> list[str]:
+        """See AgentGroup."""
+
+    def report(self, agent: int, step: int) -> None:
+        """See AgentGroup."""
+
+    def ask_again(self, agent: int, step: int) -> None:
+        """See AgentGroup."""
+
+    def reached(self) -> frozenset[str]:
+        """See AgentGroup."""
+
+    def hears_all(self) -> bool:
+        """See AgentGroup."""
+
+    def fail(self, error: Exception) -> None:
+        """See AgentGroup."""
+
+
+class Agent(NetworkNode):
+    """Connects topics and law; the subclass for the pace decides when to step and with which inputs.
+
+    Other agents read ``state``. Where that is not the exact state (broadcast noise, or a protocol that publishes only a
+    part of it), the exact one is published on ``truth``, for the log and the live node.
+    """
+
+    hears: Qos | None = None  # of its subscriptions to the states of others; None: that of the topic
+    hears_batches = False  # whether it may hear them by the batches of their processes instead
+
+    def __init__(
+        self,
+        *,
+        record: RunRecord,
+        model: Wiring,
+        agent: int,  # index from 0
+        peers: Sequence[int],  # every other agent that it hears or is heard by at any time, ascending
+        colleagues: Collection[int],  # agents of its process, itself included
+        readers: Sequence[str],  # other nodes that must read the states before the run starts
+        checkpoints: Path | None,  # directory of the published states, from which it resumes after a restart
+        group: Group,
+    ) -> None:
+        super().__init__(agent_node_name(agent), record=record)
+        experiment = record.experiment
+        self._law = agent_law(record, model, agent)
+        self._last = experiment.steps
+        self._codec = StateCodec(self.run, agent + 1, experiment.width, experiment.step_length)
+        self._frame = state_frame(record, whole=False)
+        self._whole = state_frame(record, whole=True)
+        self._beside = published_size(record)
+        self._published = Checkpoint(
+            checkpoints and checkpoints / f"{agent_node_name(agent)}.states", entry_size(record)
+        )
+        self._resumed = self._take_over()
+        self._group = group
+        self._inputs = [self._law.neighbours(mode) for mode in range(model.modes)]
+        self._peers = list(peers)
+        near = set(peers).intersection(colleagues)
+        self.far = [j for j in peers if j not in near]
+        self._near = [j for j in peers if j in near]
+        self._listeners: list[Callable[[int, int, int, bytes, bytes], str | None]] = []
+        self._peer_names = list(map(agent_node_name, self.far))
+        # The recorder reads the batches of the process instead, and in the middle of a run none of these is awaited.
+        self._others = [name for name in readers if name != RECORDER and self._resumed is None]
+        self._next_progress = 0.0
+        self._reported = -1  # step of the last report
+        self._stall = StallDetector()
+        self._far_states: list[Subscription] = []
+        self._last_sent = 0.0  # time at which the last state was sent [s of the monotonic clock]
+        self._owed: int | None = None  # step from which on states are to be repeated
+        self._answered = -ANSWER_PERIOD  # time at which they were repeated last [s of the monotonic clock]
+        self._states = self.publisher_of(topics.STATE, agent)
+        self._truth: Publisher | None = None
+        if experiment.truth:
+            self._truth = self.publisher_of(topics.TRUTH, agent)
+
+    @property
+    def number(self) -> int:
+        """Its number, from 1."""
+        return self._law.agent + 1
+
+    @property
+    def step(self) -> int:
+        """The current step."""
+        return self._law.step
+
+    def _options(self) -> dict[str, Any]:
+        """What AgentInputs takes."""
+        return {
+            "agent": self._law.agent,
+            "steps": self.record.experiment.steps,
+            "inputs": self._inputs,
+            "peers": self._peers,
+            "start": self._law.step,
+        }
+
+    def connect(self, colleagues: Mapping[int, Agent]) -> None:
+        """Connect to the peers in this process (by index) by direct calls."""
+        self._listeners = [colleagues[j].hear for j in self._near]
+
+    def subscribe_to_far(self) -> None:
+        """Connect to the peers in other processes by their topics."""
+        for j in self.far:
+            self._far_states.append(self.subscribe(topics.STATE, self._receiver(j), agent=j, qos=self.hears))
+
+    def create_shared(self, agents: Sequence[Agent]) -> None:
+        """Create what a process needs only once. Called on its first agent, with all its agents."""
+
+    def discovered_all(self) -> bool:
+        """See NetworkNode. One that comes back will ask for messages at once, so it must be ready for them."""
+        if self.resumed and not (
+            all(states.get_publisher_count() for states in self._far_states) and self._group.hears_all()
+        ):
+            return False
+        expected = self._awaited() + self._others
+        return self.has_readers(self._states, expected) and not self._group.missing_recorder()
+
+    def missing_nodes(self) -> list[str]:
+        """See NetworkNode."""
+        return self.missing_readers(self._states, self._awaited() + self._others) + self._group.missing_recorder()
+
+    def _awaited(self) -> list[str]:
+        """Names of the peers that must read its topic: not those that its batches reach."""
+        reached = self._group.reached()
+        return [name for name in self._peer_names if name not in reached] if reached else self._peer_names
+
+    def finish(self, *, complete: bool, deadline: float) -> None:
+        """See NetworkNode. Waits only for readers outside the run: at the end, those of the run have everything."""
+        self._group.send_batches()
+        for writer in (self._states, self._truth) if complete else ():
+            if writer is None:
+                continue
+            if self.has_other_readers(writer):
+                writer.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
+            if self.has_other_readers(writer, reliable=False):  # it forgets what comes after the news that we have left
+                time.sleep(max(0.0, min(deadline, self._last_sent + PASSIVE_GRACE) - time.monotonic()))
+
+    def begin(self) -> None:
+        """Publish x(0); after a takeover, repeat what others may have missed, and ask the peers to repeat theirs."""
+        if self._published.found:
+            # All that is kept, for the recorder and for readers outside the run; peers have what is older.
+            self._repeat(0, heard_since=0 if self.has_other_readers(self._states) else self._missed_since())
+            self._ask_again(self.far)
+        if not self._law.step:
+            self._publish_state(0)
+        self._report()
+
+    def rejoin(self) -> bool:
+        """See NetworkNode. All that is kept goes to the recorder again, and what peers may lack to them."""
+        if self._group.missing_recorder():
+            return False
+        self._repeat(0, heard_since=self._missed_since())
+        self._ask_again(self.far)
+        return True
+
+    def _take_over(self) -> bytes | None:
+        """Resume from the last state that an earlier process published; its message, or None without one."""
+        published = self._published.read() if self._published.found else []
+        if published:
+            step, message = published[-1][0], self._parts(published[-1][1])[0]
+            frame = self._whole.unwrap(message)
+            if frame is None or frame[:2] != (self._law.agent + 1, step):
+                raise InputError(
+                    f"--checkpoint: the file of {self.get_name()} belongs to another run: remove it, or "
+                    "give another directory"
+                )
+            self._law.resume(step, frame[3])
+            return message
+        return None
+
+    def _publish_state(self, mode: int) -> None:
+        law = self._law
+        self._keep_and_send(mode, self._codec.wrap(law.step, mode, law.state, law.heard))
+
+    def _keep_and_send(self, mode: int, message: bytes) -> None:
+        """Publish the newest state, when it is in the checkpoint."""
+        law = self._law
+        value = law.published(law.step, law.state) if self._truth is not None else b""
+        self._published.write(law.step, message + value)
+        self._send(law.step, mode, law.state, message, value)
+
+    def _parts(self, entry: bytes) -> tuple[bytes, bytes]:
+        """An entry of the checkpoint: the message, and what is published of its state if that is not the state."""
+        length = len(entry) - self._beside
+        return entry[:length], entry[length:]
+
+    def _send(self, step: int, mode: int, state: bytes, message: bytes, value: bytes, *, heard: bool = True) -> None:
+        """Publish a state: exactly on ``truth``, if there is one, and to the others as they hear it, ``value``.
+
+        Without ``heard``, to the recorder only.
+        """
+        if self._truth is not None:
+            if heard:
+                self.publish(self._truth, message)
+            self._group.record_truth(message)
+            message, state = with_state(message, value, len(state)), value
+        if heard:
+            self.publish(self._states, message)
+        self._group.record_state(message)
+        for hear in self._listeners if heard else ():
+            hear(self._law.agent, step, mode, state, message)
+        if step == self._last:
+            self._last_sent = time.monotonic()
+            self._group.send_batches()
+
+    @property
+    def resumed(self) -> bool:
+        """See NetworkNode. It goes on from a state that an earlier process published."""
+        return self._resumed is not None
+
+    def send_again(self, since: int) -> None:
+        """Repeat the states from step ``since`` on, for a peer that may have missed them, once all readers are there.
+
+        One that has come back, and asks, may not have been matched yet. Requests are latched, and may be old. In a
+        dense network that has stood still, many ask: they are answered together.
+        """
+        since = max(since, self._missed_since())
+        if self._owed is not None:
+            self._owed = min(self._owed, since)
+            return
+        self._owed = since
+        self._send_owed(time.monotonic() + RETURN_TIME)
+
+    def _send_owed(self, deadline: float) -> None:
+        now = time.monotonic()
+        too_soon = now < self._answered + ANSWER_PERIOD
+        if too_soon or (now < deadline and not self.has_readers(self._states, self._awaited())):
+            after(self, RETURN_POLL, partial(self._send_owed, deadline))
+            return
+        self._answered = now
+        since, self._owed = self._owed, None
+        assert since is not None
+        self._repeat(since)
+
+    def _repeat(self, since: int, heard_since: int = 0) -> None:
+        """Repeat the kept states from step ``since`` on, as they were published.
+
+        Those before ``heard_since`` go to the recorder only.
+        """
+        for step, entry in self._published.read(since):
+            message, value = self._parts(entry)
+            frame = self._whole.unwrap(message)
+            assert frame is not None, "written by this software"
+            self._send(step, frame[2], frame[3], message, value, heard=step >= heard_since)
+        self._group.send_batches()
+
+    def _ask_again(self, agents: Sequence[int]) -> None:
+        """Ask those of these agents that are in other processes for states that may have been missed."""
+        for j in agents:
+            if j not in self._near:
+                self._group.ask_again(j, self._missed_since())
+
+    def _missed_since(self) -> int:
+        """The first step whose state a peer may still need after a restart, of this agent or of itself."""
+        raise NotImplementedError
+
+    def _receiver(self, peer: int) -> Callable[[bytes], None]:
+        """The callback for a peer's states."""
+        topic = topics.STATE.of(peer)
+        return state_receiver(
+            self.record, peer, self._frame, self.hear, lambda reason: self.refuse(reason, topic), possible=True
+        )
+
+    def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:
+        """Take x_peer(step), from a topic or a direct call; the reason if refused, else None. ``peer``: from 0."""
+        raise NotImplementedError
+
+    def learn(self, graph: ActiveGraph) -> str | None:
+        """Take a sojourn of the graph; the reason if it is refused, else None."""
+        raise NotImplementedError
+
+    def end_at(self, step: int) -> None:
+        """Make no step after this one: the run ends early. An agent that is beyond it stays where it is."""
+        self._last = max(step, self._law.step)
+        self._limit_steps(self._last)
+        if self._law.step >= step:
+            self._last_sent = time.monotonic()
+            self._group.send_batches()
+            self._report()
+
+    def _limit_steps(self, last: int) -> None:
+        """Make no step after this one."""
+        raise NotImplementedError
+
+    def _fail(self, error: ProtocolError) -> None:
+        """End the run, since a protocol has failed."""
+        if not self.done.done():
+            traceback.print_exception(error, file=sys.stderr)  # in full in the log of the process
+        self._group.fail(error)
+
+    def _report(self) -> None:
+        self._reported = self._law.step
+        self._group.report(self._law.agent, self._reported)
+        self._next_progress = time.monotonic() + self._group.progress_period
+
+    def _report_if_due(self) -> None:
+        """Report, unless that was just done; once more where nothing is new.
+
+        In one of some 600 networks of 90 processes, the switcher was not given the last reports of four.
+        """
+        if time.monotonic() >= self._next_progress:
+            self._report()

@@ -1,0 +1,337 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import TypeVar
+
+from rclpy.duration import Duration
+from rclpy.node import NodeNameNonExistentError
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.task import Future
+
+from msg_agents.environment import discovery_scope
+from msg_agents.nodes.diagnostics import Health
+from msg_agents.nodes.ros import LeanNode, every
+from msg_agents.process_layout import RECORDER, SWITCHER
+from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.errors import InputError
+from msg_analysis.messages import topics
+from msg_analysis.messages.acceptance import Refusal, RunRules, sign
+from msg_analysis.messages.messages import ActiveGraph, Progress
+from msg_analysis.messages.topics import Topic, agent_node_name
+from msg_analysis.model.run_record import RunRecord
+
+SIGEV_THREAD = 2  # of <signal.h>: the C library calls a function in a thread of its own
+
+
+class _Event(ctypes.Structure):
+    """``struct sigevent`` of Linux, 64 bytes."""
+
+    _fields_ = (
+        ("value", ctypes.c_void_p),
+        ("signal", ctypes.c_int),
+        ("notify", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("attributes", ctypes.c_void_p),
+        ("padding", ctypes.c_byte * 32),
+    )
+
+
+def exit_after(seconds: int) -> None:
+    """End this process with exit code 0 in so many seconds, unless it has ended by then.
+
+    Neither the interpreter's lock nor the interpreter is needed. C libraries without such timers do nothing.
+    """
+    library = ctypes.CDLL(None, use_errno=True)
+    if not hasattr(library, "timer_create"):
+        return
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, OSError, ValueError):  # there is none, or nobody reads it any more
+            stream.flush()
+    function = ctypes.cast(library._exit, ctypes.c_void_p)
+    event = _Event(notify=SIGEV_THREAD, function=function.value)  # its value, 0, is what _exit is called with
+    timer = ctypes.c_void_p()
+    in_time = (ctypes.c_long * 4)(0, 0, seconds, 0)  # interval and time to the end, each in s and ns
+    if library.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0:
+        library.timer_settime(timer, 0, in_time, None)
+
+
+ACK_TIMEOUT = 4.0  # s for readers to acknowledge the last messages; more than Fast DDS's default heartbeat period, 3 s
+BARE = "_CREATED_BY_BARE_DDS_APP_"  # name of the node of a reader whose participant has no known nodes
+NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
+Message = TypeVar("Message", ActiveGraph, Progress)
+
+
+class NetworkNode(LeanNode):
+    """A node of a run, whose id is in every message. ``done`` ends the node, with an error or without.
+
+    InputError: arguments of ROS 2 changed its name, by which the nodes of a run find each other.
+    """
+
+    def __init__(self, name: str, *, record: RunRecord) -> None:
+        super().__init__(name)
+        if self.get_name() != name:
+            raise InputError(
+                f"--ros-args: __node:={self.get_name()}: expected {name}, because the nodes of a run find each other "
+                "by name: give no name (none in a launch file either), or choose a namespace instead, __ns:=/..."
+            )
+        self.record = record
+        self.run = record.run.bytes
+        self._step_clock = StepClock(record.experiment.step_length)
+        self.done: Future = Future()
+        self.refused: Counter[tuple[str, str]] = Counter()  # by topic and reason
+        self.repeated = 0
+        self._ending: list[NetworkNode] = [self]
+
+    def refuse(self, reason: str, topic: str) -> None:
+        """Count a message that is not part of this run, and warn at the first one per topic and reason.
+
+        Repeated messages are only counted: agents send again what a restarted one may have missed.
+        """
+        if reason == Refusal.REPEATED:
+            self.repeated += 1
+            return
+        self.refused[topic, reason] += 1
+        if self.refused[topic, reason] == 1:
+            self.get_logger().warning(f"refused a message on {topic}: {reason} (further ones are only counted)")
+
+    @property
+    def number(self) -> int:
+        """In messages: that of its agent, from 1."""
+        return NOT_AN_AGENT
+
+    def rejoin(self) -> bool:
+        """Make good what others may have missed while the network was cut; False: not possible yet, ask again."""
+        return True
+
+    def health(self) -> Health:
+        """State of this node; called about once a second."""
+        raise NotImplementedError
+
+    def discovered_all(self) -> bool:
+        """Whether all nodes that should read what this node publishes have been discovered; polled."""
+        return True
+
+    @property
+    def resumed(self) -> bool:
+        """Whether it takes the place of a killed one, for which the others wait."""
+        return False
+
+    def missing_nodes(self) -> list[str]:
+        """Names of the nodes that have not been discovered yet."""
+        return []
+
+    def required_peers(self) -> list[str]:
+        """Names of the nodes without which the run cannot go on; the peers of an agent would be too many to check."""
+        return [SWITCHER]
+
+    def missing_clock(self) -> list[str]:
+        """The publisher of ``/clock``, if one is needed and has not been discovered."""
+        if not self.get_parameter("use_sim_time").value or self.count_publishers(topics.CLOCK.name):
+            return []
+        return [f"a publisher of {topics.CLOCK.name}"]
+
+    def names_in_namespace(self) -> Counter[str]:
+        """How many nodes have each name, in the namespace of the run; other runs may share the domain."""
+        here = self.get_namespace()
+        return Counter(name for name, namespace in self.get_node_names_and_namespaces() if namespace == here)
+
+    def _own_names(self) -> list[str]:
+        return [*map(agent_node_name, range(self.record.experiment.agents)), SWITCHER, RECORDER]
+
+    def duplicate_names(self) -> list[str]:
+        """Names of this run that more than one node has."""
+        count = self.names_in_namespace()
+        return [name for name in self._own_names() if count[name] > 1]
+
+    def undiscovered(self, expected: Iterable[str]) -> list[str]:
+        """Those of the expected nodes that are not there: nodes of the run in its namespace, others in any.
+
+        Recorders such as that of ``ros2 bag record`` are always in the namespace /.
+        """
+        here, everywhere = self.names_in_namespace(), set(self.get_node_names())
+        own = set(self._own_names())
+        return [name for name in expected if name not in (here if name in own else everywhere)]
+
+    def duplicate_name_error(self, names: Iterable[str], seconds: float) -> InputError:
+        """The error after several nodes have had the same name for so many seconds."""
+        return InputError(
+            f"after {seconds:.0f} s more than one node was still called {', '.join(names)}, {discovery_scope()}: end "
+            "the other process, or choose another domain"
+        )
+
+    def begin(self) -> None:
+        """Start: all nodes have been discovered."""
+
+    def finish(self, *, complete: bool, deadline: float) -> None:
+        """The process is about to end; ``complete``: the node has done its part (False: it was interrupted).
+
+        It may wait for other nodes until ``deadline`` [s of the monotonic clock].
+        """
+
+    def fail(self, error: Exception) -> None:
+        """End the process with an error."""
+        if not self.done.done():
+            self.done.set_exception(error)
+
+    def finish_at_end(self, nodes: Iterable[NetworkNode] | None = None) -> None:
+        """End these nodes of the process (default: this one) when the switcher announces the end of the run.
+
+        With a node that ends earlier, unread messages or acknowledgements that others need would be lost.
+        """
+        self._ending = [self] if nodes is None else list(nodes)
+        self.subscribe(topics.END, self._receive_end)
+
+    def _receive_end(self, data: bytes) -> None:
+        if self.decode_progress(data, topics.END):
+            for node in self._ending:
+                if not node.done.done():
+                    node.done.set_result(None)
+
+    @cached_property
+    def rules(self) -> RunRules:
+        """Which messages belong to the run."""
+        return RunRules(self.record)
+
+    def decode_graph(self, data: bytes) -> ActiveGraph | None:
+        """A sojourn of the graph of this run; None, and counted, if the bytes are not one."""
+        return self._accepted(self.rules.graph(data), topics.GRAPH)
+
+    def decode_progress(self, data: bytes, topic: Topic) -> Progress | None:
+        """The same of Progress, on one of its topics."""
+        return self._accepted(self.rules.progress(data, topic), topic)
+
+    def _accepted(self, found: Message | str, topic: Topic) -> Message | None:
+        if isinstance(found, str):
+            self.refuse(found, topic.name)
+            return None
+        return found
+
+    def progress(self, topic: Topic, agent: int, step: int, stamp: int | None = None) -> bytes:
+        """Bytes of a Progress message; ``agent``: number from 1, or NOT_AN_AGENT; ``stamp`` [ns]: None: of the step."""
+        time = self._step_clock.nanoseconds(step) if stamp is None else stamp
+        return sign(Progress(time, self.run, agent, step), topic, self.record.key).encode()
+
+    def has_readers(self, publisher: Publisher, expected: Sequence[str]) -> bool:
+        """Whether all the expected nodes read a topic of this node."""
+        # Reading the names inspects every endpoint of the network: only once enough readers are there.
+        return publisher.get_subscription_count() >= len(expected) and not self.missing_readers(publisher, expected)
+
+    def has_other_readers(self, publisher: Publisher, *, reliable: bool = True) -> bool:
+        """Whether a node that is not part of the run reads a topic of this node, reliably or with best effort."""
+        own = {RECORDER, *map(agent_node_name, range(self.record.experiment.agents))}
+        return any(
+            reader.node_name not in own and (reader.qos_profile.reliability == ReliabilityPolicy.RELIABLE) == reliable
+            for reader in self.get_subscriptions_info_by_topic(publisher.topic_name)
+        )
+
+    def _announced_reader(self, name: str, topic: str) -> bool:
+        """Whether a node of this name has announced a reader of a topic that is known.
+
+        From Fast DDS 3 on, readers of Cyclone DDS have no node: it does not repeat to which participant each belongs.
+        """
+        for node, namespace in self.get_node_names_and_namespaces():
+            if node == name:
+                with contextlib.suppress(NodeNameNonExistentError):  # it has just left
+                    if topic in dict(self.get_subscriber_names_and_types_by_node(name, namespace)):
+                        return True
+        return False
+
+    def missing_readers(self, publisher: Publisher, expected: Sequence[str]) -> list[str]:
+        """Names of the expected nodes that do not read a topic of this node yet."""
+        readers = self.get_subscriptions_info_by_topic(publisher.topic_name)
+        found = {reader.node_name for reader in readers}
+        missing = [name for name in expected if name not in found]
+        if missing and BARE in found:
+            missing = [name for name in missing if not self._announced_reader(name, publisher.topic_name)]
+        # Other readers are matched too: all must be, so that ours are among them. Readers that ask for history of a
+        # topic that keeps none are never matched.
+        latched = publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        matching = sum(latched or r.qos_profile.durability != DurabilityPolicy.TRANSIENT_LOCAL for r in readers)
+        if not missing and publisher.get_subscription_count() < matching:
+            return ["(matching)"]
+        return missing
+
+
+CHECK_PERIOD = 1.0  # s between two checks
+FAREWELL = 2.0  # s that the others have to acknowledge that this process leaves
+
+
+class PeersLostError(InputError):
+    """Nodes without which the run cannot go on left before its end."""
+
+
+class PeerPresence:
+    """Ends the process of some nodes when one of the required peers of the first has been gone for ``patience`` s.
+
+    A peer is gone when it has left the network or its lease has ended; ``patience`` allows for a restart. One that has
+    said that it leaves does not come back. (RTPS says that once, best effort, so it is not enough.)
+    """
+
+    # On one machine the supervisor ends all processes when one is lost; across hosts nothing else does.
+
+    def __init__(self, nodes: Sequence[NetworkNode], patience: float) -> None:
+        self._nodes, self._node, self._patience = nodes, nodes[0], patience
+        self._since: dict[str, float] = {}  # monotonic time [s] since which a peer is gone, by name
+        self._left: set[str] = set()  # names that have said that they leave
+        self._returning: list[NetworkNode] = []  # nodes of this process that have to make good what was missed
+        self._publisher = self._node.publisher_of(topics.LEAVE)
+        self._node.subscribe(topics.LEAVE, self._receive)
+
+    def begin(self) -> None:
+        """Check from now on: all nodes have been discovered."""
+        every(self._node, CHECK_PERIOD, self._check)
+
+    def leave(self) -> None:
+        """Say that this process leaves before the end of the run."""
+        numbers = {node.number for node in self._nodes}
+        for number in numbers:
+            self._node.publish(self._publisher, self._node.progress(topics.LEAVE, number, 0))
+        self._publisher.wait_for_all_acked(Duration(seconds=FAREWELL))
+
+    def _receive(self, data: bytes) -> None:
+        message = self._node.decode_progress(data, topics.LEAVE)
+        if message is not None:
+            of_home = message.agent == NOT_AN_AGENT  # where one of them is, the other is, too
+            self._left |= {SWITCHER, RECORDER} if of_home else {agent_node_name(message.agent - 1)}
+            self._check()
+
+    def _check(self) -> None:
+        required = self._node.required_peers()
+        if left := [name for name in required if name in self._left]:
+            self._fail(left, "")
+            return
+        now = time.monotonic()
+        gone = self._node.undiscovered(required)
+        if gone:
+            self._introduce_again()
+        if self._since.keys() - gone:
+            self._returning = list(self._nodes)
+        self._since = {name: self._since.get(name, now) for name in gone}
+        self._returning = [node for node in self._returning if not node.rejoin()]
+        if now - min(self._since.values(), default=now) > self._patience:
+            self._fail(list(self._since), f" and did not return within {self._patience:g} s")
+
+    def _introduce_again(self) -> None:
+        """Make ROS tell the others the names of our nodes: who had given us up does not ask for them.
+
+        It tells them with every new endpoint; to a reader that it takes for a known one, DDS repeats nothing.
+        """
+        self._node.destroy_publisher(self._node.publisher_of(topics.LEAVE))
+
+    def _fail(self, names: Sequence[str], more: str) -> None:
+        self._node.fail(
+            PeersLostError(
+                f"{', '.join(names)} left the network before the end of the run{more}: see the messages on the host "
+                "that runs it"
+            )
+        )

@@ -1,0 +1,385 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The player: publishes the messages of a bag again."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import rclpy
+from builtin_interfaces.msg import Time
+from rclpy.duration import Duration
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.publisher import Publisher
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+
+from msg_agents.nodes.parameters import ros_arguments
+from msg_agents.nodes.playback_messages import RequiredReaders, check_definitions, message_classes
+from msg_agents.nodes.process import leave
+from msg_agents.nodes.ros import LeanNode, RCLError, ros_profile
+from msg_agents.replay import BagClock, parse_remaps, select_topics
+from msg_agents.terminal import Interruption, JobControl, Keyboard
+from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.bags.playback import Message, Playback
+from msg_analysis.errors import InputError
+from msg_analysis.messages.topics import CLOCK, LATCHED, STREAM
+
+DISCOVERY_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
+CHECK_PERIOD = 0.05  # s between two checks of keyboard and clock
+STOPPED_AFTER = 1.0  # s without a check, after which the process is taken to have been stopped
+PROGRESS_PERIOD = 0.2  # s between two reports of progress
+ACK_SLICE = 0.2  # s
+ACK_NOTE_DELAY = 5.0  # s for readers to acknowledge the end before a note; the middleware may ask them only after 3 s
+BLOCKED_AFTER = 0.05  # s to publish one message, from which on a reader is holding the player back
+FINAL_BEFORE = 0.05  # s; an error that comes sooner is final: a slow reader blocks for 100 ms
+RATE_STEP = 1.1
+SEEK_SHARE = 0.05  # of the played part, by one key
+MOST_TYPED = 12  # characters of a time
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlayOptions:
+    """How a bag is played."""
+
+    rate: float = 1.0  # seconds of the bag per second; inf: as fast as the readers take it
+    start_offset: float = 0.0  # s of the bag left out at the beginning
+    duration: float | None = None  # s of the bag that are played; None: all of the rest
+    loop: bool = False
+    paused: bool = False  # whether to start paused
+    clock: float | None = None  # Hz at which ``/clock`` is published; None: not
+    topics: Sequence[str] = ()  # see ``select_topics``, also for ``exclude``
+    exclude: Sequence[str] = ()
+    remaps: Sequence[str] = ()  # see ``parse_remaps``
+    subscribers: int = 0  # readers that every topic must have before playing begins; latched ones need none
+    readers: Sequence[str] = ()  # names of nodes that must read every such topic
+    wait_timeout: float = 30.0  # s to wait for them
+
+
+@dataclass(slots=True)
+class Played:
+    """What has been played so far."""
+
+    messages: int = 0  # published
+    seconds: float = 0.0  # of wall time since playing began
+    held_back: float = 0.0  # s of these in which readers did not take what was published
+    now: float = 0.0  # s from the start of the bag
+    length: float = 0.0  # s of the whole bag
+    rate: float = 1.0  # s of the bag per second
+    paused: bool = False
+    typed: str = ""  # a time to go to that is being typed
+    begun: bool = False  # whether the required readers were there
+
+
+class Player(LeanNode):
+    """Publishes the messages of a bag: the same bytes, in the same order on each topic, without loss.
+
+    InputError: nothing to play from ``start_offset`` on or among the topics, or a bad remapping.
+    """
+
+    # All topics are reliable and keep-all, however they were recorded: best-effort readers match too, and a slow
+    # reliable one holds the player back. Topics recorded as latched are latched. The node receives nothing, so nothing
+    # spins.
+
+    def __init__(
+        self,
+        *,
+        bag: Playback,
+        options: PlayOptions,
+        keyboard: Keyboard,
+        jobs: JobControl,  # tells when the process had been stopped
+        interruption: Interruption,  # tells when it is to end
+        on_progress: Callable[[Played], None],  # called a few times a second
+        on_note: Callable[[str], None],
+    ) -> None:
+        super().__init__("player")
+        self._bag, self._options, self._keyboard, self._jobs = bag, options, keyboard, jobs
+        self._interruption, self._on_progress, self._on_note = interruption, on_progress, on_note
+        self._first = bag.start + round(options.start_offset * SECOND)
+        self._last = bag.end
+        if options.duration is not None:
+            self._last = min(self._last, self._first + round(options.duration * SECOND))
+        if self._first > bag.end:
+            length = (bag.end - bag.start) / SECOND
+            raise InputError(f"--start-offset: {options.start_offset:g} s: the bag is only {length:g} s long")
+        chosen = select_topics(bag.topics, options.topics, options.exclude)
+        if options.clock is not None and CLOCK.name in chosen:
+            chosen.remove(CLOCK.name)
+            if not chosen:
+                raise InputError(
+                    f"--clock: publishes {CLOCK.name} itself, and nothing else is chosen: leave it out to play "
+                    f"{CLOCK.name} as it was recorded, or choose more with --topics"
+                )
+            on_note(f"{CLOCK.name} of the bag is not played: --clock publishes its own")
+        types = message_classes([bag.topics[name] for name in chosen], all_wanted=bool(options.topics), on_note=on_note)
+        names = parse_remaps(options.remaps, chosen)
+        self._latched = {name for name in types if bag.topics[name].latched}
+        self._writers: dict[str, Publisher] = {}
+        for name, kind in types.items():
+            try:
+                qos = ros_profile(LATCHED if name in self._latched else STREAM)
+                self._writers[name] = self.create_publisher(kind, names[name], qos)
+            except InvalidTopicNameException as error:
+                raise InputError(f"--remap: {name}:={names[name]}: {error}") from error
+        check_definitions(self, self._writers, bag.topics)
+        self._ticker = self.publisher_of(CLOCK) if options.clock else None
+        self._time = BagClock(self._first, options.rate, paused=options.paused)
+        self._sought = self._first  # messages of topics that are not latched are left out before this time [ns]
+        self._steps = 0  # messages to be played one by one
+        self._began = self._shown = self._looked = self._ticked = 0.0
+        self._awake = time.monotonic()  # when it was last known not to be stopped
+        self.played = Played(length=(bag.end - bag.start) / SECOND)
+
+    def play(self) -> None:
+        """Play the bag, once or (``loop``) until a signal ends it; InputError: required readers are missing."""
+        early = self._publish_early()
+        self._on_progress(self.played)
+        options = self._options
+        required = RequiredReaders(
+            self,
+            self._writers,
+            self._latched,
+            subscribers=options.subscribers,
+            readers=options.readers,
+            timeout=options.wait_timeout,
+        )
+        required.wait(self._pause, self._on_note)
+        self.played.begun = True
+        self._jobs.continued()
+        self._time.jump(self._first)
+        self._began = self._awake = time.monotonic()
+        skip = early
+        while True:
+            self._play_once(skip)
+            skip = 0
+            if not self._options.loop:
+                break
+            self._sought = self._first
+            self._time.jump(self._first)
+        self._wait_for_acknowledgements()
+
+    def _check_signals(self) -> None:
+        """End or stop the process if a signal has asked for it."""
+        self._interruption.check()
+        self._jobs.check()
+
+    def _pause(self) -> None:
+        """Wait a little before the start: signals, keyboard, progress."""
+        self._check_signals()
+        self._press(self._keyboard.wait(DISCOVERY_POLL), self._first)
+        self._on_progress(self.played)
+
+    def _publish_early(self) -> int:
+        """Publish what latched topics hold at the start, before anything else; the number of messages.
+
+        A reader that needs it to set up its other subscriptions (which run it is, for example) gets it in time.
+        """
+        count = 0
+        if self._latched:
+            for message in self._bag.messages(self._latched, self._first):
+                self._check_signals()
+                self._send(message)
+                count += 1
+        self.played.messages += count
+        return count
+
+    def _play_once(self, early: int) -> None:
+        """Play the bag without its first ``early`` messages of latched topics, which have been published."""
+        for message in self._bag.messages(self._writers.keys(), self._last):
+            self._check_signals()
+            latched = message.topic in self._latched
+            if latched and early:
+                early -= 1
+                continue
+            if message.time < self._sought and not latched:
+                continue
+            self._wait_for(message)
+            if message.time < self._sought and not latched:  # a key meanwhile
+                continue
+            before = time.monotonic()
+            self._send(message)
+            took = time.monotonic() - before
+            if took > BLOCKED_AFTER:
+                self._time.hold(took)
+                self._jobs.continued()  # a stop in that time is not counted again
+                self.played.held_back += took
+                self._awake = before + took
+            self.played.messages += 1
+
+    def _send(self, message: Message) -> None:
+        """Publish a message, again while readers block; one that is refused without waiting never goes through."""
+        writer = self._writers[message.topic]
+        while True:
+            before = time.monotonic()
+            try:
+                writer.handle.publish_raw(message.data)
+                return
+            except RCLError as error:
+                if time.monotonic() - before < FINAL_BEFORE:
+                    kind = self._bag.topics[message.topic].type_name
+                    raise InputError(
+                        f"topic {message.topic}: {len(message.data)} bytes: not a valid {kind} message "
+                        f"({error}): leave the topic out with --exclude"
+                    ) from error
+            self._check_signals()
+
+    def _wait_for(self, message: Message) -> None:
+        """Wait until a message is due; handle signals, keyboard, ``/clock`` and progress meanwhile."""
+        while message.time >= self._sought:
+            now = time.monotonic()
+            wait = self._time.until(message.time)
+            if wait <= 0 and now < self._looked + CHECK_PERIOD and (self._ticker is None or now < self._next_tick()):
+                return
+            self._update(now, message.time)
+            wait = self._time.until(message.time)
+            if self._steps and wait > 0:
+                self._steps -= 1
+                self._time.jump(message.time)
+                return
+            if wait <= 0:
+                return
+            soonest = (
+                min(wait, CHECK_PERIOD) if self._ticker is None else min(wait, CHECK_PERIOD, self._next_tick() - now)
+            )
+            self._press(self._keyboard.wait(soonest), message.time)
+            self._check_signals()
+
+    def _update(self, now: float, next_time: int) -> None:
+        # The time of a stop does not count. We may notice it late: any thread of the process may get the signal.
+        if self._jobs.continued() or now - self._awake > STOPPED_AFTER:
+            now = time.monotonic()
+            self._time.hold(now - self._awake)
+        self._looked = self._awake = now
+        self._press(self._keyboard.wait(0.0), next_time)
+        here = self._time.now(next_time)
+        if self._ticker is not None and now >= self._next_tick():
+            self._ticked = now
+            seconds, nanoseconds = divmod(here, SECOND)
+            self._ticker.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
+        if now >= self._shown + PROGRESS_PERIOD:
+            self._shown = now
+            self._report(here)
+
+    def _next_tick(self) -> float:
+        """Monotonic time [s] at which ``/clock`` is published next."""
+        return self._ticked + 1.0 / (self._options.clock or math.inf)
+
+    def _press(self, keys: Iterable[str], next_time: int) -> None:
+        for key in keys:
+            if key == "space":
+                self._time.pause(not self._time.paused, next_time)
+            elif key == "enter" and self.played.typed:
+                self._go_to(self.played.typed, next_time)
+            elif key in ("step", "enter"):
+                self._time.pause(True, next_time)
+                self._steps += 1
+            elif key == "forward":
+                self._seek(self._here(next_time) + round(SEEK_SHARE * (self._last - self._first)))
+            elif key in ("up", "down"):
+                self._time.change_rate(RATE_STEP if key == "up" else 1 / RATE_STEP, next_time)
+            else:  # of a time
+                typed = self.played.typed
+                self.played.typed = typed[:-1] if key == "back" else (typed + key)[:MOST_TYPED]
+
+    def _here(self, next_time: int) -> int:
+        return max(self._time.now(next_time), self._sought)
+
+    def _go_to(self, typed: str, next_time: int) -> None:
+        """Go forward to a time that was typed [s from the start of the bag]; there is no way back."""
+        self.played.typed = ""
+        here, end = ((each - self._bag.start) / SECOND for each in (self._here(next_time), self._last))
+        try:
+            wanted = float(typed)
+        except ValueError:
+            self._on_note(f"{typed}: expected a time in seconds, such as 12.5")
+            return
+        if here <= wanted <= end:
+            self._seek(self._bag.start + round(wanted * SECOND))
+        elif wanted > end:
+            self._on_note(f"{typed} s: expected a time up to {end:g} s, where the bag ends")
+        else:
+            self._on_note(f"{typed} s: there is no way back from {here:g} s: start again with --start-offset {typed}")
+
+    def _seek(self, when: int) -> None:
+        """Go forward to a time of the bag [ns]. Latched messages on the way are all published, at once."""
+        if self.played.begun:
+            self._sought = min(when, self._last)
+            self._time.jump(self._sought)
+
+    def _report(self, here: int) -> None:
+        played = self.played
+        played.seconds = time.monotonic() - self._began
+        played.now = (here - self._bag.start) / SECOND
+        played.rate, played.paused = self._time.rate, self._time.paused
+        self._on_progress(played)
+
+    def _wait_for_acknowledgements(self) -> None:
+        """Wait until all readers have acknowledged everything: the rest would be lost with this process."""
+        self._report(self._last)
+        waiting = list(self._writers.values())
+        began, noted = time.monotonic(), False
+        while waiting:
+            self._check_signals()
+            each_waits = Duration(seconds=ACK_SLICE / len(waiting))
+            waiting = [writer for writer in waiting if not writer.wait_for_all_acked(each_waits)]
+            if waiting and not noted and time.monotonic() > began + ACK_NOTE_DELAY:
+                noted = True
+                names = ", ".join(writer.topic_name for writer in waiting)
+                self._on_note(f"waiting until the readers of {names} have received everything")
+
+
+def play(
+    path: Path,
+    options: PlayOptions,
+    *,
+    on_progress: Callable[[Played], None] = lambda _: None,
+    on_note: Callable[[str], None] = lambda _: None,
+    on_stop: Callable[[], None] = lambda: None,  # before Ctrl-Z stops the process
+    on_continue: Callable[[], None] = lambda: None,  # when it goes on
+) -> Played:
+    """Play a bag (or one of its files) in this process; BagError or InputError: not a bag, or not playable like that.
+
+    Ctrl-C raises KeyboardInterrupt, another signal SystemExit: only ``on_progress`` then tells how far it came.
+    """
+    bag = Playback(path)
+    for line in bag.damage:
+        on_note(line)
+    known = len(bag.damage)
+    with ros_arguments():
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    nodes: list[Player] = []
+    complete = False
+    try:
+        with Keyboard() as keyboard, Interruption() as interruption:
+
+            def before() -> None:
+                on_stop()
+                keyboard.let_go()
+
+            def after() -> None:
+                keyboard.listen()
+                on_continue()
+
+            with JobControl(before=before, after=after) as jobs:
+                player = Player(
+                    bag=bag,
+                    options=options,
+                    keyboard=keyboard,
+                    jobs=jobs,
+                    interruption=interruption,
+                    on_progress=on_progress,
+                    on_note=on_note,
+                )
+                nodes = [player]
+                player.play()
+                complete = True
+    finally:
+        for line in bag.damage[known:]:
+            on_note(line)
+        leave(nodes, None, complete=complete)
+    return nodes[0].played

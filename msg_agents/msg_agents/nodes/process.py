@@ -1,0 +1,252 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The life of one process of a network: nodes, start gate, spin, end."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import ctypes
+import faulthandler
+import gc
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import rclpy
+from rclpy.exceptions import NotInitializedException
+from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from msg_agents.discovery.relay import write_introduction
+from msg_agents.discovery.rtps import PREFIX_SIZE, remove_participant
+from msg_agents.environment import discovery_scope
+from msg_agents.nodes.base import ACK_TIMEOUT, NetworkNode, PeerPresence, exit_after
+from msg_agents.nodes.diagnostics import HealthReporter
+from msg_agents.nodes.parameters import ros_arguments
+from msg_agents.recovery import Takeover
+from msg_agents.run.fork_server import ends_at_once
+from msg_agents.run.lifeline import show_stacks_when_asked
+from msg_analysis.errors import InputError
+
+FIRST_POLL, GATE_POLL = 0.005, 0.2  # s; a tight loop on the ROS graph starves discovery where many processes look
+PAUSE_PER_LOOK = 40  # times as long as a look took, which is longer the more processes compete for the cores
+SPIN_SLICE = 0.5  # s; without a time-out EventsExecutor.spin of Jazzy never wakes up
+GC_THRESHOLD = 50_000  # objects; the hot path makes no cycles, so young collections find nothing
+LEAVE_GRACE = 5  # s
+INTERRUPTED_GRACE = 15  # s; longer, because a process that ends by it has failed
+USE_SIM_TIME = ["--ros-args", "-p", "use_sim_time:=true"]
+
+
+_LEFT: list[object] = []  # what must not be taken down before the end of the process
+
+
+class NotFoundError(InputError):
+    """Some nodes of the run were not discovered in time."""
+
+
+def make_executor(kind: str = "events") -> Executor:
+    """The events executor where this rclpy has it (a third of the CPU time per message), else the single-threaded one.
+
+    ``kind``: "events" or "single"; "single" is for comparison.
+    """
+    if kind == "events":
+        try:
+            from rclpy.experimental.events_executor import EventsExecutor
+        except ImportError:
+            pass
+        else:
+            return EventsExecutor()
+    return SingleThreadedExecutor()
+
+
+def prefer_throughput() -> None:
+    """Ask the scheduler for throughput instead of immediate wake-ups (Linux: SCHED_BATCH).
+
+    In lockstep all cores are busy with processes that wake each other with every message; if each wake-up preempts the
+    running process, a third of the time goes into the switches. Threads made later inherit the policy.
+    """
+    with contextlib.suppress(AttributeError, OSError):  # other systems have no such policy
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+def run_nodes(
+    make_nodes: Callable[[], Sequence[NetworkNode]],  # called after rclpy.init
+    *,
+    executor: str = "events",  # or "single"
+    discovery_timeout: float,  # s
+    throughput: bool = True,  # see ``prefer_throughput``
+    use_sim_time: bool = False,
+    account: Path | None = None,  # status file, written once a second and at the end
+    introduction: int | None = None,  # descriptor for what ``Introducer`` wants to know
+    patience: float | None = None,  # s, see ``PeerPresence``; None: no limit
+) -> bool:
+    """Run nodes until each has done its part; False if the process was told to stop (SIGINT, SIGTERM) before.
+
+    NotFoundError: names the missing nodes. InputError: names that several nodes have, or what a node failed with.
+    """
+    show_stacks_when_asked()
+    # Python's own handler would raise KeyboardInterrupt anywhere, in the middle of a write for example. ROS's handler,
+    # installed on top, ends the spin between two callbacks.
+    told: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: told.append(number))
+    if throughput:
+        prefer_throughput()
+    arguments = [*sys.argv, *(USE_SIM_TIME if use_sim_time else [])]
+    handlers = SignalHandlerOptions.ALL
+    if (
+        patience is not None
+    ):  # with ROS's handler, nothing could be published after a signal: see ``PeerPresence.leave``
+        signal.signal(signal.SIGTERM, lambda number, _: told.append(number))
+        handlers = SignalHandlerOptions.NO
+    with ros_arguments():
+        rclpy.init(args=arguments, signal_handler_options=handlers)
+    nodes: Sequence[NetworkNode] = []
+    prefix = b""  # of a process that was introduced
+    reporter: HealthReporter | None = None
+    presence: PeerPresence | None = None
+    spinner: Executor | None = None
+    complete = False
+    try:
+        if told:  # before ROS's handler was there
+            raise ExternalShutdownException
+        nodes = make_nodes()
+        if introduction is not None:
+            prefix = own_prefix(nodes[0])
+            write_introduction(introduction, nodes[0].get_name(), prefix)
+        reporter = HealthReporter(nodes, account)
+        presence = None if patience is None else PeerPresence(nodes, patience)
+        spinner = make_executor(executor)
+        for node in nodes:
+            spinner.add_node(node)
+        _gate(nodes, discovery_timeout, told)
+        # All objects made so far live until the end: the garbage collector need not scan them again and again.
+        gc.collect()
+        gc.freeze()
+        gc.set_threshold(GC_THRESHOLD)
+        for node in nodes:
+            node.begin()
+        if presence is not None:
+            presence.begin()
+        for node in nodes:
+            while not node.done.done():
+                if told:
+                    raise ExternalShutdownException
+                spinner.spin_until_future_complete(node.done, timeout_sec=SPIN_SLICE)
+            node.done.result()
+        complete = True
+    except ExternalShutdownException:
+        pass
+    except (RuntimeError, NotInitializedException):  # RCLError among them: a signal came in the middle of a call
+        if rclpy.ok():
+            raise
+    finally:
+        if presence is not None and not complete and rclpy.ok():
+            presence.leave()
+        deadline = time.monotonic() + ACK_TIMEOUT
+        for node in nodes:
+            node.finish(complete=complete, deadline=deadline)
+        if reporter:
+            reporter.write_status_file()
+        _ignore_interrupts()
+        if prefix and ends_at_once():
+            leave_at_once(nodes, spinner, prefix)
+        else:
+            leave(nodes, spinner, complete=complete)
+    return complete
+
+
+def _ignore_interrupts() -> None:
+    """Ignore SIGINT until the process has ended."""
+    # Launchers without a terminal pass on a SIGINT that all have got. Python gives it its default action while it ends,
+    # unless it is ignored: the process would be killed before the middleware has removed its shared memory.
+    # The C library first: a signal that came while Python replaces its handler would be printed as an error.
+    ctypes.CDLL(None).signal(signal.SIGINT, ctypes.c_void_p(signal.SIG_IGN))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def own_prefix(node: Node) -> bytes:
+    """The prefix of the GUIDs of this process, read from the endpoints of one of its nodes.
+
+    Empty if that cannot be told, since another node has the same name.
+    """
+    own = (node.get_name(), node.get_namespace())
+    endpoints = [p for topic in node.publishers for p in node.get_publishers_info_by_topic(topic.topic_name)]
+    prefixes = {bytes(p.endpoint_gid[:PREFIX_SIZE]) for p in endpoints if (p.node_name, p.node_namespace) == own}
+    return prefixes.pop() if len(prefixes) == 1 else b""
+
+
+def store_participant(takeovers: Sequence[Takeover], node: Node) -> None:
+    """Store the GUID prefix of this process for a later takeover; without one, that will remove no process."""
+    prefix = own_prefix(node) if takeovers else b""
+    for takeover in takeovers if prefix else ():
+        takeover.store_prefix(prefix)
+
+
+def leave(nodes: Sequence[Node], executor: Executor | None, *, complete: bool) -> None:
+    """Remove the nodes from the network, so that no other node waits for them, and make sure that the process ends.
+
+    As long as an executor has a node, the middleware keeps it, and the others are not told.
+    """
+    # When many participants leave at once, Fast DDS 2.14 can deadlock in DomainParticipant::set_listener, with the
+    # interpreter's lock held or after the interpreter has gone. Then only C code helps. Nothing is lost, because a
+    # complete process has delivered everything by now.
+    if complete:
+        exit_after(LEAVE_GRACE)
+    else:
+        faulthandler.dump_traceback_later(INTERRUPTED_GRACE, exit=True)
+    if executor is not None:
+        executor.shutdown()
+    for node in nodes:
+        node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def leave_at_once(nodes: Sequence[Node], executor: Executor | None, prefix: bytes) -> None:
+    """Let the end of this process be its removal from the network, in one message to each of the others.
+
+    For processes that the introducer knows, which have no shared memory. Otherwise each endpoint's end would be told to
+    each of them: in a large network more messages than all the rest.
+    """
+    _LEFT.extend([executor, *nodes])
+    atexit.register(remove_participant, prefix, int(os.environ.get("ROS_DOMAIN_ID") or 0), repeats=1)
+    rclpy.try_shutdown()
+
+
+def _gate(nodes: Sequence[NetworkNode], timeout: float, told: Sequence[int]) -> None:
+    """Wait until the publishers of all nodes have found their readers, and every name belongs to one node only.
+
+    ``told``: signals that end the wait.
+
+    Readers are identified by name: with duplicates, a run might start without the node that belongs to it.
+    """
+    deadline = time.monotonic() + timeout
+    waiting = list(nodes)
+    warned = False
+    while True:
+        begun = time.monotonic()
+        waiting = [node for node in waiting if not node.discovered_all() or node.missing_clock()]
+        late = time.monotonic() > deadline
+        twice = nodes[0].duplicate_names() if late or not waiting else []
+        if not waiting and not twice:
+            return
+        if twice and not warned:
+            warned = True
+            names = ", ".join(twice)
+            nodes[0].get_logger().warning(f"more than one node is called {names}: waiting until only one is left")
+        if late and twice:
+            raise nodes[0].duplicate_name_error(twice, timeout)
+        if late:
+            missing = sorted({name for node in waiting for name in node.missing_nodes() + node.missing_clock()})
+            raise NotFoundError(
+                f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} did not discover: "
+                f"{', '.join(missing)}. Are they running {discovery_scope()}?"
+            )
+        if told or not rclpy.ok():
+            raise ExternalShutdownException
+        time.sleep(min(max(FIRST_POLL, PAUSE_PER_LOOK * (time.monotonic() - begun)), GATE_POLL))

@@ -1,0 +1,245 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""rclpy: nodes without parameter services, timers, QoS, errors."""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, cast
+
+import rclpy
+from msg_agents_interfaces.msg import AgentState
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ROSClock
+from rclpy.clock_type import ClockType
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.subscription import Subscription
+from rclpy.type_support import check_for_type_support
+
+from msg_agents.nodes.parameters import PROCESS
+from msg_analysis.errors import InputError
+from msg_analysis.messages.topics import Qos, Topic
+
+
+def use_middleware() -> None:
+    """Load rclpy's middleware and the messages; raises whatever goes wrong."""
+    rclpy.init()
+    rclpy.shutdown()
+    check_for_type_support(AgentState)
+
+
+try:
+    from rclpy._rclpy_pybind11 import RCLError
+except ImportError:  # rclpy of other distributions
+    from rclpy.impl.implementation_singleton import rclpy_implementation
+
+    RCLError = rclpy_implementation.RCLError
+
+__all__ = ["RCLError", "until_shutdown"]
+
+
+@contextmanager
+def until_shutdown(node: Node) -> Iterator[None]:
+    """Drop what cannot be published any more: a signal has shut rclpy down in the middle of a callback.
+
+    The executor would print the error as FATAL, with a stack.
+    """
+    try:
+        yield
+    except RCLError:
+        if node.context.ok():
+            raise
+
+
+def ros_profile(qos: Qos) -> QoSProfile:
+    """The profile for rclpy."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_ALL if qos.depth is None else HistoryPolicy.KEEP_LAST,
+        depth=qos.depth or 0,
+        reliability=ReliabilityPolicy.RELIABLE if qos.reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if qos.latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+FAR_OFF = 3600.0  # s
+
+
+class DueTimer:
+    """Calls back once, when the node's clock (a wall clock, or ``/clock`` under use_sim_time) has reached a given time.
+
+    ROS 2's own timers are periodic and count from when they were made. This one is set anew for every time, so it does
+    not drift and has the phase that was asked for. The callback may come a little late.
+    """
+
+    def __init__(self, node: Node, callback: Callable[[], None]) -> None:
+        self._clock = cast(ROSClock, node.get_clock())
+        self._callback = callback
+        self._timer = node.create_timer(FAR_OFF, self._fire)
+        self._timer.cancel()
+
+    def now(self) -> int:
+        """Time of the clock [ns]; 0 under use_sim_time until ``/clock`` has been received."""
+        if self._clock.ros_time_is_active:
+            return int(self._clock.now().nanoseconds)
+        return time.time_ns()  # what that clock reads then, in a third of the time
+
+    def set(self, when: int, now: int | None = None) -> None:
+        """Call back at time ``when`` of the clock [ns], at once if it has passed; ``now``: its time, if known."""
+        # The clock may have moved on from ``now``: the callback is then a little later.
+        self._timer.timer_period_ns = max(1, when - (self.now() if now is None else now))
+        self._timer.reset()
+
+    def _fire(self) -> None:
+        self._timer.cancel()
+        self._callback()
+
+
+def every(node: Node, period: float, callback: Callable[[], None]) -> None:
+    """Call back every ``period`` s of wall time, from the node's executor, even while the node's clock stands still."""
+    node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def after(node: Node, seconds: float, callback: Callable[[], None]) -> None:
+    """Call back once, after so many seconds of wall time."""
+
+    def fire() -> None:
+        node.destroy_timer(timer)
+        callback()
+
+    timer = node.create_timer(seconds, fire, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+LOSSLESS = ("history", "reliability", "durability", "lifespan")
+"""Policies that must not change where nothing may be lost, except that a publisher may become latched."""
+
+
+def message_class(type_name: str) -> Any:
+    """Class of a type such as std_msgs/msg/String; ImportError, AttributeError or ValueError without one."""
+    package, kind, name = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), name)
+
+
+def load_type_support(topics: Iterable[Topic]) -> None:
+    """Load what rclpy loads when a topic of this type is first used."""
+    for topic in topics:
+        check_for_type_support(message_class(topic.type.full_name))
+
+
+class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy can follow
+    """A node without parameter services, type descriptions and /rosout.
+
+    Each node would have seven services and /rosout, which cost more than the network if there are many nodes.
+    Parameters are declared all the same; the option ``parameter_services`` adds their services.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._takes_overrides = False  # rclpy cannot handle overrides yet when it makes the node's own topics
+        super().__init__(
+            name,
+            start_parameter_services=bool(PROCESS.values.get("parameter_services")),
+            enable_rosout=False,
+            parameter_overrides=[Parameter("start_type_description_service", value=False)],
+        )
+        self._takes_overrides = PROCESS.qos_overrides
+        PROCESS.declare(self)
+
+    def publisher_of(self, topic: Topic, agent: int = 0) -> Publisher:
+        """A publisher of a topic; ``agent`` (index from 0) where every agent has one."""
+        return self.create_publisher(message_class(topic.type.full_name), topic.of(agent), ros_profile(topic.qos))
+
+    def subscribe(
+        self, topic: Topic, callback: Callable[[bytes], None], *, agent: int = 0, qos: Qos | None = None
+    ) -> Subscription:
+        """Pass the messages of a topic on as CDR bytes; ``qos``: if not that of the topic."""
+        kind, profile = message_class(topic.type.full_name), ros_profile(qos or topic.qos)
+        return self.create_subscription(kind, topic.of(agent), callback, profile, raw=True)
+
+    def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Publisher:
+        """As in rclpy; with the user's overrides of the quality of service, as far as no message would be lost."""
+        kinds = [
+            QoSPolicyKind.DEADLINE,
+            QoSPolicyKind.LIFESPAN,
+            QoSPolicyKind.LIVELINESS,
+            QoSPolicyKind.LIVELINESS_LEASE_DURATION,
+        ]
+        return self._create(super().create_publisher, kinds, msg_type, topic, qos_profile, **options)
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[[Any], None], qos_profile: Any, **options: Any
+    ) -> Subscription:
+        """As in rclpy; overrides as in ``create_publisher``."""
+
+        def create(msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Subscription:
+            return super(LeanNode, self).create_subscription(msg_type, topic, callback, qos_profile, **options)
+
+        return self._create(create, [], msg_type, topic, qos_profile, **options)
+
+    def _create(
+        self,
+        create: Callable[..., Any],
+        kinds: list[QoSPolicyKind],
+        msg_type: Any,
+        topic: str,
+        qos: Any,
+        **options: Any,
+    ) -> Any:
+        if not self._takes_overrides:
+            return create(msg_type, topic, qos, **options)
+        qos = copy.copy(qos) if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)  # rclpy changes it in place
+        before, publishes = copy.copy(qos), bool(kinds)
+        kinds = [QoSPolicyKind.HISTORY, QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY, *kinds]
+        if before.history != HistoryPolicy.KEEP_ALL:  # depth has no meaning there
+            kinds.append(QoSPolicyKind.DEPTH)
+        # The parameters go by the resolved name of the topic.
+        final = self.resolve_topic_name(topic)
+
+        def check(profile: QoSProfile) -> SetParametersResult:
+            reason = objection(before, profile, publishes=publishes)
+            return SetParametersResult(successful=not reason, reason=reason)
+
+        try:
+            return create(
+                msg_type, topic, qos, qos_overriding_options=QoSOverridingOptions(kinds, callback=check), **options
+            )
+        except (InvalidQosOverridesError, RuntimeError) as error:
+            if not isinstance(error, InvalidQosOverridesError) and "QoS override" not in str(error):
+                raise
+            side = "publisher" if publishes else "subscription"
+            reason = str(error).partition("not valid: ")[2] or str(error)
+            raise InputError(f"parameter qos_overrides.{final}.{side}: {reason}") from error
+
+    def publish(self, publisher: Publisher, data: bytes) -> None:
+        """Publish CDR bytes on a reliable, keep-all publisher, again until they go through, or this process has to end.
+
+        A slow reader blocks such a writer; after 100 ms the middleware raises, and the message has not been written.
+        """
+        while True:
+            try:
+                # What Publisher.publish does with bytes, without entering the handle's context each time.
+                publisher.handle.publish_raw(data)
+                return
+            except RCLError:
+                if not self.context.ok():  # see ``until_shutdown``
+                    return
+
+
+def objection(before: QoSProfile, after: QoSProfile, *, publishes: bool) -> str:
+    """Why a quality of service may not be overridden so, or empty text; publishers may become latched."""
+    if before.history != HistoryPolicy.KEEP_ALL:  # messages may be lost there anyway
+        return ""
+    for policy in LOSSLESS:
+        ours, theirs = getattr(before, policy), getattr(after, policy)
+        latched_as_well = policy == "durability" and publishes and theirs.name == "TRANSIENT_LOCAL"
+        if theirs != ours and not latched_as_well:
+            names = [str(getattr(value, "name", value)).lower() for value in (theirs, ours)]
+            return f"{policy}: {names[0]}: messages of the run would be lost or never arrive: expected {names[1]}"
+    return ""

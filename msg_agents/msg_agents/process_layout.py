@@ -1,0 +1,393 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Which processes a run has, on which hosts and cores.
+
+A network spread over several hosts: which agents are where, and how the processes find each other.
+
+Every host runs its share of the same plan, from the same run record. The processes find each other at the addresses
+in the hosts file, without multicast, which routers, access points and bridges often do not pass on.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import socket
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from msg_agents.discovery.profiles import MOST_PARTICIPANTS, profile_for_hosts
+from msg_agents.discovery.rtps import PEERS_VARIABLE
+from msg_agents.environment import DISCOVERY_TIMEOUT, LAST_DOMAIN, USER_TIMEOUT, node_environment
+from msg_analysis.bags.mcap_chunks import DEFAULT_STORAGE, MEGABYTE, Storage
+from msg_analysis.common.arrays import BoolArray
+from msg_analysis.common.resources import count_cores
+from msg_analysis.errors import InputError
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.loading import read_yaml
+from msg_analysis.experiment.network_spec import expected
+from msg_analysis.experiment.problems import ExperimentError, problem, show, translate
+from msg_analysis.messages.topics import agent_node_name
+
+RECORDER, SWITCHER, CHANNEL = "recorder", "switcher", "channel"
+SMALL = 8
+"""Of ``processes: auto``: up to so many agents, each has a process of its own; beyond, there is one process per so many
+agents, but not more than the machine has cores."""
+MOST_PROCESSES = 200
+"""Agent processes that ``Introducer`` introduces to each other, which with switcher, recorder and the user's own tools
+fill the ports of two ROS domains."""
+MOST_UNAIDED = 90
+"""Agent processes that look for each other: Fast DDS finds ``MOST_PARTICIPANTS``, of which some are for others."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessPlan:
+    """One process of a network."""
+
+    name: str
+    arguments: tuple[str, ...]  # of the command ``msg-agents``
+    agents: tuple[int, ...] = ()  # indices from 0
+    resumes: bool = False  # whether the same command takes over after the process was killed
+
+    @property
+    def nodes(self) -> list[str]:
+        """Names of its nodes."""
+        return [agent_node_name(agent) for agent in self.agents] or [self.name]
+
+    @property
+    def first_node(self) -> str:
+        """Name of its first node."""
+        return self.nodes[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """What one host runs of a network that is spread over several hosts."""
+
+    agents: tuple[int, ...]  # indices from 0, ascending
+    home: bool  # whether recorder and switcher run here
+    discovery_timeout: float  # s for which nodes look for those of other hosts, which the user starts
+    patience: float  # s that companions may be gone before a node ends itself
+
+
+def wanted_processes(experiment: ValidExperiment, agents: int) -> int:
+    """Most processes that an experiment may have for so many agents, on a machine of any number of cores."""
+    wanted = experiment.run.processes
+    return min(agents, wanted) if isinstance(wanted, int) else agents
+
+
+def count_processes(experiment: ValidExperiment, agents: int | None = None, *, most: int = MOST_UNAIDED) -> int:
+    """Number of processes for ``agents`` agents (None: all) on this machine; InputError: more than ``most``."""
+    agents = experiment.agents if agents is None else agents
+    wanted, count = experiment.run.processes, wanted_processes(experiment, agents)
+    if wanted == "auto" and agents > SMALL:
+        # A message to another process costs more than the step it is for: no more processes than can run at once.
+        return min(math.ceil(agents / SMALL), most, count_cores())
+    if count > most:
+        raise InputError(
+            f"run.processes: {wanted} ({count} processes): expected at most {most}, because discovery on one machine "
+            "finds no more participants: give a smaller number, several agents share a process"
+        )
+    return count
+
+
+def split_agents(
+    experiment: ValidExperiment, agents: Sequence[int] | None = None, *, most: int = MOST_UNAIDED
+) -> list[tuple[int, ...]]:
+    """The agents (indices, ascending; None: all) of each process; InputError: more than ``most`` processes."""
+    agents = range(experiment.agents) if agents is None else agents
+    count = count_processes(experiment, len(agents), most=most)
+    # Consecutive agents share a process: in most graphs they are neighbours, and their messages stay inside.
+    return [tuple(agents[i * len(agents) // count : (i + 1) * len(agents) // count]) for i in range(count)]
+
+
+def process_name(agents: Sequence[int]) -> str:
+    """The name of a process with these agents (indices, ascending)."""
+    first, last = agents[0] + 1, agents[-1] + 1
+    rest = f"to_{last}" if last - first == len(agents) - 1 else f"and_{len(agents) - 1}_more"
+    return f"agent_{first}" if first == last else f"agents_{first}_{rest}"
+
+
+def discovery_timeout(agents: int, processes: int) -> float:
+    """Seconds after which a node of a network of so many agents and processes gives up on the missing ones.
+
+    The first process waits for the last one: two or more start per second, and many endpoints take longer to discover.
+    """
+    return max(DISCOVERY_TIMEOUT, 2.0 * processes + 0.1 * agents)
+
+
+def plan_network(
+    experiment: ValidExperiment,
+    run_file: Path,  # run record, read by every node
+    bag: Path | None,  # directory to record to; None: no recorder
+    checkpoints: Path | None = None,  # directory of the states for a takeover; None: killed processes cannot resume
+    *,
+    use_sim_time: bool = False,
+    parameter_services: bool = False,
+    storage: Storage = DEFAULT_STORAGE,
+    share: Share | None = None,
+    readers: Sequence[str] = (),  # nodes that the user starts, and that must read the topics before the run starts
+    most: int = MOST_UNAIDED,
+    hosts: Sequence[Sequence[int]] = (),  # agents of each host of a channel: a process is on one; empty: no channel
+) -> list[ProcessPlan]:
+    """The processes of a run, in the order in which to start them; with ``share``, those of this host only.
+
+    InputError: more than ``most`` processes with agents.
+    """
+    here = tuple(range(experiment.agents)) if share is None else share.agents
+    groups = [group for part in hosts or [here] for group in split_agents(experiment, part, most=most)]
+    count = len(groups)
+    if count > most:
+        raise InputError(f"run.processes: {count} processes on all hosts: expected at most {most}: give fewer")
+    common: tuple[str, ...] = ("--use-sim-time",) if use_sim_time else ()
+    if parameter_services:
+        common += ("--parameter-services",)
+    timeout = discovery_timeout(experiment.agents, count) if share is None else share.discovery_timeout
+    if readers or hosts:  # what a channel loses is sent again
+        timeout = max(timeout, USER_TIMEOUT)
+    if timeout != DISCOVERY_TIMEOUT:
+        common += ("--discovery-timeout", f"{timeout:g}")
+    awaited = ([RECORDER] if bag is not None or share is not None else []) + list(readers)
+    options = common + tuple(part for name in awaited for part in ("--await", name))
+    if checkpoints is not None:
+        options += ("--checkpoint", str(checkpoints))
+    if share is not None:
+        options += ("--patience", f"{share.patience:g}")
+    resumes = checkpoints is not None
+    home = share is None or share.home
+    plans = []
+    if bag is not None and home:
+        files: tuple[str, ...] = ("--compression", storage.compression)
+        if storage.split_size is not None:
+            files += ("--split-size", repr(storage.split_size / MEGABYTE))
+        plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag), *files, *common)))
+    for agents in groups:
+        numbers = [part for agent in agents for part in ("--agent", str(agent + 1))]
+        arguments = ("agent", str(run_file), *numbers, *options)
+        plans.append(ProcessPlan(process_name(agents), arguments, agents, resumes))
+    if home:
+        plans.append(ProcessPlan(SWITCHER, ("switcher", str(run_file), *options), resumes=resumes))
+    return plans
+
+
+def partners(plans: Sequence[ProcessPlan], listens: BoolArray) -> dict[str, set[str]]:
+    """The processes that each process exchanges messages with; processes go by their first nodes.
+
+    ``listens``: (m, m), whether agent i ever listens to agent j. Recorder and switcher have to do with all.
+    """
+    exchanges = listens | listens.T
+    names = {plan.first_node for plan in plans}
+    of_agent = {agent: plan.first_node for plan in plans for agent in plan.agents}
+    central = {plan.first_node for plan in plans if not plan.agents}
+    found = {}
+    for plan in plans:
+        peers = {of_agent[int(j)] for i in plan.agents for j in exchanges[i].nonzero()[0]}
+        found[plan.first_node] = (peers | central if plan.agents else names) - {plan.first_node}
+    return found
+
+
+def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) -> dict[str, int]:
+    """A core for each agent process by name, where they and the recorder outnumber two or more cores; else empty.
+
+    ``plans``: in the order of ``plan_network``, so that neighbours share a core. ``first``: index of the first core.
+    """
+    # In lockstep every message wakes the process that receives it. To wake it on another core costs an interrupt there,
+    # and without pinning the scheduler spreads communicating processes over the cores: with two cores, the demo network
+    # makes a third to a half fewer steps per second (docs/performance.md). Networks with successive values of ``first``
+    # begin at different cores, and so share them evenly. The recorder gets no core: agents wait for each other, so a
+    # core that it slows down holds up the others, which then are idle; the scheduler moves it there. The switcher needs
+    # hardly any time.
+    loads = {plan.name: len(plan.agents) for plan in plans if plan.agents}
+    recorded = any(plan.name == RECORDER for plan in plans)
+    if len(cores) < 2 or len(loads) + recorded <= len(cores):
+        return {}
+    total = sum(loads.values())
+    ends = accumulate(loads.values())
+    middles = {name: end - load / 2 for (name, load), end in zip(loads.items(), ends, strict=True)}
+    return {name: cores[(first + int(middle / total * len(cores))) % len(cores)] for name, middle in middles.items()}
+
+
+def keep_to(process: int, core: int) -> None:
+    """Pin a process that has just been started, and its children, to a core; errors are ignored."""
+    try:
+        os.sched_setaffinity(process, {core})
+    except OSError:  # it has ended already, or the core has been taken from us
+        return
+
+
+VISITORS = 8  # participants on a host besides those of the run, such as tools that watch it
+_RANGE = re.compile(r"([0-9]+)-([0-9]+)")
+
+
+def agent_numbers(value: object) -> list[int]:
+    """Agent numbers from a list of numbers and of ranges."""
+    wanted = expected("a list of numbers of agents, from 1, and of ranges such as 3-5")
+    if not isinstance(value, list):
+        raise wanted
+    numbers: list[int] = []
+    for entry in value:
+        found = _RANGE.fullmatch(entry) if isinstance(entry, str) else None
+        first, last = (int(found[1]), int(found[2])) if found else (entry, entry)
+        if not isinstance(first, int) or isinstance(first, bool) or not 1 <= first <= last < 2**32:
+            raise wanted
+        if last - first >= 1_000_000:
+            raise wanted
+        numbers.extend(range(first, last + 1))
+    return numbers
+
+
+class HostSpec(BaseModel):
+    """One host in the hosts file."""
+
+    model_config = ConfigDict(extra="forbid")
+    address: str = Field(
+        min_length=1,
+        description="the address at which the other hosts reach this one",
+        examples=["192.0.2.1"],
+    )
+    agents: Annotated[list[int], BeforeValidator(agent_numbers)] = Field(
+        default=[], description="the agents that run there", examples=[[1, "3-5"]]
+    )
+
+
+class HostsSpec(BaseModel):
+    """The hosts file as data."""
+
+    model_config = ConfigDict(extra="forbid")
+    domain: int = Field(0, strict=True, ge=0, le=LAST_DOMAIN, description="ROS_DOMAIN_ID of the run", examples=[42])
+    recorder: str = Field(description="the host that records, and that has the switcher", examples=["lab1"])
+    hosts: dict[str, HostSpec] = Field(
+        min_length=1, description="the hosts, by name", examples=[{"lab1": {"address": "192.0.2.1", "agents": ["1-5"]}}]
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Hosts:
+    """A hosts file that fits an experiment."""
+
+    domain: int  # ROS_DOMAIN_ID
+    recorder: str  # name of the host with recorder and switcher
+    addresses: dict[str, str]  # IPv4 addresses by host
+    agents: dict[str, tuple[int, ...]]  # indices from 0, ascending, by host
+
+    @classmethod
+    def load(cls, path: Path, experiment: ValidExperiment) -> Hosts:
+        """Read a hosts file (YAML); InputError if it cannot be read or does not fit the experiment."""
+        return cls.parse(read_yaml(path), experiment, source=str(path))
+
+    @classmethod
+    def parse(cls, document: Any, experiment: ValidExperiment, source: str = "hosts") -> Hosts:
+        """Check a document from a YAML reader; the ExperimentError lists the mistakes, with ``source`` as place."""
+        if not isinstance(document, dict):
+            raise ExperimentError(
+                source, ["expected the keys domain, recorder and hosts: see `msg-agents host --help`"]
+            )
+        try:
+            spec = HostsSpec.model_validate(document)
+        except ValidationError as error:
+            problems = [translate(each, root=HostsSpec) for each in error.errors()]
+            raise ExperimentError(source, problems) from error
+        problems = _mistakes(spec, experiment.agents)
+        addresses: dict[str, str] = {}
+        for name, host in spec.hosts.items():
+            try:
+                addresses[name] = socket.gethostbyname(host.address)
+            except (OSError, UnicodeError) as error:
+                reason = getattr(error, "strerror", None) or "no such address"
+                problems.append(
+                    problem(
+                        f"hosts.{name}.address",
+                        host.address,
+                        f"expected an IPv4 address or a name that has one ({reason})",
+                        "give it as numbers",
+                    )
+                )
+        problems += [
+            problem(f"hosts.{name}.address", address, "duplicate address", "give each host its own")
+            for place, (name, address) in enumerate(addresses.items())
+            if address in list(addresses.values())[:place]
+        ]
+        if problems:
+            raise ExperimentError(source, problems)
+        agents = {name: tuple(sorted(number - 1 for number in host.agents)) for name, host in spec.hosts.items()}
+        return cls(spec.domain, spec.recorder, addresses, agents)
+
+    def share(self, name: str, *, discovery_timeout: float, patience: float) -> Share:
+        """What runs on the host ``name``; times in s. InputError: no such host, or nothing to do on it."""
+        if name not in self.agents:
+            known = ", ".join(self.agents)
+            raise InputError(f"--name: {name}: no such host in the hosts file: expected one of {known}")
+        if not self.agents[name] and name != self.recorder:
+            raise InputError(f"--name: {name}: has no agents and is not the recorder: there is nothing to run on it")
+        return Share(self.agents[name], name == self.recorder, discovery_timeout, patience)
+
+    def participants(self, experiment: ValidExperiment) -> int:
+        """How many participants to look for on each host: more than run on any."""
+        most = max(wanted_processes(experiment, len(agents)) for agents in self.agents.values())
+        return min(most + 2 + VISITORS, MOST_PARTICIPANTS)
+
+    def profile(self, experiment: ValidExperiment) -> str:
+        """The Fast DDS profile with which the processes of all hosts find each other."""
+        addresses = list(dict.fromkeys(("127.0.0.1", *self.addresses.values())))
+        return profile_for_hosts(addresses, self.participants(experiment))
+
+    def environment(self, experiment: ValidExperiment, folder: Path) -> dict[str, str]:
+        """Environment of the processes, with the profile written to ``folder``; the user's own profile is kept."""
+        profile = folder / "hosts.xml"
+        profile.write_text(self.profile(experiment), encoding="utf-8")
+        others = [address for address in self.addresses.values() if address != "127.0.0.1"]
+        return node_environment(self.domain, profile) | {PEERS_VARIABLE: " ".join(others)}
+
+
+def _mistakes(spec: HostsSpec, agents: int) -> list[str]:
+    """Mistakes in the assignment of agents and recorder to hosts."""
+    problems = []
+    if spec.recorder not in spec.hosts:
+        names = ", ".join(spec.hosts)
+        problems.append(problem("recorder", spec.recorder, f"expected one of the hosts, {names}", "name one of them"))
+    return problems + assignment_problems({name: host.agents for name, host in spec.hosts.items()}, agents)
+
+
+def assignment_problems(hosts: Mapping[str, Sequence[int]], agents: int) -> list[str]:
+    """Mistakes in the numbers of the agents on each host, of an experiment with so many agents."""
+    problems = []
+    where: dict[int, list[str]] = {}
+    for name, numbers in hosts.items():
+        for number in numbers:
+            where.setdefault(number, []).append(name)
+    unknown = sorted(number for number in where if number > agents)
+    if unknown:
+        problems.append(
+            problem("agents", _listed(unknown), f"expected numbers from 1 to {agents}", "remove the others")
+        )
+    twice = {number: names for number, names in where.items() if len(names) > 1}
+    if twice:
+        number = min(twice)
+        problems.append(
+            problem(
+                "agents",
+                _listed(sorted(twice)),
+                "expected each agent once",
+                f"{number} is on {' and '.join(twice[number])}",
+            )
+        )
+    missing = [number for number in range(1, agents + 1) if number not in where]
+    if missing:
+        problems.append(problem("agents", _listed(missing), "on no host", "name each agent on one"))
+    return problems
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return show(list(numbers))
+
+
+def this_host() -> str:
+    """Host name of this machine."""
+    return socket.gethostname()

@@ -1,0 +1,186 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Taking over from a killed process: checkpoints, stop files.
+
+How a run is asked to end early, and at which step it does: two files beside the checkpoints.
+
+They outlive the processes: a switcher that takes over asks for nothing again, and announces the same step.
+
+The last states that an agent has published, in a file that remains when its process is killed.
+
+Every state is written before it is published. A process that takes over from a killed one resumes from there, and
+publishes again what may have been lost on the way. Any agent can also repeat what a restarted peer has missed.
+
+Takeover of a node: the new process removes its killed predecessor from the network at once.
+
+The middleware drops a killed process only after 20 s of silence (its lease); until then writers keep what it never
+acknowledged, and block after 5,000 messages. A shorter lease would also drop processes that are only stopped or
+starved, and lose messages to them. The successor knows that the process is gone: it holds a lock that ends with the
+process that held it. So it sends, in the name of the dead process, the message by which a participant leaves.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import mmap
+import os
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+from uuid import UUID
+
+from msg_agents.discovery.rtps import PREFIX_SIZE, remove_participant
+from msg_agents.stepping.synchronizer import RESEND_LIMIT
+from msg_analysis.errors import InputError
+from msg_analysis.messages.acceptance import state_frame
+from msg_analysis.model.run_record import RunRecord
+
+
+class StopFiles:
+    """The files of a run in its directory of checkpoints."""
+
+    def __init__(self, directory: Path, run: UUID) -> None:
+        self._asked, self._decided = directory / f"stop_asked.{run}", directory / f"stop.{run}"
+
+    def ask(self) -> None:
+        """Ask the switcher to end the run soon."""
+        self._asked.touch()
+
+    def asked(self) -> bool:
+        """Whether somebody has asked."""
+        return self._asked.exists()
+
+    def decide(self, step: int) -> None:
+        """Note the last step of the run, whole or not at all, before it is announced."""
+        draft = self._decided.with_suffix(".draft")
+        draft.write_text(str(step), encoding="ascii")
+        draft.replace(self._decided)
+
+    def decided(self) -> int | None:
+        """The last step of the run; None: not decided."""
+        with contextlib.suppress(OSError, ValueError):
+            return int(self._decided.read_text(encoding="ascii"))
+        return None
+
+
+MOST_KEPT, LEAST_KEPT, ROOM = RESEND_LIMIT, 256, 1 << 24
+"""States kept of each agent: as many as fit into ROOM bytes, from LEAST_KEPT to MOST_KEPT. Where possible, more than
+the 5,000 that the middleware keeps of a writer for slow readers; always more steps than agents may be apart."""
+
+# Length of the entry and step + 1; 0 from before the entry is written until it is whole.
+MARK = struct.Struct("<QQ")
+
+
+def published_size(record: RunRecord) -> int:
+    """Bytes of what agents publish of a state, where that is not the state itself; else 0: it is not kept."""
+    return 8 * record.experiment.run.replicas if record.experiment.truth else 0
+
+
+def entry_size(record: RunRecord) -> int:
+    """Bytes of the longest entry of a run: a message with the whole state, and behind it what is published of it."""
+    return state_frame(record, whole=True).size + published_size(record)
+
+
+def room_for(size: int) -> int:
+    """Size of the checkpoint file of an agent whose longest entry has ``size`` bytes."""
+    slot = size + MARK.size
+    return slot * max(LEAST_KEPT, min(MOST_KEPT, ROOM // slot))
+
+
+class Checkpoint:
+    """A ring of entries in a memory-mapped file, which survives its process, but not its machine.
+
+    ``found``: the file was there, so another process has run this agent before. ``size`` is that of the longest entry
+    in bytes. Without a path it is in memory, for this process only. InputError: a file of another size, or no room.
+    """
+
+    def __init__(self, path: Path | None, size: int) -> None:
+        self.found = False
+        self._size = size
+        self._slot = size + MARK.size
+        total = room_for(size)
+        self.capacity = total // self._slot  # entries
+        if path is None:
+            self._map = mmap.mmap(-1, total)
+            return
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            found = os.fstat(descriptor).st_size
+            if found not in (0, total):
+                raise InputError(
+                    f"{path}: {found} bytes, expected {total}: it belongs to another run: remove it, or give another "
+                    "directory"
+                )
+            self.found = bool(found)
+            # Allocate all of it now: if the disk were full later, writing to the map would kill the process.
+            os.posix_fallocate(descriptor, 0, total)
+            self._map = mmap.mmap(descriptor, total)
+        except OSError as error:
+            raise InputError(
+                f"{path}: no room for {total} bytes ({error.strerror}): give another directory, or allow no restarts "
+                "(--restarts 0)"
+            ) from error
+        finally:
+            os.close(descriptor)
+
+    def write(self, step: int, entry: bytes) -> None:
+        """Keep the entry of a step; steps must be consecutive."""
+        start = step % self.capacity * self._slot
+        MARK.pack_into(self._map, start + self._size, 0, 0)  # who reads meanwhile must not take it for the old one
+        self._map[start : start + len(entry)] = entry
+        MARK.pack_into(self._map, start + self._size, len(entry), step + 1)
+
+    def read(self, first: int = 0) -> list[tuple[int, bytes]]:
+        """(step, entry) of the newest consecutive steps, ascending, from step ``first`` on.
+
+        The slot after the newest is left out: it may be torn.
+        """
+        marks = [MARK.unpack_from(self._map, slot * self._slot + self._size) for slot in range(self.capacity)]
+        newest = max(mark for _, mark in marks) - 1
+        found: list[tuple[int, bytes]] = []
+        for step in range(newest, max(first - 1, newest - self.capacity + 1, -1), -1):
+            slot = step % self.capacity
+            length, mark = marks[slot]
+            if mark != step + 1:
+                break
+            start = slot * self._slot
+            found.append((step, self._map[start : start + length]))
+        return found[::-1]
+
+
+class Takeover:
+    """The right to run a node, which one process has at a time: a lock on the file ``path``, created if missing.
+
+    ``predecessor``: GUID prefix of the last process; empty if there was none. InputError: another process has the lock.
+    """
+
+    def __init__(self, path: Path) -> None:
+        # Open, and locked, for as long as this process lives.
+        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"--checkpoint: another process is running {path.stem}: end that process, or give another directory"
+            ) from None
+        self.predecessor = os.read(self._descriptor, PREFIX_SIZE)
+
+    def store_prefix(self, prefix: bytes) -> None:
+        """Store the GUID prefix of this process for its successor."""
+        os.pwrite(self._descriptor, prefix, 0)
+
+
+def take_over(directory: Path | None, names: Iterable[str]) -> list[Takeover]:
+    """Get the right to run these nodes, and remove the processes that ran them before from the network.
+
+    ``directory`` has a file per node; None: no takeover. InputError: another process is running one of the nodes.
+    """
+    if directory is None:
+        return []
+    takeovers = [Takeover(directory / f"{name}.participant") for name in names]
+    domain = int(os.environ.get("ROS_DOMAIN_ID") or 0)
+    for prefix in {t.predecessor for t in takeovers if len(t.predecessor) == PREFIX_SIZE}:
+        remove_participant(prefix, domain)
+    return takeovers

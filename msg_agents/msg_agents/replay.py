@@ -1,0 +1,128 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Replay of bags, free of ROS: clock and topics."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from fnmatch import fnmatchcase
+
+from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.errors import InputError
+
+
+def parse_rate(word: object) -> float:
+    """A rate as users give it: a positive number, or "max" (inf); ValueError if it is neither."""
+    rate = math.inf if word == "max" else float(str(word))
+    if not rate > 0 or (isinstance(word, str) and math.isinf(rate) and word != "max"):
+        raise ValueError(word)
+    return rate
+
+
+class BagClock:
+    """Time of a bag [ns], at ``rate`` seconds of the bag per second of wall time (inf: as fast as possible).
+
+    It can be paused, and held back while nothing is played.
+    """
+
+    def __init__(
+        self, start: int, rate: float, *, paused: bool = False, wall: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._wall = wall
+        self._rate = rate
+        self._paused = paused
+        self._set(start)
+
+    @property
+    def rate(self) -> float:
+        """Seconds of the bag per second of wall time."""
+        return self._rate
+
+    @property
+    def paused(self) -> bool:
+        """Whether it is paused."""
+        return self._paused
+
+    def now(self, limit: int) -> int:
+        """Time of the bag [ns], at most ``limit`` (of the next message): no message is older than the clock."""
+        if self._paused:
+            return self._then
+        if math.isinf(self._rate):
+            return limit
+        return min(limit, self._then + round((self._wall() - self._since) * self._rate * SECOND))
+
+    def until(self, when: int) -> float:
+        """Seconds of wall time until a time of the bag [ns]: inf while paused, 0 or less if it has come."""
+        if self._paused:
+            return math.inf
+        if math.isinf(self._rate):
+            return 0.0
+        return (when - self._then) / (self._rate * SECOND) - (self._wall() - self._since)
+
+    def jump(self, when: int) -> None:
+        """Go to a time of the bag [ns]."""
+        self._set(when)
+
+    def hold(self, seconds: float) -> None:
+        """Do not count the last so many seconds of wall time: nothing was played in them."""
+        self._since += seconds
+
+    def pause(self, paused: bool, limit: int) -> None:
+        """Pause, or go on from the same time; ``limit`` as in ``now``."""
+        if paused != self._paused:
+            self._set(self.now(limit))
+            self._paused = paused
+
+    def change_rate(self, factor: float, limit: int) -> None:
+        """Multiply the rate by ``factor`` from now on; ``limit`` as in ``now``. The rate inf stays."""
+        if not math.isinf(self._rate):
+            self._set(self.now(limit))
+            self._rate *= factor
+
+    def _set(self, when: int) -> None:
+        self._then, self._since = when, self._wall()
+
+
+def select_topics(topics: Iterable[str], wanted: Sequence[str], excluded: Sequence[str]) -> list[str]:
+    """Names that are wanted (none given: all) and not excluded, by name or pattern such as ``/agent_*/state``.
+
+    InputError: a name or pattern that no topic has, or no topic is left.
+    """
+    names = list(topics)
+    for option, patterns in (("--topics", wanted), ("--exclude", excluded)):
+        for pattern in patterns:
+            if not any(_fits(name, pattern) for name in names):
+                raise InputError(f"{option}: {pattern}: no such topic in the bag: expected one of {', '.join(names)}")
+    chosen = [
+        name
+        for name in names
+        if (not wanted or any(_fits(name, pattern) for pattern in wanted))
+        and not any(_fits(name, pattern) for pattern in excluded)
+    ]
+    if not chosen:
+        raise InputError(f"--exclude: {', '.join(excluded)}: leaves no topic to play: exclude fewer")
+    return chosen
+
+
+def _fits(name: str, pattern: str) -> bool:
+    return fnmatchcase(name, pattern if pattern.startswith("/") else f"/{pattern}")
+
+
+def parse_remaps(remaps: Sequence[str], topics: Sequence[str]) -> dict[str, str]:
+    """New names of all topics that are played, by old name; each of ``remaps`` is ``old:=new``.
+
+    Names get a missing slash in front. InputError: not of this form, or a topic that is not played.
+    """
+    names = {name: name for name in topics}
+    for remap in remaps:
+        old, separator, new = remap.partition(":=")
+        if not separator or not old or not new:
+            raise InputError(f"--remap: {remap}: expected old:=new")
+        old, new = (name if name.startswith("/") else f"/{name}" for name in (old, new))
+        if old not in names:
+            raise InputError(f"--remap: {old}: no such topic is played: expected one of {', '.join(topics)}")
+        names[old] = new
+    return names

@@ -1,0 +1,104 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The folder of a run, and the experiment with the values of the command line."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from msg_agents.environment import MEMORY, free_space
+from msg_analysis.common.files import require_utf8
+from msg_analysis.errors import InputError
+from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.experiment.loading import read_yaml
+
+PREFIX = "msg_agents_run_"
+SPARE = 4  # times the room that is needed must be free there, so that other programs have enough
+YOUTH = 60.0  # s; younger folders may belong to a run that has not locked its own yet
+
+
+@contextmanager
+def workshop(room: int | None = None) -> Iterator[Path]:
+    """A folder that is removed at the end; those that killed runs left behind are removed first.
+
+    A lock, which ends with its process, marks folders in use. ``room``: bytes that will be mapped into memory; the
+    folder is then in memory, if there is plenty.
+    """
+    _clear_abandoned()
+    parent = MEMORY if room is not None and free_space(MEMORY) > SPARE * room else None
+    path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
+    lock = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
+        os.close(lock)
+
+
+def _clear_abandoned() -> None:
+    for path in [path for parent in (Path(tempfile.gettempdir()), MEMORY) for path in parent.glob(f"{PREFIX}*")]:
+        with suppress(OSError):  # gone already, another user's, or locked
+            if time.time() - path.stat().st_mtime < YOUTH:
+                continue
+            lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(path)
+            finally:
+                os.close(lock)
+
+
+def make_bag_directory(experiment: ValidExperiment, out: Path, *, option: str = "--out: ") -> Path:
+    """Make an empty directory <out>/<name>_<time> for a new bag; no other run can then take that name.
+
+    InputError: it cannot be made; ``option`` is how the user gave ``out``.
+    """
+    require_utf8(out)
+    stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
+    candidate, number = out / stem, 2
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        while True:
+            try:
+                candidate.mkdir()
+                return candidate
+            except FileExistsError:
+                candidate, number = out / f"{stem}_{number}", number + 1
+    except OSError as error:
+        place = "is a file" if out.is_file() else f"cannot be written ({error.strerror})"
+        raise InputError(f"{option}{out}: {place}: give a directory for the bags of runs") from error
+
+
+def load_with_overrides(
+    path: Path, run: Mapping[str, Any], *, name: Callable[[str], str] = "--{}".format
+) -> ValidExperiment:
+    """The experiment, checked once, after values of ``run`` were replaced; None replaces nothing.
+
+    ``processes`` may be a number as text. ``name``: how errors call the new value of a key.
+    """
+    changes = {key: value for key, value in run.items() if value is not None}
+    if str(changes.get("processes", "")).isdigit():
+        changes["processes"] = int(changes["processes"])
+    document = read_yaml(path)
+    if not changes or not isinstance(document, dict) or not isinstance(section := document.get("run", {}), dict):
+        return ValidExperiment.parse(document, source=str(path), directory=path.parent)
+    changed = document | {"run": section | changes}
+    try:
+        return ValidExperiment.parse(changed, source=str(path), directory=path.parent)
+    except InputError as error:
+        ValidExperiment.parse(document, source=str(path), directory=path.parent)  # the fault may be the file's
+        problems = error.problems if isinstance(error, ExperimentError) else []
+        wrong = [key for key in changes if any(line.startswith(f"run.{key}:") for line in problems)]
+        given = ", ".join(name(key) for key in wrong or changes)
+        return ValidExperiment.parse(changed, source=given, directory=path.parent)

@@ -1,0 +1,276 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Files in which the processes of a run report to the runner: neither side ever waits for the other.
+
+Account files have refused messages and what the nodes wait for; the file of steps, how far every agent is; that of
+clocks, how far those of several hosts are apart.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from msg_analysis.common.files import REPORT_FILE
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.run import Trajectory
+
+if TYPE_CHECKING:
+    from msg_analysis.inference.comparison import Comparison
+
+
+Refused = tuple[str, str, str, int]  # node, topic, reason, count
+
+
+@dataclass(slots=True)
+class Account:
+    """Sum of the account files of a run."""
+
+    refused: Counter[tuple[str, str, str]] = field(default_factory=Counter)  # by (node, topic, reason)
+    waiting: dict[str, str] = field(default_factory=dict)  # by node, what it waits for; only nodes that wait
+
+    def strangers(self) -> list[dict[str, Any]]:
+        """Key ``strangers`` of result.json: refused messages by node, topic and reason, with their counts."""
+        return [
+            {"node": node, "topic": topic, "reason": reason, "count": count}
+            for (node, topic, reason), count in sorted(self.refused.items())
+        ]
+
+
+def write_account(path: Path, refused: Sequence[Refused], waiting: Mapping[str, str]) -> None:
+    """Replace the account file of one process atomically; an error such as a full disk is ignored."""
+    _replace(path, {"refused": refused, "waiting": waiting})
+
+
+def write_steps(path: Path, steps: Sequence[int]) -> None:
+    """Replace the newest step of every agent; an error such as a full disk is ignored."""
+    _replace(path, list(steps))
+
+
+def read_steps(path: Path) -> list[int]:
+    """The newest step of every agent; empty as long as there is no such file."""
+    with contextlib.suppress(OSError, ValueError):
+        steps: list[int] = json.loads(path.read_text(encoding="utf-8"))
+        return steps
+    return []
+
+
+def write_clocks(path: Path, offsets: Sequence[Mapping[str, Any]], warning: str | None) -> None:
+    """Replace what the switcher knows of the clocks of several hosts; an error such as a full disk is ignored."""
+    _replace(path, {"offsets": list(offsets), "warning": warning})
+
+
+def read_clocks(path: Path) -> tuple[list[dict[str, Any]] | None, str | None]:
+    """Offsets of the clocks (None: not compared), and which are too far apart."""
+    with contextlib.suppress(OSError, ValueError):
+        document = json.loads(path.read_text(encoding="utf-8"))
+        return document["offsets"], document["warning"]
+    return None, None
+
+
+def _replace(path: Path, document: Any) -> None:
+    """Whole or not at all, whatever ends this process."""
+    with contextlib.suppress(OSError):
+        temporary = path.with_suffix(".part")
+        temporary.write_text(json.dumps(document), encoding="utf-8")
+        temporary.replace(path)
+
+
+def read_accounts(paths: Iterable[Path]) -> Account:
+    """Add up account files, given in the order of the starts; missing or damaged files are left out."""
+    account = Account()
+    waiting: dict[str, str] = {}
+    for path in paths:
+        with contextlib.suppress(OSError, ValueError):
+            document = json.loads(path.read_text(encoding="utf-8"))
+            for *what, count in document["refused"]:
+                account.refused[tuple(what)] += count
+            waiting |= document["waiting"]  # later processes are more recent; "": does not wait
+    account.waiting = {node: message for node, message in waiting.items() if message}
+    return account
+
+
+_ACCOUNT_EVERY = 1.0  # s between two looks at the files of refused messages
+
+
+class EventLog:
+    """Appends dictionaries with "kind", "step", "node" and "words" to a list.
+
+    The kind is "killed", "back" or "refused". The step is that of the node that was killed, else the newest of all.
+    """
+
+    def __init__(self, events: list[dict[str, Any]], clock: Callable[[], float] = time.monotonic) -> None:
+        self._events, self._clock = events, clock
+        self._absent: dict[str, tuple[Sequence[int], int]] = {}  # by node: its agents from 0, their step
+        self._refused: set[tuple[str, str, str]] = set()
+        self._next_account = clock()
+        self._newest = 0
+
+    def killed(self, node: str, agents: Sequence[int], step: int, words: str) -> None:
+        """Note that a process, with these agents (from 0), has ended after this step.
+
+        One without agents, such as the switcher, is not known to be back: it makes no steps.
+        """
+        if agents:
+            self._absent[node] = agents, step
+        self._add("killed", step if agents else self._newest, node, words)
+
+    def look(self, steps: Sequence[int], account: Callable[[], Account], *, last: bool = False) -> None:
+        """Note who is back and what is refused, given the newest step of every agent; ``last``: at the end."""
+        newest = self._newest = max(steps, default=0)
+        for node, (agents, step) in list(self._absent.items()):
+            if steps and min(steps[agent] for agent in agents) > step:
+                del self._absent[node]
+                self._add("back", newest, node, f"{node}: back")
+        if self._clock() < self._next_account and not last:
+            return
+        self._next_account = self._clock() + _ACCOUNT_EVERY
+        for key in sorted(set(account().refused) - self._refused):
+            self._refused.add(key)
+            node, topic, reason = key
+            self._add("refused", newest, node, f"{node}: refused on {topic}: {reason} (first noticed)")
+
+    def _add(self, kind: str, step: int, node: str, words: str) -> None:
+        self._events.append({"kind": kind, "step": max(step, 0), "node": node, "words": words})
+
+
+ReportWhen = Literal["always", "on-failure", "never"]
+
+
+@dataclass(slots=True)
+class RunResult:
+    """What a run left behind.
+
+    Attributes
+    ----------
+    experiment
+        what was run
+    bag
+        directory; None if nothing was to be recorded on this host
+    failures
+        what went wrong, one line each
+    interrupted_by
+        number of the signal (Ctrl-C: SIGINT) that ended the run, or the comparison; then the bag is not read
+    wall_time
+        s from the first state of the slowest agent to its last one, as reported a few times a second
+    rate
+        steps of the slowest agent per second of wall time
+    restarts
+        processes that were killed, or crashed, and were started again, one line each
+    strangers
+        messages that the nodes refused: dictionaries with "node", "topic", "reason", "count"
+    events
+        when processes were killed and back, and messages first refused: see ``running.event_log``
+    reached
+        newest step of the slowest agent, as last reported; -1: none
+    until
+        of a run that may end early: "rule", "planned_steps", "ended_early", "step" (the last one, None: not known) and
+        "reason", in words; else None
+    clocks
+        with several hosts in real time, how far the clocks of the agents' hosts are ahead of the switcher's:
+        dictionaries with "node" and "ahead_ms", an interval; None: not compared
+    channel
+        what the channel did: see ``channel.counts``; None: there was none
+    trajectory
+        states of the bag; None if there is none, or it could not be read, or the run was interrupted
+    comparison
+        with the prediction; None before ``conclude``
+    report
+        file of the report; None: not written
+    """
+
+    experiment: ValidExperiment
+    bag: Path | None
+    failures: list[str] = field(default_factory=list)
+    interrupted_by: int | None = None
+    wall_time: float = 0.0
+    rate: float = 0.0
+    restarts: list[str] = field(default_factory=list)
+    strangers: list[dict[str, Any]] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
+    reached: int = -1
+    until: dict[str, Any] | None = None
+    clocks: list[dict[str, Any]] | None = None
+    channel: dict[str, Any] | None = None
+    trajectory: Trajectory | None = None
+    comparison: Comparison | None = None
+    report: Path | None = None
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether a signal has ended the run, or the comparison."""
+        return self.interrupted_by is not None
+
+    @property
+    def recorded(self) -> bool:
+        """Whether there is a bag that can be read, although perhaps not to its end."""
+        if self.trajectory is None and not self.interrupted:
+            return False
+        return self.bag is not None and any(self.bag.glob("*.mcap"))
+
+    def interrupt(self, by: int, during: str) -> None:
+        """Note that a signal has ended the run or the comparison.
+
+        Parameters
+        ----------
+        by
+            number of the signal
+        during
+            when, in words; may be empty
+        """
+        self.interrupted_by = by
+        name = "Ctrl-C" if by == signal.SIGINT else signal.Signals(by).name
+        self.failures.insert(0, f"stopped by {name} {during}".rstrip())
+
+
+def conclude(result: RunResult, report: ReportWhen = "always") -> None:
+    """Compare the bag of a run with its prediction, and write report.html into the bag.
+
+    Does nothing if there is no bag, or it was not read.
+
+    Parameters
+    ----------
+    result
+        from ``run_network``; its ``comparison`` is set
+    report
+        when the report is written; "on-failure": if the verdict is not "agrees"
+
+    Raises
+    ------
+    InputError
+        there is no prediction (too large, unbounded), the bag lacks what is needed, or the report cannot be written
+    """
+    if result.trajectory is None or result.bag is None:
+        return
+    from msg_analysis.inference.verdict import compare
+
+    comparison = compare(result.trajectory)
+    if result.channel is not None and comparison.timing is not None:
+        from msg_agents.channel.process import channel_findings
+
+        timing = comparison.timing
+        result.channel["findings"] = channel_findings(result.channel, timing.unheard, timing.period_ms)
+    if report == "always" or (report == "on-failure" and comparison.verdict != "agrees"):
+        from msg_analysis.report.page import write_report
+
+        file = result.bag / REPORT_FILE
+        write_report(
+            comparison,
+            result.trajectory,
+            file,
+            restarts=result.restarts,
+            strangers=result.strangers,
+            events=result.events,
+            wall_time=result.wall_time,
+            channel=result.channel,
+        )
+        result.report = file
+    result.comparison = comparison

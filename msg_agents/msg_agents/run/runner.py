@@ -1,0 +1,371 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A whole run: processes, bag, verdict, report."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import replace
+from pathlib import Path
+
+from msg_agents.channel.channel_file import Channel
+from msg_agents.environment import RESTARTS, ROS_LOGS, require_middleware, surroundings, will_introduce
+from msg_agents.process_layout import (
+    MOST_PROCESSES,
+    MOST_UNAIDED,
+    SWITCHER,
+    Share,
+    count_processes,
+    partners,
+    place,
+    plan_network,
+)
+from msg_agents.recovery import entry_size, room_for
+from msg_agents.run.folder import make_bag_directory, workshop
+from msg_agents.run.fork_server import NodeServer
+from msg_agents.run.result import EventLog, RunResult
+from msg_agents.run.run_channel import RunChannel, run_channel
+from msg_agents.run.supervisor import ACCOUNTS, CLOCKS, CRASHED, LATE, STEPS, Supervisor
+from msg_agents.stepping.stall_detection import ClockDetector, LagDetector, StallDetector
+from msg_agents.terminal import Interruption
+from msg_agents.watch.observer import EarlyEnd
+from msg_agents.watch.panel import View
+from msg_analysis.bags.mcap_chunks import DEFAULT_STORAGE, Storage
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.salvage import salvage_in_place
+from msg_analysis.bags.writing import RECORDING_MARKER
+from msg_analysis.common.resources import available_cores
+from msg_analysis.common.text import agent_text, with_names
+from msg_analysis.errors import BagError
+from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.model.run_record import RunRecord, Until
+from msg_analysis.twin.simulate import new_record
+
+FIRST_POLL, POLL = 0.02, 0.05  # s; the first until the switcher here has heard of all agents
+
+
+def run_network(
+    experiment: ValidExperiment,
+    out: Path | None,
+    *,
+    domain: int | None = None,
+    restarts: int = RESTARTS,
+    readers: Sequence[str] = (),
+    use_sim_time: bool = False,
+    storage: Storage = DEFAULT_STORAGE,
+    pin: bool = True,
+    fork: bool = True,
+    on_progress: Callable[[int], None] = lambda _: None,
+    on_note: Callable[[str], None] = lambda _: None,
+    view: View | None = None,
+    environment: Mapping[str, str] | None = None,
+    record: RunRecord | None = None,
+    share: Share | None = None,
+    channel: Channel | None = None,
+    interruption: Interruption | None = None,
+    until: Until | None = None,
+) -> RunResult:
+    """Run an experiment as a network of ROS 2 processes.
+
+    To be called from the main thread, since it handles signals; the callbacks are called from there.
+
+    Parameters
+    ----------
+    experiment
+        what to run
+    out
+        directory in which a new bag is made; None: do not record
+    domain
+        ROS_DOMAIN_ID; None: a free one is chosen
+    restarts
+        how often, in all, processes of agents and the switcher are started again when they were killed (or crashed for
+        the first time); one more failure ends the run. 0: no states are kept for a restart
+    readers
+        names of other nodes, in the same domain, that must read the states of all agents before the run starts, as
+        those of a tool do that must not miss a message
+    use_sim_time
+        whether the nodes take the time from ``/clock``, which another process publishes in the same domain
+    storage
+        compression and file size of the bag
+    pin
+        whether each process of a run in lockstep keeps to one core, if there are more processes than cores
+    fork
+        whether processes are forked from one that has imported everything (Linux), and so start in a fraction of the
+        time; False: each starts on its own, as a tracer such as LTTng needs
+    on_progress
+        called about 20 times a second, once all agents have started, with the step that every agent has reached
+    on_note
+        called with a line of text about each restart or stall
+    view
+        shows the run while it goes on; ``on_progress`` and ``on_note`` are then not called
+    environment
+        changes to the environment of the processes
+    record
+        record of the run; None: a new one is made
+    share
+        what this host runs, of several hosts; None: all. Without the recorder only the logs are kept, in the
+        directory that would hold the bag
+    channel
+        the hosts on which the processes are, and what is between them; None: all are on this one
+    until
+        when the run may end before its duration, in order, as a complete run of fewer steps; None: it does not. Not
+        with a ``share``
+    interruption
+        keeps signals from the start of the processes on, beyond the end of this call; None: one for this call only
+
+    Returns
+    -------
+    RunResult
+        The result, without comparison. ``failures`` is empty if every process did its part.
+
+    Raises
+    ------
+    NotAvailableError, InputError
+        the experiment cannot be run, no domain is free, or rights for a channel are missing; nothing was started, and
+        no bag or log is left
+    """
+    view = view or View(on_progress, on_note)
+    experiment.require_available()
+    most = MOST_PROCESSES if channel is None and will_introduce(environment or {}) else MOST_UNAIDED
+    processes = count_processes(experiment, None if share is None else len(share.agents), most=most)
+    directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
+    bag = directory if share is None or share.home else None
+    result = RunResult(experiment, bag)
+    kept = interruption or Interruption()
+    try:
+        with (
+            run_channel(channel) as linked,
+            workshop() as folder,
+            surroundings(
+                folder,
+                domain,
+                {**(environment or {}), **(linked.environment(folder) if linked else {})},
+                processes + 2,
+            ) as around,
+        ):
+            variables = around.environment
+            with NodeServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
+                require_middleware(variables, *([fork_server.has_middleware] if fork_server else []))
+                if share is None and linked is None:  # other hosts and users' tools do not reach those of a channel
+                    view.joined(around.domain)
+                record = replace(record or new_record(experiment), until=until)
+                run_file = folder / "run.json"
+                run_file.write_text(record.to_json(with_key=True), encoding="utf-8")
+                kept.keep()
+                with (
+                    workshop(experiment.agents * room_for(entry_size(record)))
+                    if restarts or until
+                    else nullcontext() as checkpoints,
+                    Supervisor(
+                        folder,
+                        variables,
+                        last_step=experiment.steps,
+                        fork_server=fork_server,
+                        introducer=around.introducer,
+                        ends_hung=share is None,  # with several hosts, the switcher waits for others at its end
+                    ) as supervisor,
+                ):
+                    plans = plan_network(
+                        experiment,
+                        run_file,
+                        bag,
+                        checkpoints=checkpoints,
+                        use_sim_time=use_sim_time,
+                        storage=storage,
+                        share=share,
+                        readers=readers,
+                        most=MOST_PROCESSES if around.introducer else MOST_UNAIDED,
+                        hosts=linked.agents if linked else (),
+                    )
+                    if linked:
+                        linked.start(supervisor, plans, record.model, lockstep=experiment.run.pace == "lockstep")
+                    if around.introducer:
+                        around.introducer.introduce(partners(plans, record.model.listens()))
+                    if pin and experiment.run.pace == "lockstep":
+                        supervisor.cores = place(plans, available_cores(), first=around.domain)
+                    supervisor.start(plans)
+                    ending = EarlyEnd(record, checkpoints) if until and checkpoints else None
+                    with ending or nullcontext():
+                        view.begin(record, checkpoints if share is None else None, ending.observer if ending else None)
+                        view.started(supervisor.by_node)
+                        _watch(
+                            supervisor,
+                            experiment,
+                            result,
+                            restarts,
+                            kept,
+                            view,
+                            ending,
+                            linked,
+                            follow_clock=not use_sim_time,
+                        )
+                        view.end()
+                    result.until = ending.to_json() if ending else None
+                    # Before the supervisor ends the rest: what ends because we end it has not failed.
+                    _collect_failures(supervisor, result, kept, restarts)
+            result.strangers = supervisor.account().strangers()
+            result.clocks, _ = supervisor.clocks()
+            if linked:
+                result.channel = linked.to_json(supervisor, experiment)
+            if bag is not None:
+                try:
+                    with kept.let_through():
+                        _settle(bag, result)
+                except KeyboardInterrupt:
+                    result.interrupt(signal.SIGINT, "while the bag was read")
+            if directory is not None:
+                _keep_logs(folder, directory / "log", result)
+        if (number := kept.take()) is not None and not result.interrupted:
+            result.interrupt(number, "while the logs were kept")
+    finally:
+        if interruption is None:
+            kept.end()
+        if directory is not None:
+            with suppress(OSError):
+                directory.rmdir()  # if it is empty
+    return result
+
+
+def _watch(
+    supervisor: Supervisor,
+    experiment: ValidExperiment,
+    result: RunResult,
+    restarts: int,
+    interruption: Interruption,
+    view: View,
+    ending: EarlyEnd | None,
+    linked: RunChannel | None,
+    *,
+    follow_clock: bool,  # whether the nodes' clock is that of this machine
+) -> None:
+    """Watch until all have done their part, one has failed for good, or a signal has ended the run."""
+    began: float | None = None
+    stall, steps, run = StallDetector(), experiment.steps, experiment.run
+    due = run.speed / experiment.step_length  # steps per second in real time
+    lag, clock = (LagDetector(due), ClockDetector()) if run.pace == "realtime" and follow_clock else (None, None)
+    events, warned = EventLog(result.events), None
+    will_begin = SWITCHER in supervisor.by_node  # with several hosts, one has it; the others are not told
+    while interruption.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
+        if linked:
+            linked.look(supervisor)
+        time.sleep(FIRST_POLL if will_begin and began is None else POLL)
+        supervisor.read_status()
+        if ending and ending.look(min(supervisor.steps, default=-1), view.note):
+            supervisor.last_step = steps = ending.last_step
+            view.ends_at(steps)
+        events.look(supervisor.steps, supervisor.account)
+        if not warned and (warned := supervisor.clocks()[1]):
+            view.note(warned)
+        view.look(supervisor.steps)
+        for name in supervisor.dismiss_late():
+            view.note(f"{name} had not left {LATE:g} s after the end of the run: told to end")
+        reached = min(supervisor.steps, default=-1)
+        if clock and (words := clock.update()):
+            view.note(words)
+            lag = LagDetector(due)
+        if stall.update(sum(supervisor.steps)) and 0 <= reached < steps:
+            view.note(f"no step for {stall.stalled:.0f} s: {_standstill(supervisor, result.experiment.names)}")
+        if reached < 0:
+            continue
+        if lag and reached < steps and (behind := lag.update(reached)):
+            view.note(
+                f"the network cannot keep up: it is {behind:.1f} s behind the {due:g} steps/s of real time: lower "
+                f"`run: speed: {run.speed:g}`, or give several agents to one process (`run: processes`)"
+            )
+        now = time.monotonic()
+        began = began or now
+        if reached < steps or not result.wall_time:
+            result.wall_time = now - began
+    supervisor.read_status()  # what was reported between the last look and the end
+    events.look(supervisor.steps, supervisor.account, last=True)
+    view.look(supervisor.steps)
+    if result.wall_time:
+        result.rate = min(supervisor.steps, default=0) / result.wall_time
+
+
+def _standstill(supervisor: Supervisor, names: Sequence[str] | None) -> str:
+    """Causes of a stall, as far as they are known; a silent process is stopped, or waits for one that is."""
+    words = [f"{node}: {message}" for node, message in sorted(supervisor.account().waiting.items())]
+    silent = [child.plan.name for child in supervisor.silent]
+    if silent:
+        words.append("no report from " + ", ".join(silent))
+    if not words and supervisor.steps:  # the processes that know are on another host
+        last = min(supervisor.steps)
+        words.append(f"slowest: agent {supervisor.steps.index(last) + 1}, at step {last}")
+    return with_names("; ".join(words), names) or "cause unknown"
+
+
+def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View, events: EventLog) -> bool:
+    """Start killed processes again; False if one cannot be."""
+    for child in supervisor.failures:
+        if not child.resumes or len(result.restarts) >= restarts:
+            return False
+        step = min((supervisor.steps[i] for i in child.plan.agents), default=-1) if supervisor.steps else -1
+        after = f" after step {step}" if step >= 0 else ""
+        words = f" ({child.last_words()})" if child.process.poll() == CRASHED else ""
+        result.restarts.append(f"{child.plan.name}: {child.failure}{words}{after}, started again")
+        events.killed(child.plan.name, child.plan.agents, step, result.restarts[-1])
+        view.note(result.restarts[-1])
+        supervisor.restart(child)
+        view.started(supervisor.by_node)
+    return True
+
+
+def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: Interruption, restarts: int) -> None:
+    result.reached = min(supervisor.steps, default=-1)
+    if (number := interruption.take()) is not None:
+        reached, steps = result.reached, result.experiment.steps
+        unknown = all(child.plan.name != SWITCHER for child in supervisor.children)  # it is on another host
+        where = "" if unknown else f"at step {reached} of {steps}" if reached >= 0 else "before step 0"
+        result.interrupt(number, where)
+    for child in supervisor.failures:
+        words = child.last_words()
+        line = f"{child.plan.name}: {child.failure}" + (f": {words}" if words else "")
+        if child.resumes and result.restarts:
+            counts = {c.plan.name: c.number - 1 for c in supervisor.children if c.number > 1}
+            listed = ", ".join(
+                f"{name} {times} times" if times > 1 else f"{name} once" for name, times in counts.items()
+            )
+            line += f". Not started again: all restarts are used up (--restarts {restarts}): {listed}"
+        result.failures.append(line)
+
+
+def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
+    try:
+        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(ACCOUNTS, STEPS, CLOCKS, ROS_LOGS))
+    except OSError as error:
+        # The argument of shutil.Error is a list of (from, to, reason).
+        reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)
+        shutil.rmtree(directory, ignore_errors=True)
+        result.failures.append(f"the logs of the processes could not be kept: {reason}")
+
+
+def _settle(bag: Path, result: RunResult) -> None:
+    """Salvage the bag if its recorder did not close it, read it, and say how far each agent came."""
+    try:
+        if (bag / RECORDING_MARKER).exists():
+            report = salvage_in_place(bag)
+            result.failures.append(f"the bag was salvaged: {report.kept_messages} messages kept")
+        if result.failures and not any(bag.glob("*.mcap")):
+            result.failures.append("nothing was recorded: the run ended before the recorder created a bag")
+            return
+        if result.interrupted:  # whoever has stopped the run does not want to wait
+            return
+        result.trajectory = read_bag(bag)
+    except BagError as error:
+        result.failures.append(str(error))
+        return
+    if result.failures:
+        names = result.experiment.names
+        last = [
+            int(steps[-1]) if (steps := present.nonzero()[0]).size else -1 for present in result.trajectory.present.T
+        ]
+        result.failures.append(
+            "last recorded step: "
+            + ", ".join(f"{agent_text(i, names)}: {k if k >= 0 else 'none'}" for i, k in enumerate(last, start=1))
+        )

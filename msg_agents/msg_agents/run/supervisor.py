@@ -1,0 +1,345 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Starts the processes of a network, watches them and ends them: none outlives its parent."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from msg_agents.discovery.relay import Introducer
+from msg_agents.process_layout import CHANNEL, RECORDER, SWITCHER, ProcessPlan, keep_to
+from msg_agents.run.fork_server import NodeServer, NodeStart, Process
+from msg_agents.run.lifeline import SHOW_STACKS, HungDetector
+from msg_agents.run.result import Account, read_accounts, read_clocks, read_steps
+from msg_analysis.errors import ExitCode
+
+ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
+"""Signals and the seconds that a process has to obey each."""
+
+AFTER_HANG = ((SHOW_STACKS, 0.5), (signal.SIGKILL, 5.0))
+"""The same for a process that has hung."""
+
+AT_ONCE = 50  # processes that are started together: so many log files are then open
+POLL = 0.02  # s
+LOOK = 1.0  # s between two looks whether processes have hung
+SILENCE = 3.0  # s; accounts are written once a second
+CHANNEL_SILENCE = 10.0  # s after which a channel that reports nothing is given up
+EARLY = 3.0  # s after which an agent that has ended without its last step is not waited for any more
+LATE = 10.0  # s after the end of the run after which a process that has not left is not waited for any more
+CRASHED = 1  # exit code of Python after an uncaught exception
+ACCOUNTS, STEPS, CLOCKS = "accounts", "steps.json", "clocks.json"
+
+
+def failure_of(code: int) -> str | None:
+    """How a process failed, in words, from its exit code or minus the signal that killed it; None if it ended well."""
+    if code == 0:
+        return None
+    return f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+
+@dataclass(slots=True)
+class Child:
+    """A process of the network."""
+
+    plan: ProcessPlan
+    process: Process
+    log: Path  # file of what it printed
+    number: int = 1  # of this start; 2: restarted once
+    ended: float | None = None  # when it was first seen to have ended with exit code 0 [s]
+    early: bool = False  # whether it did so before its last step
+    given_up: str | None = None  # why it was ended
+    dismissed: bool = False  # whether it was told to end because the run was over
+    detector: HungDetector = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.detector = HungDetector(self.process.pid)
+
+    @property
+    def running(self) -> bool:
+        """Whether it has not ended."""
+        return self.process.poll() is None
+
+    @property
+    def age_of_account(self) -> float:
+        """Seconds since it last wrote its account; inf: never."""
+        path = self.log.parent / ACCOUNTS / f"{self.plan.name}.{self.number}.json"
+        try:
+            return time.time() - path.stat().st_mtime
+        except OSError:
+            return math.inf
+
+    @property
+    def ended_well(self) -> bool:
+        """Whether it has ended and done its part."""
+        return self.process.poll() is not None and self.failure is None
+
+    @property
+    def failure(self) -> str | None:
+        """How it failed, in words; None if it is running or has ended well."""
+        code = self.process.poll()
+        if self.given_up:
+            return self.given_up
+        if self.early:
+            return f"exit code {code} before its last step"
+        if self.dismissed and code == ExitCode.INCOMPLETE:
+            return None
+        return None if code is None else failure_of(code)
+
+    @property
+    def resumes(self) -> bool:
+        """Whether it can take over from itself, and starting it again makes sense.
+
+        It does for a process that was killed, for whatever reason. A crash of its own will probably repeat: one more
+        try. It does not after bad input, failed discovery or an order to stop.
+        """
+        code = self.process.poll()
+        if not self.plan.resumes or code is None:
+            return False
+        return code < 0 or (code == CRASHED and self.number == 1)
+
+    def last_words(self) -> str:
+        """The last line that it printed; none of one that was ended, since it did not say why."""
+        if self.given_up:
+            return ""
+        with contextlib.suppress(OSError):
+            lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            return lines[-1] if lines else ""
+        return ""
+
+
+@dataclass(slots=True)
+class Supervisor:
+    """The processes of one run; at the end of the context they are ended.
+
+    They have sessions of their own, so that Ctrl-C reaches only the parent; they end when its pipe to them closes.
+    """
+
+    logs: Path  # directory for what the children print
+    environment: Mapping[str, str]  # of the children
+    children: list[Child] = field(default_factory=list)  # as started; a restarted one keeps its place
+    steps: list[int] = field(default_factory=list)  # newest step of every agent, as reported
+    cores: Mapping[str, int] = field(default_factory=dict)  # by name of the process; the others are not pinned
+    last_step: int = 0  # of the run
+    fork_server: NodeServer | None = None  # without one, or when it has ended, every child starts on its own
+    introducer: Introducer | None = None  # without one, the children look for each other
+    namespaces: Mapping[str, int] = field(default_factory=dict)  # descriptors by name of the process; else that of ours
+    options: Mapping[str, Sequence[str]] = field(default_factory=dict)  # more of them, by name of the process
+    ends_hung: bool = False  # whether processes that have hung are ended
+    channel: Child | None = None  # carries the packets of the others; not one of ``children``: it has no part to do
+    _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
+    _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
+    _looked: float = field(default=0.0, init=False)  # for processes that have hung [s of the monotonic clock]
+    _over_since: float | None = field(default=None, init=False)  # [s of the monotonic clock]
+    _control: socket.socket | None = field(default=None, init=False)  # of the channel, which ends when it is closed
+
+    def start(self, plans: Sequence[ProcessPlan]) -> None:
+        """Start all processes."""
+        self._lifeline = os.pipe()
+        for first in range(0, len(plans), AT_ONCE):
+            self.children += self._start([(plan, 1) for plan in plans[first : first + AT_ONCE]])
+
+    def start_channel(self) -> socket.socket:
+        """Start the process of a channel, before all others; the socket at which it waits for ``hand_over``."""
+        self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            plan = ProcessPlan(CHANNEL, (CHANNEL, "--control", str(theirs.fileno())))
+            (self.channel,) = self._start([(plan, 1)])
+        return self._control
+
+    @property
+    def channel_account(self) -> Path:
+        """The file in which the channel says what it did."""
+        return self.logs / ACCOUNTS / f"{CHANNEL}.1.json"
+
+    def restart(self, child: Child) -> None:
+        """Start a process that has ended again; the new child takes its place in ``children``."""
+        place = self.children.index(child)
+        self.children[place : place + 1] = self._start([(child.plan, child.number + 1)])
+
+    def _start(self, plans: Sequence[tuple[ProcessPlan, int]]) -> list[Child]:
+        """Start processes; the numbers count the starts of each."""
+        (self.logs / ACCOUNTS).mkdir(exist_ok=True)
+        with contextlib.ExitStack() as stack:
+            logs = [stack.enter_context(self._log(plan).open("ab")) for plan, _ in plans]
+            starts = [self._node_start(*each, log.fileno()) for each, log in zip(plans, logs, strict=True)]
+            processes: list[Process] = []
+            if self.fork_server is not None:
+                processes += self.fork_server.fork_nodes(starts)
+            processes += [self._spawn(start) for start in starts[len(processes) :]]
+        return [
+            Child(plan, process, self._log(plan), number)
+            for (plan, number), process in zip(plans, processes, strict=True)
+        ]
+
+    def _log(self, plan: ProcessPlan) -> Path:
+        return self.logs / f"{plan.name}.log"
+
+    def _node_start(self, plan: ProcessPlan, number: int, output: int) -> NodeStart:
+        if plan.name == CHANNEL:
+            *command, option, control = plan.arguments
+            return NodeStart(command, {option: int(control)}, output, None)
+        account = self.logs / ACCOUNTS / f"{plan.name}.{number}.json"
+        self._accounts.append(account)
+        arguments = [*plan.arguments, "--account", str(account), *self.options.get(plan.name, ())]
+        if plan.name == SWITCHER:
+            arguments += ["--steps", str(self.logs / STEPS), "--clocks", str(self.logs / CLOCKS)]
+        descriptors = {"--lifeline": self._lifeline[0]}
+        if self.introducer is not None:
+            descriptors["--introduction"] = self.introducer.descriptor
+        if plan.name in self.namespaces:
+            descriptors["--namespace"] = self.namespaces[plan.name]
+        return NodeStart(arguments, descriptors, output, self.cores.get(plan.name))
+
+    def _spawn(self, node: NodeStart) -> Process:
+        """Start a process that is not forked."""
+        options = [word for option, number in node.descriptors.items() for word in (option, str(number))]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "msg_agents", *node.arguments, *options],
+            stdin=subprocess.DEVNULL,
+            stdout=node.output,
+            stderr=subprocess.STDOUT,
+            env=dict(self.environment),
+            pass_fds=list(node.descriptors.values()),
+            start_new_session=True,
+        )
+        if node.core is not None:
+            keep_to(process.pid, node.core)
+        return process
+
+    def read_status(self) -> None:
+        """Read what the switcher has reported, and note agents that have ended too early: their code may end Python."""
+        self.steps = read_steps(self.logs / STEPS) or self.steps
+        if self.channel and CHANNEL_SILENCE < self.channel.age_of_account < math.inf and self.channel.running:
+            self.channel.given_up = f"no report for {CHANNEL_SILENCE:g} s, as if it was stopped"
+            self.channel.process.send_signal(signal.SIGKILL)
+        if self.ends_hung and time.monotonic() >= self._looked + LOOK:
+            self._looked = time.monotonic()
+            self._end_hung()
+        switching = any(child.running for child in self.children if child.plan.name == SWITCHER)
+        for child in self.children:
+            if not self.steps or not switching or not child.plan.agents or child.process.poll() != 0:
+                continue
+            child.ended = child.ended or time.monotonic()
+            behind = min(self.steps[agent] for agent in child.plan.agents) < self.last_step
+            child.early = behind and time.monotonic() > child.ended + EARLY
+
+    def _end_hung(self) -> None:
+        """End processes that have hung: the others would wait for them for ever."""
+        for child in self.running:
+            if words := child.detector.update():
+                child.given_up = f"{words} (stacks in log/{child.log.name})"
+                self._end([child], AFTER_HANG)
+
+    def dismiss_late(self) -> list[str]:
+        """Tell processes to end that have not left long after the switcher; the names of those that were just told.
+
+        The middleware may not have given them the end of the run; one that was stopped then is not given it any more.
+        """
+        if not any(child.plan.name == SWITCHER and child.ended_well for child in self.children):
+            return []
+        self._over_since = self._over_since or time.monotonic()
+        late = [child for child in self.awaited if not child.dismissed]
+        if not late or time.monotonic() < self._over_since + LATE:
+            return []
+        for child in late:
+            child.dismissed = True
+            child.process.send_signal(signal.SIGINT)
+        self._end([child for child in late if child.plan.name != RECORDER])  # a recorder may need time for its bag
+        return [child.plan.name for child in late]
+
+    @property
+    def by_node(self) -> dict[str, Process]:
+        """The newest process of every node."""
+        return {node: child.process for child in self.children for node in child.plan.nodes}
+
+    @property
+    def running(self) -> list[Child]:
+        """Children that have not ended."""
+        return [child for child in self.children if child.running]
+
+    def account(self) -> Account:
+        """What the nodes have refused, and what they wait for."""
+        return read_accounts(self._accounts)
+
+    def clocks(self) -> tuple[list[dict[str, Any]] | None, str | None]:
+        """How far the clocks of several hosts are apart, and a warning."""
+        return read_clocks(self.logs / CLOCKS)
+
+    @property
+    def silent(self) -> list[Child]:
+        """Running children that have not written their account lately."""
+        running = self.running + ([self.channel] if self.channel and self.channel.running else [])
+        return [child for child in running if child.age_of_account > SILENCE]
+
+    @property
+    def starting_again(self) -> list[Child]:
+        """Restarted children that have not found all others yet: they write no account before."""
+        return [child for child in self.running if child.number > 1 and child.age_of_account == math.inf]
+
+    @property
+    def over(self) -> bool:
+        """Whether all have done their part: no process leaves before, and the switcher only after it has said so."""
+        ended = {child.plan.name for child in self.children if child.ended_well}
+        rest = {child.plan.name for child in self.children} - ended
+        if all(child.plan.name != SWITCHER for child in self.children):  # it is on another host
+            return bool(ended)
+        return SWITCHER in ended or (bool(ended) and rest == {SWITCHER})
+
+    @property
+    def awaited(self) -> list[Child]:
+        """Running children that have something to do; one that was restarted after the end has not."""
+        return [child for child in self.running if child.number == 1 or not self.over]
+
+    @property
+    def failures(self) -> list[Child]:
+        """Children that failed; after the end of the run, only the recorder can still fail."""
+        failed = [child for child in (self.channel, *self.children) if child and child.failure]
+        if failed and self.over:
+            return [child for child in failed if child.plan.name == RECORDER]
+        return failed
+
+    def stop(self) -> None:
+        """End all: first the agents and the switcher, so that the recorder gets all that they sent."""
+        self._end([child for child in self.children if child.plan.name != RECORDER])
+        self._end([child for child in self.children if child.plan.name == RECORDER])
+        if self.channel and self._control:
+            self._control.close()
+            self._end([self.channel])
+
+    @staticmethod
+    def _end(children: Sequence[Child], escalation: Sequence[tuple[signal.Signals, float]] = ESCALATION) -> None:
+        for number, patience in escalation:
+            for child in children:
+                if child.running:
+                    child.process.send_signal(number)
+            deadline = time.monotonic() + patience
+            while any(child.running for child in children):
+                if time.monotonic() > deadline:
+                    break
+                time.sleep(POLL)
+            else:
+                return
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+        for descriptor in self._lifeline:
+            with contextlib.suppress(OSError):
+                os.close(descriptor)

@@ -1,0 +1,266 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A snapshot of a run, for a terminal or a browser."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+from msg_analysis.common.text import agent_text
+from msg_analysis.model.graph_path import Sojourn, sojourns
+from msg_analysis.model.step_model import first_graph
+
+if TYPE_CHECKING:
+    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.inference.online_errors import LiveReport
+    from msg_analysis.inference.online_steps import Recent
+
+
+WINDOW = 3.0  # s over which speeds are measured
+GRAIN = 0.25  # s; least time between two measurements
+MOST_SOJOURNS = 500  # that are shown beside the states
+MOST_EVENTS = 50  # the newest, which a page gets
+MOST_TRACED = 20  # agents whose states a page gets
+SILENT = 1.0  # s without a new step after which a page shows an agent as silent; five periods where that is longer
+
+
+class StepRates:
+    """Steps per second of every agent over the last ``WINDOW`` seconds."""
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[float, list[int]]] = deque()
+
+    def add(self, steps: Sequence[int]) -> None:
+        """Take the newest step of every agent, by index."""
+        now = time.monotonic()
+        if self._seen and now - self._seen[-1][0] < GRAIN:
+            return
+        self._seen.append((now, list(steps)))
+        while len(self._seen) > 2 and now - self._seen[1][0] > WINDOW:
+            self._seen.popleft()
+
+    def rates(self) -> list[float]:
+        """Steps per second of every agent; empty before the second measurement."""
+        if len(self._seen) < 2:
+            return []
+        (then, before), (now, after) = self._seen[0], self._seen[-1]
+        return [(b - a) / (now - then) for a, b in zip(before, after, strict=True)]
+
+    def rate(self) -> float | None:
+        """By how many steps per second the step that all agents have reached has moved; None where not known.
+
+        Not the least of ``rates``: in an overloaded network agents step in bursts, and one is always between two.
+        """
+        if len(self._seen) < 2:
+            return None
+        (then, before), (now, after) = self._seen[0], self._seen[-1]
+        return (min(after) - min(before)) / (now - then)
+
+
+class Presence:
+    """Which agents make no new steps, and since when."""
+
+    def __init__(self, names: Sequence[str] | None) -> None:
+        self._names = names
+        self._steps: list[int] = []
+        self._moved: list[float] = []  # when each made its newest step [s]
+        self.gone: set[int] = set()  # agents (from 0) whose process has ended, until a new one makes a step
+
+    def add(self, steps: Sequence[int], ended: Iterable[int]) -> list[str]:
+        """Take the newest step of every agent, by index, and the agents whose process has ended; what is new."""
+        now = time.monotonic()
+        if len(steps) != len(self._steps):
+            self._steps, self._moved = list(steps), [now] * len(steps)
+        back = [agent for agent, (old, new) in enumerate(zip(self._steps, steps, strict=True)) if new > old]
+        for agent in back:
+            self._steps[agent], self._moved[agent] = steps[agent], now
+        returned = sorted(self.gone.intersection(back))
+        self.gone = self.gone.difference(back).union(ended)
+        return [f"{agent_text(agent + 1, self._names)} is back" for agent in returned if agent not in self.gone]
+
+    def ages(self) -> list[float]:
+        """Seconds since each agent has made its newest step."""
+        now = time.monotonic()
+        return [now - moved for moved in self._moved]
+
+
+class SojournFinder:
+    """Finds the sojourn of a step of a run."""
+
+    def __init__(self, experiment: ValidExperiment) -> None:
+        self._rest: Iterator[Sojourn] = sojourns(experiment, first_graph(experiment))
+        self._now = next(self._rest, None)
+        self._before: deque[Sojourn] = deque(maxlen=MOST_SOJOURNS)
+
+    def at(self, step: int) -> Sojourn | None:
+        """The sojourn of the step k -> k+1; steps must not decrease from call to call."""
+        while self._now is not None and step > self._now.last_step:
+            following = next(self._rest, None)
+            if following is None:  # the end of the run
+                break
+            self._before.append(self._now)
+            self._now = following
+        return self._now
+
+    def since(self, step: int) -> list[Sojourn]:
+        """The sojourns from that of a step to the present one, the last ``MOST_SOJOURNS`` of them."""
+        known = [*self._before, *([self._now] if self._now else [])]
+        return [sojourn for sojourn in known if sojourn.last_step >= step]
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened in a run."""
+
+    step: int  # which all agents had reached
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The state of a run at one time."""
+
+    # Newest step of every agent, -1: none; empty before the start; a single one for all where only that is known.
+    steps: list[int]
+    rates: list[float] = field(default_factory=list)  # steps per second, as ``steps``; empty where not known
+    rate: float | None = None  # steps per second of all agents together; None where not known
+    sojourn: Sojourn | None = None  # of the slowest agent's next step; None before the start
+    left: float | None = None  # s until the end at this ``rate``; None where not known
+    report: LiveReport | None = None  # the errors up to now
+    note: str | None = None  # about the errors
+    ages: list[float] = field(default_factory=list)  # s since each agent has made its newest step
+    gone: frozenset[int] = frozenset()  # agents (from 0) without a process, or with one that has made no step yet
+    path: list[Sojourn] = field(default_factory=list)  # sojourns from the oldest of ``report.recent`` on
+    events: tuple[Event, ...] = ()  # the newest ``MOST_EVENTS``
+    last: int | None = None  # last step of a run that ends before its planned end; None: not known to do so
+
+    @property
+    def reached(self) -> int:
+        """The step that every agent has reached; -1: none. What is done after the end is not a part of the run."""
+        reached = min(self.steps, default=-1)
+        return reached if self.last is None else min(reached, self.last)
+
+
+class SnapshotSource:
+    """Makes snapshots of a run from the steps that its agents have reached."""
+
+    def __init__(self, experiment: ValidExperiment) -> None:
+        self._steps = experiment.steps
+        self._last: int | None = None  # where the run ends early
+        self._sojourns, self._rates, self._presence = SojournFinder(experiment), StepRates(), Presence(experiment.names)
+        self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
+        self._refused: dict[str, int] = {}
+        self._reached = -1
+
+    def ends_at(self, step: int) -> None:
+        """The run ends at this step, before its planned end."""
+        self._last = self._steps = step
+
+    def happened(self, text: str) -> None:
+        """Something happened, now."""
+        self._events.append(Event(self._reached, text))
+
+    def snapshot(
+        self,
+        steps: Sequence[int],
+        report: LiveReport | None = None,
+        note: str | None = None,
+        ended: Iterable[int] = (),
+    ) -> Snapshot:
+        """The snapshot now, from the newest step of every agent (-1: none; empty before the start).
+
+        ``ended``: agents (from 0) whose process has ended before its last step.
+        """
+        now = Snapshot(list(steps), report=report, note=note or (report.note if report else None), last=self._last)
+        self._reached = max(self._reached, now.reached)
+        for text in self._presence.add(steps, ended):
+            self.happened(text)
+        for reason, count in (report.refused if report else {}).items():
+            if reason not in self._refused:
+                self.happened(f"messages are refused: {reason} ({count} so far)")
+            self._refused[reason] = count
+        now = replace(now, ages=self._presence.ages(), gone=frozenset(self._presence.gone), events=tuple(self._events))
+        if now.reached < 0:
+            return now
+        self._rates.add(steps)
+        now = replace(now, rates=self._rates.rates(), rate=self._rates.rate())
+        left = (self._steps - now.reached) / now.rate if now.rate else None
+        now = replace(now, left=left, sojourn=self._sojourns.at(min(now.reached, self._steps - 1)))
+        recent = report.recent if report else None
+        return now if recent is None else replace(now, path=self._sojourns.since(int(recent.steps[0])))
+
+
+def run_description(experiment: ValidExperiment) -> dict[str, Any]:
+    """What does not change in a run, for a page that draws it: agents, graphs, positions."""
+    from msg_analysis.report.figures import places
+
+    where = places(experiment.graph_list)
+    return {
+        "name": experiment.name,
+        "problem": experiment.problem,
+        "agents": experiment.agents,
+        "names": experiment.names,
+        "steps": experiment.steps,
+        "dt": experiment.step_length,
+        "pace": experiment.run.pace,
+        "silent": max(SILENT, 5 * experiment.step_length / experiment.run.speed)
+        if experiment.run.pace == "realtime"
+        else SILENT,
+        "leaders": list(experiment.leaders.agents) if experiment.leaders else [],
+        "reference": experiment.reference if experiment.leaders else None,
+        "graphs": [
+            {
+                "name": graph.name,
+                "directed": not graph.symmetric,
+                "links": [[a - 1, b - 1] for a, b, _ in (graph.edges if graph.symmetric else graph.arcs)],
+            }
+            for graph in experiment.graph_list
+        ],
+        "places": [[float(x) for x in where[agent]] for agent in range(experiment.agents)],
+    }
+
+
+def snapshot_document(snapshot: Snapshot, before: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """A snapshot for a page; unknown numbers are None, the graph counts from 0 and the sojourn from 1.
+
+    While there are no new states, the "trace" is that of the document ``before``.
+    """
+    report, sojourn = snapshot.report, snapshot.sojourn
+    recent = report.recent if report else None
+    return {
+        "steps": snapshot.steps if len(snapshot.steps) > 1 else [],
+        "reached": snapshot.reached,
+        "last": snapshot.last,
+        "rate": snapshot.rate or 0.0,
+        "left": snapshot.left,
+        "graph": None if sojourn is None else sojourn.mode,
+        "sojourn": None if sojourn is None else [sojourn.sequence + 1, sojourn.first_step, sojourn.last_step],
+        "system": report.system.to_json() if report else None,
+        "nodes": [node.to_json() for node in report.nodes] if report else None,
+        "any_time": report.any_time.to_json() if report else None,
+        "values": None if recent is None else recent.states[-1].tolist(),
+        "values_step": None if recent is None else int(recent.steps[-1]),
+        "trace": None if recent is None else _trace(snapshot, recent, before and before["trace"]),
+        "lateness": report.lateness if report else None,
+        "ages": [round(age, 2) for age in snapshot.ages] if len(snapshot.ages) > 1 else [],
+        "gone": sorted(snapshot.gone),
+        "events": [[event.step, event.text] for event in snapshot.events],
+        "note": snapshot.note,
+    }
+
+
+def _trace(snapshot: Snapshot, recent: Recent, before: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """The newest states of the first agents, in four digits, with the graphs; ``before`` if the steps are the same."""
+    steps = recent.steps.tolist()
+    if before is not None and before["steps"] == steps:
+        return before
+    return {
+        "steps": steps,
+        "agents": [[float(f"{x:.4g}") for x in column] for column in recent.states.T[:MOST_TRACED].tolist()],
+        "sojourns": [[each.mode, each.first_step, each.last_step] for each in snapshot.path],
+    }
