@@ -13,7 +13,7 @@ WHEEL = {"bdist_wheel", "editable_wheel", "dist_info"} & set(sys.argv)
 
 # Without a compiler the package works all the same, only slower. Fused multiply-adds would change the last bits.
 KERNEL = Extension(
-    f"{PACKAGE}.model.arithmetic._kernel",
+    f"{PACKAGE}.arithmetic._kernel",
     [f"{PACKAGE}/arithmetic/_kernel.c"],
     extra_compile_args=["-O2", "-ffp-contract=off"] if os.name == "posix" else [],
     optional=True,

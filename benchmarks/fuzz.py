@@ -168,7 +168,7 @@ def run(kind: str, count: int, seed: int, sources: list[Path], findings: Path, j
         for part, new, slowest, most in pool.imap_unordered(work, tasks):
             outcomes += part
             found += new
-            longest, memory = max(longest, slowest), max(loading, most)
+            longest, memory = max(longest, slowest), max(memory, most)
             for line in new:
                 print(line, file=sys.stderr, flush=True)
     listed = ", ".join(f"{number} {name}" for name, number in sorted(outcomes.items()))

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         read_bag,
         write_report,
     )
-    from msg_analysis.common.version import __version__
+    from msg_analysis.common.version import __version__ as __version__
 
 __all__ = [
     "BagError",

@@ -40,7 +40,7 @@ def test_executable(tmp_path: Path) -> None:
 
 def test_data_files() -> None:
     assert (resources.files(msg_analysis) / "wire/definitions/std_msgs/msg/Header.msg").is_file()
-    assert (resources.files(msg_analysis) / "report/html/templates").is_dir()
+    assert (resources.files(msg_analysis) / "report/templates").is_dir()
 
 
 def test_examples() -> None:

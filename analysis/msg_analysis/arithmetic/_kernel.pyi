@@ -1,6 +1,6 @@
 from collections.abc import Sequence
 
-from msg_analysis.types import BoolArray, FloatArray, IntArray
+from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 
 def combine(weights: Sequence[float], payloads: Sequence[bytes], drive: bytes, /) -> bytes: ...
 def all_finite(payload: bytes, /) -> bool: ...

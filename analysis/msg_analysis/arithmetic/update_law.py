@@ -49,14 +49,6 @@ def step(weights: Sequence[float | FloatArray], values: Sequence[FloatArray], dr
     return total
 
 
-try:
-    from msg_analysis.arithmetic import _kernel
-except ImportError:  # there was no compiler when this was installed
-    COMPILED = False
-else:
-    COMPILED = True
-
-
 @dataclass(frozen=True, slots=True)
 class Round:
     """Agents that can step at once, under one graph, because none uses what another of them makes."""
@@ -204,6 +196,6 @@ all_finite: Callable[[bytes], bool]
 try:
     from msg_analysis.arithmetic import _kernel
 except ImportError:  # there was no compiler when this was installed
-    PAYLOADS_COMPILED, combine, all_finite = False, combine_with_numpy, all_finite_with_numpy
+    COMPILED, combine, all_finite = False, combine_with_numpy, all_finite_with_numpy
 else:
-    PAYLOADS_COMPILED, combine, all_finite = True, _kernel.combine, _kernel.all_finite
+    COMPILED, combine, all_finite = True, _kernel.combine, _kernel.all_finite

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
+"""Consoles of the commands, and the progress of long work."""
+
 from __future__ import annotations
 
 import errno

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import click
 
 from msg_analysis.cli import runs, sweep, theory
-from msg_analysis.cli import runs as compare
 from msg_analysis.cli.console import CommandGroup, complain, examples, print_json, print_text, result_console
 from msg_analysis.cli.options import (
     BAG,
@@ -308,8 +307,8 @@ def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Pa
         sys.exit(ExitCode.INCOMPLETE)
 
 
-main.add_command(compare.compare)
-main.add_command(compare.tabulate)
+main.add_command(runs.compare)
+main.add_command(runs.tabulate)
 main.add_command(runs.runs)
 main.add_command(runs.diff)
 main.add_command(theory.transient)

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
+"""Commands on bags and runs: compare, tabulate, runs, diff, export."""
+
 from __future__ import annotations
 
 from pathlib import Path

@@ -15,7 +15,7 @@ from typing import Literal
 
 from msg_analysis.errors import InputError
 
-FOLDER = Path(__file__).parent / "experiments"
+FOLDER = Path(__file__).parent / "bundled"
 SUFFIX = ".yaml"
 
 

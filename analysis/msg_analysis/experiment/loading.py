@@ -20,7 +20,6 @@ from msg_analysis.common.files import SAFE_LOADER, load_yaml, read_text
 from msg_analysis.common.text import listed
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import graph_sources, protocols, validation
-from msg_analysis.experiment import graph_sources as topology
 from msg_analysis.experiment.graph_sources import ForeignGraph, GraphError, is_networkx
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
@@ -337,7 +336,7 @@ class Sections:
         if len(self.problems) > before or not self._number_nodes(graphs):
             return
         declared, names = self.values["agents"], self.values["names"]
-        largest = max(map(topology.largest_label, graphs.values()))
+        largest = max(map(graph_sources.largest_label, graphs.values()))
         untold = all(spec.complete or spec.star for spec in graphs.values())
         if declared is None and names is None and (untold or largest < 2):
             wanted = "expected the number of agents, since the graphs do not give it"
@@ -405,10 +404,10 @@ class Sections:
     def _resolve_losses(self, noise: NoiseSpec, time: Time) -> None:
         """Numbers instead of names in ``noise.loss``, and the probability of every link."""
         names: list[str] | None = self.values["names"]
-        loss, found = topology.numbered_losses(noise.loss, names)
+        loss, found = graph_sources.numbered_losses(noise.loss, names)
         if not found:
             self.values["noise"] = noise.model_copy(update={"loss": loss})
-            self.loss, found = topology.loss_matrix(loss, self.graphs, time, names)
+            self.loss, found = graph_sources.loss_matrix(loss, self.graphs, time, names)
         self.problems += found
         if noise.burst is not None and not found:
             self.problems += validation.burst_problems(noise.burst, loss)
@@ -431,8 +430,8 @@ class Sections:
         found = [
             line
             for name, spec in graphs.items()
-            for line in topology.link_problems(self.keys[name], spec, self.agents, names)
+            for line in graph_sources.link_problems(self.keys[name], spec, self.agents, names)
         ]
         self.problems += found
         if not found:
-            self.graphs = tuple(topology.build_graph(name, spec, self.agents) for name, spec in graphs.items())
+            self.graphs = tuple(graph_sources.build_graph(name, spec, self.agents) for name, spec in graphs.items())

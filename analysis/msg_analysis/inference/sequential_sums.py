@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
+"""Evidence after each interim analysis, from sums over steps."""
+
 from __future__ import annotations
 
 import math

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
+"""The paper's figures."""
+
 from __future__ import annotations
 
 import dataclasses

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
+"""Comparisons, live estimates and differences in the terminal."""
+
 from __future__ import annotations
 
 from collections.abc import Sequence

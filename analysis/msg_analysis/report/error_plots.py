@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
+"""Interactive plots of errors and covariances."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
+"""The report of a run as one HTML page."""
+
 from __future__ import annotations
 
 import base64

@@ -283,7 +283,6 @@ def evaluate(job: Job, stopping: Callable[[], bool] = lambda: False) -> Outcome:
 
     ``stopping`` is asked while a network runs; if the sweep is being ended, NetworkStoppedError is raised.
     """
-
     begin = time.perf_counter()
     reason: str | None = None
     result: Mapping[str, Any] = {}

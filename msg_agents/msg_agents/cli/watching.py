@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
+"""Commands and options that watch a run."""
+
 from __future__ import annotations
 
 import os

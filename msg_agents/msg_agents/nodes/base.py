@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
+"""What all nodes of a network share."""
+
 from __future__ import annotations
 
 import contextlib

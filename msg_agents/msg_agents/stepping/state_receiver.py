@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
+"""Received states: checked, and those from before a restart found again."""
+
 from __future__ import annotations
 
 from collections.abc import Callable

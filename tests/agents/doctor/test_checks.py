@@ -13,18 +13,17 @@ import pytest
 
 from msg_agents.discovery.rtps import PORT_BASE, PORTS_PER_DOMAIN, free_domain
 from msg_agents.doctor import checks, network_checks
-from msg_agents.doctor import network_checks as discovery_checks
 from msg_agents.doctor.checks import Check
 from msg_agents.environment import require_shared_memory
 
 VARIABLES = (
-    *discovery_checks.PROFILE_VARIABLES,
-    *discovery_checks.NOT_USED,
-    discovery_checks.VARIABLES_FILE,
-    discovery_checks.RANGE_VARIABLE,
-    discovery_checks.SERVER_VARIABLE,
-    discovery_checks.PEERS_VARIABLE,
-    discovery_checks.LOCALHOST_VARIABLE,
+    *network_checks.PROFILE_VARIABLES,
+    *network_checks.NOT_USED,
+    network_checks.VARIABLES_FILE,
+    network_checks.RANGE_VARIABLE,
+    network_checks.SERVER_VARIABLE,
+    network_checks.PEERS_VARIABLE,
+    network_checks.LOCALHOST_VARIABLE,
     *("ROS_DOMAIN_ID", "ROS_LOG_DIR", "ROS_HOME", "RMW_IMPLEMENTATION"),
 )
 
@@ -38,10 +37,10 @@ def plain_shell(monkeypatch: pytest.MonkeyPatch) -> None:
 def by_variables() -> dict[str, Check]:
     """The checks of variables, by name."""
     checks = (
-        discovery_checks.check_profiles(),
-        discovery_checks.check_range(),
-        discovery_checks.check_server(),
-        discovery_checks.check_peers(),
+        network_checks.check_profiles(),
+        network_checks.check_range(),
+        network_checks.check_server(),
+        network_checks.check_peers(),
         network_checks.check_own_domain(),
     )
     return {check.name: check for check in checks}
@@ -88,7 +87,7 @@ def test_a_server_that_a_run_would_use(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a range of the user's, the environment of the nodes keeps it."""
     monkeypatch.setenv("ROS_DISCOVERY_SERVER", "10.0.0.1:11811")
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
-    assert "only while it is there" in discovery_checks.check_server().text
+    assert "only while it is there" in network_checks.check_server().text
 
 
 def test_a_domain_that_a_run_holds(monkeypatch: pytest.MonkeyPatch) -> None:
