@@ -19,7 +19,6 @@ from fuzz_documents import mutate_document, mutate_text
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from msg_analysis.bags import writing
 from msg_analysis.bags.mcap_chunks import COMPRESSIONS, Storage
 from msg_analysis.bags.mcap_reading import MAGIC
 from msg_analysis.bags.run_writer import write_trajectory
@@ -39,7 +38,6 @@ Record = tuple[int, bytes]  # opcode, content
 
 def make_bags(directory: Path) -> list[Path]:
     """A bag of every kind that there is, each with several chunks."""
-    writing.CHUNK_SIZE = 3000
     graphs = {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}}
     plain = {"name": "fuzz", "graphs": graphs, "switching": {"generator": [[-1, 1], [1, -1]]}}
     run = {"dt": 0.05, "duration": 6.0, "replicas": 2, "start": "zero"}
@@ -55,7 +53,7 @@ def make_bags(directory: Path) -> list[Path]:
         for compression in COMPRESSIONS:
             bags.append(directory / f"{name}_{compression}")
             split = 12_000 if compression == "zstd" else None
-            write_trajectory(trajectory, bags[-1], Storage(compression, split))
+            write_trajectory(trajectory, bags[-1], Storage(compression, split, chunk_size=3000))
     return bags
 
 

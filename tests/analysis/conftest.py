@@ -1,7 +1,5 @@
 """Packages that offer protocols, and rosbags as the independent judge of bytes and bags."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """What can be imported from msg_analysis itself."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess
@@ -162,10 +160,9 @@ def test_everything_says_what_it_is(experiment: Experiment, run: Run) -> None:
         assert "\n" not in text
         assert len(text) < 200
         assert all(word in text for word in words), text
-        if hasattr(result, "_repr_markdown_"):
-            rows = [line for line in result._repr_markdown_().splitlines() if line.startswith("|")]
-            assert len(rows) >= 3
-            assert len({row.count("|") for row in rows}) == 1
+        rows = [line for line in result._repr_markdown_().splitlines() if line.startswith("|")]
+        assert len(rows) >= 3
+        assert len({row.count("|") for row in rows}) == 1
 
 
 def test_large_networks_are_short_too() -> None:

@@ -1,7 +1,5 @@
 """Networks whose agents and switcher wait for another node before their first step."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager

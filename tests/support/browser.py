@@ -1,7 +1,5 @@
 """A browser for tests of pages: headless Chromium, which tells what it complained of and what it asked for."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager

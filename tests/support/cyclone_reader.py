@@ -3,8 +3,6 @@
 Prints one JSON document: of every topic what came, in the order in which it came.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """Linear algebra in many digits: numpy arrays of Decimal, whose arithmetic is compiled."""
 
-from __future__ import annotations
-
 from decimal import Decimal, localcontext
 
 import numpy as np

@@ -5,8 +5,6 @@ inference/, and theory/ names its sources. All else has one to three lines witho
 their --help (tests/commands). Folders are matched by prefix, so that modules may move into folders below them.
 """
 
-from __future__ import annotations
-
 import ast
 import functools
 import logging

@@ -1,11 +1,10 @@
 """The built-in law as protocols of somebody else, and a network for them: for tests of what protocols are given."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 
+import experiments
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.protocol import Heard, LinearProtocol, Protocol
@@ -14,16 +13,15 @@ DIRECTED = {"a": {"arcs": [[1, 2], [2, 3], [3, 4], [4, 5], [5, 1]]}, "b": {"path
 
 
 def document(protocol: dict[str, Any] | None, **changes: Any) -> dict[str, Any]:
-    """Five agents on a line and a ring; ``run`` is merged, other keys are replaced."""
+    """Five agents on a line and a weighted ring."""
     run = {"dt": 0.1, "duration": 60, "replicas": 3, "seed": 5, "start": [1, 2, 3, 4, 5]} | changes.pop("run", {})
-    return {
-        "name": "net",
-        "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"edges": [[1, 2], [2, 3, 0.5], [3, 4], [4, 5], [5, 1]]}},
+    ring = {"edges": [[1, 2], [2, 3, 0.5], [3, 4], [4, 5], [5, 1]]}
+    default = {
+        "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": ring},
         "switching": {"generator": [[-1, 1], [2, -2]]},
-        **({"protocol": protocol} if protocol else {}),
-        **changes,
-        "run": run,
     }
+    given = {"protocol": protocol} if protocol else {}
+    return experiments.document(**default | given | changes, run=run)
 
 
 def experiment(protocol: dict[str, Any] | None, **changes: Any) -> ValidExperiment:

@@ -1,7 +1,5 @@
 """Machines on which something is wrong: words before a command that then runs on one, in namespaces of its own."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import os

@@ -3,8 +3,6 @@
 A layer is a folder, without its sub-folders, or a module beside them.
 """
 
-from __future__ import annotations
-
 import ast
 import functools
 import re

@@ -1,7 +1,5 @@
 """What processes were doing that have outlived their test: for the report of its failure."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess

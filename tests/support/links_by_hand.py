@@ -1,7 +1,5 @@
 """Runs with noise, loss and delay on the air, from the definitions in docs/network.md alone: numbers, lists, loops."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Callable
 from functools import cache

@@ -6,8 +6,6 @@ nobody reads), "terminal", "ascii" (it has few characters), "limit" (files canno
 the process that forks: it answers each line, a request, by a line.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import functools

@@ -4,8 +4,6 @@ It shares the experiment's document and the phases of the agents with the softwa
 late and messages slow; by default nobody is late, and messages arrive at once.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

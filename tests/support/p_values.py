@@ -4,6 +4,8 @@ from collections.abc import Sequence
 
 from scipy import stats
 
+from msg_analysis.inference.comparison import Comparison
+
 BY_A_BOUND = {
     "innovations: noise by graph",
     "innovations: noise over time",
@@ -20,3 +22,24 @@ def kolmogorov_smirnov(name: str, p: Sequence[float]) -> float:
     """Chance of p-values of a test that are further from uniform; of bounds: of ones that are that much too small."""
     side = "greater" if name in BY_A_BOUND else "two-sided"
     return float(stats.kstest(p, "uniform", alternative=side).pvalue)
+
+
+def assert_calibrated(results: Sequence[Comparison]) -> None:
+    """Of correct runs: p-values are even, intervals cover, verdicts agree.
+
+    Kolmogorov-Smirnov at 2e-4 for each of at most 20 tests, coverage and verdicts at 1e-4 by the binomial law: a right
+    program fails with probability below 0.5 %.
+    """
+    for name in [test.name for test in results[0].tests]:
+        p = [test.p for result in results for test in result.tests if test.name == name]
+        assert kolmogorov_smirnov(name, p) > 2e-4, name
+    errors = [result.system_error for result in results]
+    covered = sum(error.interval[0] <= error.predicted <= error.interval[1] for error in errors)
+    assert covered >= stats.binom.ppf(1e-4, len(results), 0.95)
+    assert_few_alarms(results)
+
+
+def assert_few_alarms(results: Sequence[Comparison]) -> None:
+    """At level 0.01, with false-alarm rate 1e-4."""
+    alarms = sum(result.verdict == "disagrees" for result in results)
+    assert alarms <= stats.binom.isf(1e-4, len(results), 0.01)

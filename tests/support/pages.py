@@ -1,7 +1,5 @@
 """The pages of the documentation as text: their blocks of code, commands and what these print."""
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections.abc import Iterator

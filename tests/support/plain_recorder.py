@@ -5,8 +5,6 @@ It ends when so many messages have come, some on every topic.
 python plain_recorder.py FILE COUNT TOPIC...
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Another processor, as far as one machine can play it: older kernels of BLAS, numpy and the C library."""
 
-from __future__ import annotations
-
 import os
 import platform
 import subprocess

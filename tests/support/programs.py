@@ -1,7 +1,5 @@
 """Every command of both command lines."""
 
-from __future__ import annotations
-
 import re
 
 import click

@@ -1,7 +1,5 @@
 """What is in a recorded file, by MCAP's own reader."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The clock of the system, set for some processes only, while they run, by a library that is loaded first."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 import subprocess

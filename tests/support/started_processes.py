@@ -1,7 +1,5 @@
 """Processes that a fixture starts: none outlives its test."""
 
-from __future__ import annotations
-
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """A stranger in the ROS domain of a run: what it publishes arrives before anything of the run."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections import Counter

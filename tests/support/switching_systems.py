@@ -1,17 +1,16 @@
 """Experiments for tests of the theory: the line and the ring, and random graphs under random chains."""
 
+import networkx as nx
 import numpy as np
+import scipy.linalg
 
+from experiments import document
 from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.markov_chain import stationary_law
+from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
 
-LINE_RING = {
-    "name": "line_ring",
-    "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
-    "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
-    "noise": {"process": 1.0},
-    "run": {"dt": 0.05, "duration": 10},
-}
+LINE_RING = document(5, 0.5, noise={"process": 1.0}, run={"duration": 10, "replicas": 1})
 
 
 def network(seed, m, n, *, time="continuous", problem="consensus", directed=True, **run):
@@ -45,3 +44,44 @@ def network(seed, m, n, *, time="continuous", problem="consensus", directed=True
 
 def steady_of(system):
     return MomentSolver(system).steady()
+
+
+def generator(random, n, rate=1.0, *, reversible=False):
+    flow = random.uniform(0.05, 2.0, (n, n)) * rate
+    if reversible:
+        flow = (flow + flow.T) / random.uniform(0.2, 1.0, n)[:, None]
+    np.fill_diagonal(flow, 0.0)
+    return flow - np.diag(flow.sum(axis=1))
+
+
+def laplacian(random, m, kind):
+    a = np.zeros((m, m))
+    if kind == "pieces":  # a few edges only: disconnected; the union is made to hold together below
+        for i, j in random.integers(m, size=(max(1, m // 3), 2)):
+            a[i, j] = a[j, i] = 1.0
+    elif kind == "chain":  # everybody hears the one before: no eigenvectors
+        a[range(1, m), range(m - 1)] = 1.0
+    else:
+        a = random.uniform(0.2, 1.5, (m, m)) * (random.random((m, m)) < 3.0 / m)
+        a[range(1, m), range(m - 1)] = 1.0
+        if kind == "symmetric":
+            a = a + a.T
+    np.fill_diagonal(a, 0.0)
+    return np.diag(a.sum(axis=1)) - a
+
+
+def system(random, m, gamma, kind="symmetric", dt=None, loss=False):
+    """Consensus; with dt in discrete time."""
+    n = len(gamma)
+    z = np.stack([laplacian(random, m, kind) for _ in range(n)])
+    if kind == "pieces":
+        z[0] += nx.laplacian_matrix(nx.path_graph(m)).toarray()
+    f = random.standard_normal((n, m, m))
+    lift = scipy.linalg.helmert(m).T
+    noise, law = lift.T @ (f @ f.transpose(0, 2, 1)) @ lift, stationary_law(gamma)
+    if dt is None:
+        return JumpSystem("continuous", lift.T @ z @ lift, noise, gamma, law, lift)
+    chain = np.clip(scipy.linalg.expm(gamma * dt), 0.0, None)
+    chain /= chain.sum(axis=1, keepdims=True)
+    variance = 0.2 * (dt * z * ~np.eye(m, dtype=bool)) ** 2 if loss else None
+    return JumpSystem("discrete", np.eye(m - 1) - dt * lift.T @ z @ lift, noise, chain, law, lift, variance)

@@ -1,7 +1,5 @@
 """A terminal for tests: what a program prints on it, and what is typed."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import pty

@@ -1,7 +1,5 @@
 """What a process does at its start to be in a user namespace of its own."""
 
-from __future__ import annotations
-
 import ctypes
 
 CLONE_NEWUSER = 0x10000000  # linux/sched.h

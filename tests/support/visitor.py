@@ -1,7 +1,5 @@
 """A node outside a network that looks who reads its topics."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A run given to a watcher message by message, as its topics would."""
 
-from __future__ import annotations
-
 import random
 
 from msg_analysis.bags import run_writer

@@ -111,9 +111,12 @@ class Reception:
 class ManySteps:
     """The steps of m agents, under each graph in one or several rounds."""
 
-    def __init__(self, rounds: Sequence[Sequence[Round]]) -> None:
-        """``rounds[mode]`` are the rounds of a graph, in order; each agent is in one of them."""
-        self._rounds = rounds
+    def __init__(self, rounds: Sequence[Sequence[Round]], *, compiled: bool = COMPILED) -> None:
+        """``rounds[mode]`` are the rounds of a graph, in order; each agent is in one of them.
+
+        ``compiled``: else by numpy, with the same bits.
+        """
+        self._rounds, self._compiled = rounds, compiled
         self._agents = sum(len(one.agents) for one in rounds[0])
         together = [one for of_graph in rounds for one in of_graph]
         terms = np.concatenate([one.there.sum(axis=0) for one in together])
@@ -133,7 +136,7 @@ class ManySteps:
         """
         states = np.empty((len(past) + len(modes), *past.shape[1:]))
         states[: len(past)] = past
-        if COMPILED:
+        if self._compiled:
             arrays = self._order, self._offsets, self._columns, self._weights, np.ascontiguousarray(modes)
             air: list[Any] = []
             if reception is not None:

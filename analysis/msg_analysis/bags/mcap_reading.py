@@ -60,8 +60,8 @@ class _Chunk:
 class _Source:
     """A stream of records that gives out many message records in a row at once; nothing else may read the stream."""
 
-    def __init__(self, stream: io.BufferedReader) -> None:
-        self._stream = stream
+    def __init__(self, stream: io.BufferedReader, loose: int) -> None:
+        self._stream, self._loose = stream, loose
         self._buffer, self._at = b"", 0  # bytes read from the stream, and how many of them were given out
 
     def read(self, size: int) -> bytes:
@@ -76,7 +76,7 @@ class _Source:
     def messages(self, head: bytes) -> tuple[bytes, IntArray, IntArray, int]:
         """Buffer, (messages,) content offsets and sizes in it, and bytes of all, of whole message records in a row.
 
-        The first is the one whose ``head`` was read last. 0 bytes where it is cut off or does not fit into ``_LOOSE``
+        The first is the one whose ``head`` was read last. 0 bytes where it is cut off or does not fit into ``loose``
         bytes.
         """
         if self._at >= len(head):
@@ -87,7 +87,7 @@ class _Source:
             start, size, end = run_of_messages(self._buffer, self._at)
             if len(start):
                 break
-            self._buffer, self._at = self._buffer[self._at :] + self._stream.read(_LOOSE), 0
+            self._buffer, self._at = self._buffer[self._at :] + self._stream.read(self._loose), 0
         length, self._at = end - self._at, end
         if not length:
             self._at += len(head)  # the head counts as read again
@@ -100,6 +100,7 @@ class McapFile(StoredFile):
 
     statistics: Statistics | None = None
     false_indexes: int = 0  # chunks whose index is wrong: here the records decide, other programs use the index
+    loose: int = _LOOSE  # bytes of a batch of messages that are not in chunks
     _described: int = 0  # bytes of the schemas and channels in the chunks
 
     def _stored(self) -> Iterator[Batch]:
@@ -128,7 +129,7 @@ class McapFile(StoredFile):
         _keep_memory()
         zstd = zstandard.ZstdDecompressor()
         chunk: _Chunk | None = None
-        for opcode, content, places in self._records(_Source(stream), size):
+        for opcode, content, places in self._records(_Source(stream, self.loose), size):
             if opcode == Opcode.MESSAGE_INDEX and chunk is not None:
                 chunk.add_index(content)
                 continue

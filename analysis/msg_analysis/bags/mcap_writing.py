@@ -61,12 +61,13 @@ class McapWriter:
         profile: str = "ros2",
         library: str = "mcap",
         directory: str | None = None,  # of a temporary file; None: that of the system
+        indexes_in_memory: int = INDEXES_IN_MEMORY,
     ) -> None:
         self._stream, self._chunk_size, self._compression = stream, chunk_size, compression
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         # An index of a chunk has an entry for every channel: an hour of a thousand agents has gigabytes of them.
-        self._chunk_indexes = tempfile.SpooledTemporaryFile(INDEXES_IN_MEMORY, dir=directory)  # noqa: SIM115
+        self._chunk_indexes = tempfile.SpooledTemporaryFile(indexes_in_memory, dir=directory)  # noqa: SIM115
         self._chunks = 0
         self._first: int | None = None  # log time [ns] of the first message
         self._last = 0

@@ -75,7 +75,8 @@ class Playback:
     line per damaged file, some only after reading. BagError: no bag, no messages, or a topic with two types.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, most_held: int = MOST_HELD) -> None:
+        self._most_held = most_held  # bytes
         self._outlines = [_quick_outline(file) or _outline(file) for file in bag_files(Path(path))]
         starts = [outline.start for outline in self._outlines if outline.start is not None]
         ends = [outline.end for outline in self._outlines if outline.end is not None]
@@ -139,7 +140,7 @@ class Playback:
                 pending.sort()
                 low = lows.behind(batch.end)
                 ready = bisect_right(pending, min(low, until), key=lambda entry: entry[0])
-                if held > MOST_HELD:
+                if held > self._most_held:
                     ready = max(ready, len(pending) // 2)
                 for time, _, topic, data in pending[:ready]:
                     held -= len(data)

@@ -32,7 +32,12 @@ AT_ONCE = 4096  # messages
 _Message = tuple[str, bytes, int, int | None]
 
 
-def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Storage = DEFAULT_STORAGE) -> None:
+def write_trajectory(
+    trajectory: Trajectory,
+    directory: str | Path,
+    storage: Storage = DEFAULT_STORAGE,
+    block_numbers: int = BLOCK_NUMBERS,
+) -> None:
     """Write a bag, whole or not at all; BagError where the directory exists or cannot be written.
 
     InputError for a name that is not UTF-8.
@@ -51,7 +56,7 @@ def write_trajectory(trajectory: Trajectory, directory: str | Path, storage: Sto
             topics = network_topics(trajectory.record.experiment.agents, truth=noisy)
             with BagWriter(unfinished, topics, record=record, storage=storage) as bag:
                 bag.write(f"/{EXPERIMENT.name}", encode_string(record), 0)
-                _write(bag, [topic.name for topic in topics], _messages(trajectory))
+                _write(bag, [topic.name for topic in topics], _messages(trajectory, block_numbers))
             unfinished.rename(directory)
     except OSError as error:
         raise BagError(f"{directory}: cannot be written ({error.strerror}): choose another place") from error
@@ -74,7 +79,7 @@ def _write(bag: BagWriter, names: Sequence[str], messages: Iterator[_Message]) -
         bag.write_many(names, of, time, b"".join(contents), np.cumsum(size) - size, size)
 
 
-def _messages(trajectory: Trajectory) -> Iterator[_Message]:
+def _messages(trajectory: Trajectory, block_numbers: int = BLOCK_NUMBERS) -> Iterator[_Message]:
     """The messages in the order of time."""
     experiment = trajectory.record.experiment
     run, dt = trajectory.record.run.bytes, experiment.step_length
@@ -87,7 +92,7 @@ def _messages(trajectory: Trajectory) -> Iterator[_Message]:
     heard = _heard(trajectory)
     sojourns = _sojourns(trajectory)
     sojourn = next(sojourns, None)
-    for steps, agents, times in _in_order(trajectory):
+    for steps, agents, times in _in_order(trajectory, block_numbers):
         if trajectory.agent_modes is not None:
             graphs = trajectory.agent_modes[steps, agents]
         else:
@@ -109,11 +114,11 @@ def _messages(trajectory: Trajectory) -> Iterator[_Message]:
         sojourn = next(sojourns, None)
 
 
-def _in_order(trajectory: Trajectory) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
+def _in_order(trajectory: Trajectory, block_numbers: int) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
     """Steps, agents and times (e,) of all states by time, those of one time by step and agent, a part at once."""
     count, m, made = len(trajectory.states), trajectory.states.shape[1], trajectory.made
     clock = StepClock(trajectory.record.experiment.step_length)
-    rows = max(1, BLOCK_NUMBERS // trajectory.states[:1].size)
+    rows = max(1, block_numbers // trajectory.states[:1].size)
     # Nothing of step k or a later one is earlier than later[k].
     later = np.empty(count + 1, dtype=np.int64)
     later[count] = np.iinfo(np.int64).max

@@ -33,9 +33,6 @@ from msg_analysis.common.files import require_utf8
 from msg_analysis.errors import BagError
 from msg_analysis.messages.topics import Qos, Topic
 
-# As in rosbag2: small enough that a killed recorder loses little, large enough that the readers' work per chunk does
-# not matter. With a third of it, reading takes a fifth longer.
-CHUNK_SIZE = 768 * 1024
 RECORD_NAME = "msg_agents"  # of the MCAP metadata record with the run record
 ROSBAG2_RECORD = "rosbag2"
 
@@ -77,7 +74,7 @@ class WrittenFile:
         storage, self._custom = self._storage, custom
         self.mcap = McapWriter(
             self._stream,
-            chunk_size=min(CHUNK_SIZE, storage.split_size or CHUNK_SIZE),
+            chunk_size=min(storage.chunk_size, storage.split_size or storage.chunk_size),
             compression=storage.compression,
             directory=self._directory,
         )

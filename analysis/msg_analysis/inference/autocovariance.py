@@ -115,7 +115,9 @@ def why_not_tested(observation: Observation) -> str | None:
     return None
 
 
-def logged_autocovariance(observation: Observation, lags: IntArray | None = None) -> LoggedAutocovariance | None:
+def logged_autocovariance(
+    observation: Observation, lags: IntArray | None = None, most_numbers: float = MOST_NUMBERS
+) -> LoggedAutocovariance | None:
     """Autocovariances of a run in lockstep, with their expectation and covariance given its path.
 
     Time and memory are those of the steps, lags and squared coordinates.
@@ -126,6 +128,8 @@ def logged_autocovariance(observation: Observation, lags: IntArray | None = None
         of a run of which ``why_not_tested`` is None
     lags
         (L,) ascending, >= 0 [steps]; None: 0 and up to 8 more, to where 5 % of the correlation is left
+    most_numbers
+        in the matrices of all lags and steps: of longer runs the beginning is tested
 
     Returns
     -------
@@ -138,7 +142,7 @@ def logged_autocovariance(observation: Observation, lags: IntArray | None = None
     system, replicas = observation.prediction.system, observation.replicas
     chosen = _chosen_lags(observation) if lags is None else np.asarray(lags)
     d = system.dimension
-    steps = min(observation.steps, int(MOST_NUMBERS / max(1, len(chosen) * d * max(d, replicas))))
+    steps = min(observation.steps, int(most_numbers / max(1, len(chosen) * d * max(d, replicas))))
     chosen = chosen[chosen < steps]
     kinds = kinds[0][:steps], kinds[1], kinds[2]
     which, matrices, noise = kinds

@@ -56,7 +56,7 @@ def _zeros(rows: int, columns: int) -> IntArray:
     return large_zeros((rows, columns), np.int64, total=8 * 8 * rows * columns)
 
 
-def order_events(observation: Observation) -> EventOrder:
+def order_events(observation: Observation, ties_at_once: int = TIES_AT_ONCE) -> EventOrder:
     """Order the events of a run in real time by time; at equal times, a value comes before the steps that use it.
 
     Equal times are common where the agents' clock moves in jumps, and when a late agent catches up.
@@ -64,7 +64,7 @@ def order_events(observation: Observation) -> EventOrder:
     timers = _timers(observation)
     newest = newest_steps(observation)
     contradiction, ties = _early_and_equal(observation, timers)
-    turn, circular = _turns_of(timers, ties)
+    turn, circular = _turns_of(timers, ties, ties_at_once)
     if circular:
         contradiction = contradiction or "agents used new values of each other at the same time"
     order = EventOrder(_zeros(*timers.graphs.shape), newest, contradiction)
@@ -116,7 +116,7 @@ def _early_and_equal(observation: Observation, timers: Timers) -> tuple[str | No
     )
 
 
-def _turns_of(timers: Timers, ties: IntArray) -> tuple[IntArray, bool]:
+def _turns_of(timers: Timers, ties: IntArray, ties_at_once: int) -> tuple[IntArray, bool]:
     """(N + 1, m): of states with equal times, which comes first; and whether there is a circle."""
     turn, m, circular = _zeros(*timers.made.shape), timers.made.shape[1], False
     times = timers.made[ties[:, 2], ties[:, 3]]
@@ -124,7 +124,7 @@ def _turns_of(timers: Timers, ties: IntArray) -> tuple[IntArray, bool]:
     ties, times = ties[order], times[order]
     begin = 0
     while begin < len(ties):  # all pairs of one time together
-        last = times[min(begin + TIES_AT_ONCE, len(ties)) - 1]
+        last = times[min(begin + ties_at_once, len(ties)) - 1]
         end = int(np.searchsorted(times, last, side="right"))
         cells, place = np.unique(ties[begin:end].reshape(-1, 2) @ [m, 1], return_inverse=True)
         source, target = place.reshape(-1, 2).T

@@ -90,10 +90,15 @@ def _variance(means: TimeMeans, combination: FloatArray) -> float:
     return float(combination @ means.covariance @ combination)
 
 
-def means_given_path(observation: Observation) -> TimeMeans | None:
+def means_given_path(
+    observation: Observation,
+    *,
+    most_work: float = MAX_WORK,
+    most_numbers: int = MAX_NUMBERS,
+) -> TimeMeans | None:
     """Time means of a run in lockstep, with expectation and standard errors given the path of the graphs.
 
-    None where it would take too long: more than ``MAX_WORK``, or too many kinds of steps.
+    None where it would take too long: more than ``most_work``, or too many kinds of steps for ``most_numbers``.
     """
     system, steps = observation.prediction.system, observation.steps
     d = system.dimension
@@ -102,11 +107,11 @@ def means_given_path(observation: Observation) -> TimeMeans | None:
         "nodes": observation.step.agents,
         "system": 1,
     }
-    kind = next((kind for kind, q in counts.items() if steps * d**2 * (q**2 + 5 * q * d) <= MAX_WORK), None)
+    kind = next((kind for kind, q in counts.items() if steps * d**2 * (q**2 + 5 * q * d) <= most_work), None)
     if kind is None:
         return None
     forms, nodes, trace = forms_of(system, kind)
-    kinds = steps_of_path(observation)
+    kinds = steps_of_path(observation, most_numbers)
     if kinds is None:
         return None
     which, matrices, noise = kinds
@@ -142,7 +147,10 @@ def _expected_sum(which: IntArray, matrices: FloatArray, noise: FloatArray, star
 
 
 def _backwards(
-    observation: Observation, kinds: tuple[IntArray, FloatArray, FloatArray], forms: FloatArray, trace: FloatArray
+    observation: Observation,
+    kinds: tuple[IntArray, FloatArray, FloatArray],
+    forms: FloatArray,
+    trace: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Sum of packed y y^T (p,), sum of Cov(D | now) (q, q), and of every step the system error and its Var(D | now)."""
     which, matrices, noise = kinds
@@ -150,7 +158,7 @@ def _backwards(
     lifted = packed_symmetric.unpack(forms, d).transpose(1, 0, 2).copy()
     seen, covariance = np.zeros(forms.shape[1]), np.zeros((q, q))
     series, variances = np.empty(steps), np.zeros(steps)
-    length = max(1, SMALL_BLOCK // max(q * d**2, observation.states[0].size))
+    length = max(1, min(SMALL_BLOCK, observation.block_numbers) // max(q * d**2, observation.states[0].size))
     dual = lifted  # Y(last + 1) of the block
     for first in reversed(range(0, steps, length)):
         last = min(first + length, steps)
@@ -192,12 +200,14 @@ def _duals(which: IntArray, matrices: FloatArray, forms: FloatArray, after: Floa
     return duals
 
 
-def steps_of_path(observation: Observation) -> tuple[IntArray, FloatArray, FloatArray] | None:
+def steps_of_path(
+    observation: Observation, most_numbers: int = MAX_NUMBERS
+) -> tuple[IntArray, FloatArray, FloatArray] | None:
     """(N,) kind of every step; and of every kind the reduced matrix and noise covariance, (kinds, d, d) each."""
     system, step, lost = observation.prediction.system, observation.step, observation.lost
     if lost is None or not step.loss:
         return observation.modes, system.matrices, system.noise
-    found = _kinds(observation, lost, MAX_NUMBERS // step.agents**2)
+    found = _kinds(observation, lost, most_numbers // step.agents**2)
     if found is None:
         return None
     which, kinds = found

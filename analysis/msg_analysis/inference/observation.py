@@ -133,6 +133,7 @@ class Observation:
     lost: BoolArray | None = None  # (N, m, D) see ``Trajectory.lost``
     timers: Timers | None = None  # None in lockstep
     used: IntArray | None = None  # (N, m, D) in lockstep, see ``Trajectory.used``
+    block_numbers: int = BLOCK_NUMBERS  # of temporary arrays of a block of steps, at most
 
     @classmethod
     def of(cls, trajectory: Trajectory, prediction: Prediction) -> Observation:
@@ -212,7 +213,7 @@ class Observation:
 
         ``what``: what is done with them, for those who watch.
         """
-        length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
+        length = max(1, self.block_numbers // max(1, numbers_per_step))
         for first in range(0, self.steps, length):
             tell(what, first, self.steps)
             yield first, min(first + length, self.steps)

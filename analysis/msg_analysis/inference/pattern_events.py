@@ -25,7 +25,7 @@ from msg_analysis.inference.period_tables import OWN, Entries, period_tables
 from msg_analysis.inference.received_values import neighbour_weights
 from msg_analysis.model.reception import neighbour_tables
 
-CACHED_NUMBERS = 20_000_000  # numbers in cached matrices: 160 MB
+CACHED_BLOCKS = 10  # blocks of numbers in cached matrices: 160 MB
 
 NULL = 1e-12  # eigenvalues of second moments this small, relative to the largest, are rounding: some are 0 exactly
 
@@ -61,7 +61,7 @@ class Periods:
         self._shared = self._numbers.shared
         self._laws: dict[tuple[int, int], _Law] = {}  # by graph and agent
         self._cache: dict[bytes, Period] = {}
-        self._cached = 0
+        self._cached, self._most_cached = 0, CACHED_BLOCKS * observation.block_numbers
         self.steps = observation.steps
         self.largest = step.agents + int(
             np.diff(self._tables.extra_ends).max(initial=0)
@@ -119,7 +119,7 @@ class Periods:
         key = b"|".join((events.tobytes(), before.tobytes(), after.tobytes()))
         if key not in self._cache:
             found = self._compile(events, before, after)
-            if self._cached > CACHED_NUMBERS:
+            if self._cached > self._most_cached:
                 self._cache.clear()
                 self._cached = 0
             self._cached += found.matrix.size + found.noise.size

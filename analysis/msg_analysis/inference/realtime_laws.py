@@ -75,7 +75,13 @@ def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
     return float(means.trace @ means.predicted) / expected - 1.0 if expected > 0.0 else None
 
 
-def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
+def pattern_means(
+    observation: Observation,
+    order: EventOrder,
+    *,
+    most_work: float = MAX_WORK,
+    most_entries: int = MAX_ENTRIES,
+) -> TimeMeans:
     """Time means of the sampled states, with expectation and standard errors given the log.
 
     Parameters
@@ -84,6 +90,8 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
         of a run in real time
     order
         of its events
+    most_work, most_entries
+        multiplications, and entries of a stack, at most
 
     Raises
     ------
@@ -95,9 +103,9 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
     system, steps = observation.prediction.system, observation.steps
     periods = Periods(observation, order)
     entries = periods.largest
-    if entries > MAX_ENTRIES:
+    if entries > most_entries:
         raise PatternUnavailableError(
-            f"{entries} values are in use at the same time, expected at most {MAX_ENTRIES}: some were used long after "
+            f"{entries} values are in use at the same time, expected at most {most_entries}: some were used long after "
             "they were computed"
         )
     frame = system.frame
@@ -106,7 +114,7 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
         forms, nodes, trace = forms_of(system, kind)
         q = len(forms)
         work = steps * entries**2 * (q**2 + (3 * q + 4) * entries)
-        if work <= MAX_WORK:
+        if work <= most_work:
             break
     else:
         raise PatternUnavailableError(f"{steps} steps of {entries} values are too many to compute")

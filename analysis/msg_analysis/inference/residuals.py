@@ -75,7 +75,11 @@ class InnovationSums:
     """
 
     def __init__(
-        self, observation: Observation, position: IntArray | None = None, follower: Follower | None = None
+        self,
+        observation: Observation,
+        position: IntArray | None = None,
+        follower: Follower | None = None,
+        most_regressors: int = MAX_REGRESSORS,
     ) -> None:
         step, noise = observation.step, observation.prediction.experiment.noise
         n, m = step.modes, step.agents
@@ -97,9 +101,9 @@ class InnovationSums:
             varies = bool((step.noise_gain != step.noise_gain[0]).any())
         self._equalizer = Equalizer(step, self.noises) if varies else None
         regression: StateRegression | HeardRegression = (
-            HeardRegression(observation, MAX_REGRESSORS, position if _correlated(step) else None)
+            HeardRegression(observation, most_regressors, position if _correlated(step) else None)
             if noise.steps_only or observation.timers
-            else StateRegression(observation, MAX_REGRESSORS)
+            else StateRegression(observation, most_regressors)
         )
         if self.independent:
             self._add(observation, regression, follower)

@@ -35,7 +35,9 @@ def extent(pieces: Pieces) -> tuple[int, float, float]:
     return count, low, high
 
 
-def quantiles(pieces: Pieces, shares: Sequence[float]) -> list[float]:
+def quantiles(
+    pieces: Pieces, shares: Sequence[float], *, at_once: int = AT_ONCE, bins: int = QUANTILE_BINS
+) -> list[float]:
     """Quantiles of all numbers, between neighbours linearly: as ``numpy.quantile``; empty where there are none."""
     count, low, high = extent(pieces)
     if not count:
@@ -43,7 +45,7 @@ def quantiles(pieces: Pieces, shares: Sequence[float]) -> list[float]:
     place = np.array(shares) * (count - 1)
     below = np.floor(place).astype(np.int64)
     ranks = np.unique(np.concatenate([below, np.minimum(below + 1, count - 1)]))
-    found = dict(zip(ranks.tolist(), _of_ranks(pieces, ranks, count, low, high).tolist(), strict=True))
+    found = dict(zip(ranks.tolist(), _of_ranks(pieces, ranks, count, low, high, at_once, bins).tolist(), strict=True))
     values = []
     for rank, part in zip(below.tolist(), (place - below).tolist(), strict=True):
         one, next_one = found[rank], found[min(rank + 1, count - 1)]
@@ -51,29 +53,29 @@ def quantiles(pieces: Pieces, shares: Sequence[float]) -> list[float]:
     return values
 
 
-def _of_ranks(pieces: Pieces, ranks: IntArray, count: int, low: float, high: float) -> FloatArray:
+def _of_ranks(
+    pieces: Pieces, ranks: IntArray, count: int, low: float, high: float, at_once: int, bins: int
+) -> FloatArray:
     """The numbers with these ranks, from 0, of ``count`` numbers from ``low`` to ``high``."""
     if low == high:
         return np.full(len(ranks), low)
-    if count <= AT_ONCE:
+    if count <= at_once:
         return np.sort(np.concatenate([np.ravel(piece) for piece in pieces()]).astype(np.float64))[ranks]
 
-    def bins(piece: AnyArray) -> IntArray:
-        return np.minimum((np.ravel(piece) - low) * (QUANTILE_BINS / (high - low)), QUANTILE_BINS - 1).astype(np.int64)
+    def bin_of(piece: AnyArray) -> IntArray:
+        return np.minimum((np.ravel(piece) - low) * (bins / (high - low)), bins - 1).astype(np.int64)
 
-    counts = sum(
-        (np.bincount(bins(piece), minlength=QUANTILE_BINS) for piece in pieces()), np.zeros(QUANTILE_BINS, np.int64)
-    )
+    counts = sum((np.bincount(bin_of(piece), minlength=bins) for piece in pieces()), np.zeros(bins, np.int64))
     ends = np.cumsum(counts)
     chosen = np.searchsorted(ends, ranks, side="right")
     found = np.empty(len(ranks))
     for one in np.unique(chosen).tolist():
 
         def inside(one: int = one) -> Iterable[AnyArray]:
-            return (np.ravel(piece)[bins(piece) == one] for piece in pieces())
+            return (np.ravel(piece)[bin_of(piece) == one] for piece in pieces())
 
         wanted = chosen == one
-        found[wanted] = _of_ranks(inside, ranks[wanted] - (ends[one] - counts[one]), *extent(inside))
+        found[wanted] = _of_ranks(inside, ranks[wanted] - (ends[one] - counts[one]), *extent(inside), at_once, bins)
     return found
 
 

@@ -32,7 +32,7 @@ from msg_analysis.theory.prediction import Moments, Prediction, predict
 from msg_analysis.theory.settling import asymptotic_rates
 
 
-def state_difference(a: Trajectory, b: Trajectory) -> dict[str, Any]:
+def state_difference(a: Trajectory, b: Trajectory, *, block_numbers: int = BLOCK_NUMBERS) -> dict[str, Any]:
     """The key ``states`` of the difference of two runs; steps count from 0, agents and replicas from 1.
 
     States of a step count as equal if both are missing; +0 and -0 are different.
@@ -43,7 +43,7 @@ def state_difference(a: Trajectory, b: Trajectory) -> dict[str, Any]:
     steps = min(len(a.states), len(b.states)) - 1
     found = _Differences(a.record.experiment.step_length)
     numbers = 4 * max(1, a.states[:1].size)
-    length = max(1, BLOCK_NUMBERS // numbers)
+    length = max(1, block_numbers // numbers)
     for first in range(0, steps + 1, length):
         tell("comparing states", first, steps + 1)
         block = slice(first, min(first + length, steps + 1))

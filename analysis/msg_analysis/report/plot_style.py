@@ -191,9 +191,10 @@ def thin(
     replica: int,
     reference: float | None,  # None: the mean of the agents
     numbers: int = NUMBERS,
+    block_numbers: int = BLOCK_NUMBERS,
 ) -> Thinned:
     """Thin one replica; the memory needed does not depend on the length of the run."""
-    return thin_together(states, slice(replica, replica + 1), reference, numbers)[0]
+    return thin_together(states, slice(replica, replica + 1), reference, numbers, block_numbers)[0]
 
 
 def thin_together(
@@ -201,6 +202,7 @@ def thin_together(
     replicas: slice,
     reference: float | None,
     numbers: int,  # of each replica, at most about
+    block_numbers: int = BLOCK_NUMBERS,  # that are looked at together
 ) -> list[Thinned]:
     """Thin several replicas, each to the same width, while the states are read once."""
     count, agents = states.shape[:2]
@@ -210,7 +212,7 @@ def thin_together(
     low, high = (
         [np.empty((several, bins, agents if key < 2 else 1), np.float32) for key in range(4)] for _ in range(2)
     )
-    length = width * max(1, BLOCK_NUMBERS // max(1, width * states[:1].size))  # steps that are looked at together
+    length = width * max(1, block_numbers // max(1, width * states[:1].size))
     for first in range(0, count, length):
         piece = np.clip(states[first : first + length, :, replicas], -_LARGEST, _LARGEST)
         centre = piece.mean(axis=1, keepdims=True) if reference is None else np.full_like(piece[:, :1], reference)

@@ -51,8 +51,13 @@ class Event:
     words: str
 
 
-def run_events(trajectory: Trajectory, reported: Sequence[Mapping[str, Any]] = ()) -> tuple[list[Event], int]:
-    """The events in order of time, and how many more there are; ``reported``: by the network."""
+def run_events(
+    trajectory: Trajectory, reported: Sequence[Mapping[str, Any]] = (), most: int = MOST_EVENTS
+) -> tuple[list[Event], int]:
+    """The events in order of time, of each kind at most so many, and how many more there are.
+
+    ``reported``: by the network.
+    """
     events = [
         Event(str(one["kind"]), int(one["step"]), int(one["step"]), str(one["words"]))
         for one in reported
@@ -71,7 +76,7 @@ def run_events(trajectory: Trajectory, reported: Sequence[Mapping[str, Any]] = (
     ]
     kept, more = [], 0
     for kind in (events, late, missing):
-        longest = sorted(kind, key=lambda event: event.first - event.last)[:MOST_EVENTS]
+        longest = sorted(kind, key=lambda event: event.first - event.last)[:most]
         kept += longest
         more += len(kind) - len(longest)
     return sorted(kept, key=lambda event: (event.first, KINDS.index(event.kind))), more

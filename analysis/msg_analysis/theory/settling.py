@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.sparse.linalg
@@ -48,7 +49,7 @@ class Rates:
     graph: float | None  # of the law of the graph; None for one graph
 
 
-def asymptotic_rates(system: JumpSystem) -> Rates:
+def asymptotic_rates(system: JumpSystem, *, most_unknowns: int = MAX_UNKNOWNS) -> Rates:
     """Rates of a reduced system, per unit of time or per step.
 
     From the eigenvalues of the matrices of Propositions 1 and 6 of the paper, for each strongly connected component;
@@ -56,7 +57,8 @@ def asymptotic_rates(system: JumpSystem) -> Rates:
     """
     parts = components(system)
     graph = mean_propagator(system).slowest_jump if system.modes > 1 else None
-    return Rates(_slowest(system, parts, _methods_of_means), _slowest(system, parts, _methods_of_second_moments), graph)
+    of_second_moments = partial(_methods_of_second_moments, most_unknowns=most_unknowns)
+    return Rates(_slowest(system, parts, _methods_of_means), _slowest(system, parts, of_second_moments), graph)
 
 
 Method = Callable[[JumpSystem, np.random.Generator | None], float | None]
@@ -94,8 +96,8 @@ def _methods_of_means(_: JumpSystem) -> Iterator[Method]:
     yield lambda system, _: mean_propagator(system).slowest
 
 
-def _methods_of_second_moments(system: JumpSystem) -> Iterator[Method]:
-    if unknowns(system) <= MAX_UNKNOWNS:
+def _methods_of_second_moments(system: JumpSystem, most_unknowns: int) -> Iterator[Method]:
+    if unknowns(system) <= most_unknowns:
         yield lambda system, _: homogeneous_propagator(system).slowest
     elif system.time == "discrete":
         yield _by_arnoldi
@@ -155,7 +157,14 @@ MAX_DOUBLINGS = 200
 MAX_STEPS = 1_000_000
 
 
-def settling_time(system: JumpSystem, steady: FloatArray, start: Snapshot, fraction: float = FRACTION) -> float:
+def settling_time(
+    system: JumpSystem,
+    steady: FloatArray,
+    start: Snapshot,
+    fraction: float = FRACTION,
+    *,
+    most_unknowns: int = MAX_UNKNOWNS,
+) -> float:
     """First time [units of time, or steps] after which the system error stays within a fraction of its steady value.
 
     0.0 if it does so from the start. The end of the search is certain: if at some time -f C_i <= D_i <= f C_i for every
@@ -175,6 +184,8 @@ def settling_time(system: JumpSystem, steady: FloatArray, start: Snapshot, fract
         at time 0
     fraction
         f, between 0 and 1
+    most_unknowns
+        up to which the joint equations are propagated as a whole
 
     Raises
     ------
@@ -189,10 +200,10 @@ def settling_time(system: JumpSystem, steady: FloatArray, start: Snapshot, fract
         raise InputError("settling time: the steady error is 0, expected noise: set noise.process")
     away = distance(system, start, steady)
     judge = _Judge(system, steady, weights, fraction * error, fraction)
-    if unknowns(system) > MAX_UNKNOWNS and system.time == "discrete":
+    if unknowns(system) > most_unknowns and system.time == "discrete":
         return _stepped(system, judge, away)
     stack = joint_stack(away)
-    flow = joint_flow(system, stack, lambda: slowest_rate(system, steady), decays=True)
+    flow = joint_flow(system, stack, lambda: slowest_rate(system, steady), decays=True, most_unknowns=most_unknowns)
     return _searched(flow, judge, stack, system.time)
 
 

@@ -99,7 +99,13 @@ class Spectrum:
         }
 
 
-def spectrum(prediction: Prediction, lags: IntArray | None = None, frequencies: FloatArray | None = None) -> Spectrum:
+def spectrum(
+    prediction: Prediction,
+    lags: IntArray | None = None,
+    frequencies: FloatArray | None = None,
+    *,
+    most_unknowns: int = MAX_SIZE,
+) -> Spectrum:
     """Autocovariance and spectral density of the errors, from the steady moments of a prediction.
 
     Parameters
@@ -111,6 +117,8 @@ def spectrum(prediction: Prediction, lags: IntArray | None = None, frequencies: 
     frequencies
         (F,) ascending, from 0 to 1 / (2 dt) [cycles per unit of simulated time]; None: 200, equally spaced on a
         logarithmic axis
+    most_unknowns
+        graphs times coordinates of the resolvent, at most
 
     Raises
     ------
@@ -133,7 +141,7 @@ def spectrum(prediction: Prediction, lags: IntArray | None = None, frequencies: 
         chosen,
         _covariances(system, prediction.steady, chosen),
         frequencies,
-        2.0 * dt * _densities(system, prediction.steady, 2.0 * np.pi * dt * frequencies),
+        2.0 * dt * _densities(system, prediction.steady, 2.0 * np.pi * dt * frequencies, most_unknowns),
     )
 
 
@@ -166,13 +174,13 @@ def _covariances(system: JumpSystem, steady: FloatArray, lags: IntArray) -> Floa
     return np.stack(found)
 
 
-def _densities(system: JumpSystem, steady: FloatArray, angles: FloatArray) -> FloatArray:
+def _densities(system: JumpSystem, steady: FloatArray, angles: FloatArray, most_unknowns: int) -> FloatArray:
     """(F, m): sum over all lags of R(l) exp(-i w l) of every agent, for angles w (F,) per step."""
     n, d = system.modes, system.dimension
-    if n * d > MAX_SIZE:
+    if n * d > most_unknowns:
         raise InputError(
             f"spectrum: {n} graphs or states of the network and {d} coordinates make {n * d} unknowns; at most "
-            f"{MAX_SIZE} are computed: use fewer agents or graphs"
+            f"{most_unknowns} are computed: use fewer agents or graphs"
         )
     output = system.output
     if not d:

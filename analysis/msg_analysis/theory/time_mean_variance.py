@@ -59,7 +59,7 @@ class _Moments(Protocol):
         """E[tr(S M S M); i] of a symmetric S."""
 
 
-def mean_variance(prediction: Prediction) -> MeanVariance:
+def mean_variance(prediction: Prediction, *, most_work: float = MAX_WORK) -> MeanVariance:
     """Asymptotic variance of the time mean of the system error, from its Poisson equation.
 
     The martingale difference of a step (docs/statistics.md, "Standard errors") has a part of the noise, of each loss
@@ -78,6 +78,8 @@ def mean_variance(prediction: Prediction) -> MeanVariance:
     ----------
     prediction
         of the experiment
+    most_work
+        n p^3 for p packed moments, up to which M is followed along the path
 
     Raises
     ------
@@ -87,7 +89,7 @@ def mean_variance(prediction: Prediction) -> MeanVariance:
     system, solver, losses = prediction.system, prediction.solver, prediction.step.losses
     if not system.dimension:
         return MeanVariance(0.0, 0.0, True)
-    rank = _most_followed(system.modes)
+    rank = _most_followed(system.modes, most_work)
     if system.dimension <= rank:
         return MeanVariance(*_variance(solver, prediction.steady, losses, follow=True), followed=True)
     rough = _variance(solver, prediction.steady, losses, follow=False)
@@ -98,9 +100,9 @@ def mean_variance(prediction: Prediction) -> MeanVariance:
     return MeanVariance(path, replica, followed=False)
 
 
-def _most_followed(modes: int) -> int:
+def _most_followed(modes: int, most_work: float) -> int:
     """Largest dimension whose M is followed along the path, with so many graphs."""
-    return max(1, next(d for d in range(1, 1000) if modes * float(packed_symmetric.size(d + 1)) ** 3 > MAX_WORK))
+    return max(1, next(d for d in range(1, 1000) if modes * float(packed_symmetric.size(d + 1)) ** 3 > most_work))
 
 
 def _principal(system: JumpSystem, steady: FloatArray, rank: int) -> JumpSystem:

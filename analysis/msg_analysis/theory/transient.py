@@ -194,7 +194,14 @@ def unreduced_consensus(experiment: ValidExperiment) -> JumpSystem:
     )
 
 
-def transient(system: JumpSystem, start: Snapshot, times: FloatArray, steady: FloatArray | None = None) -> Transient:
+def transient(
+    system: JumpSystem,
+    start: Snapshot,
+    times: FloatArray,
+    steady: FloatArray | None = None,
+    *,
+    most_unknowns: int = MAX_UNKNOWNS,
+) -> Transient:
     """Exact moments at the given times (Propositions 1 and 6 of the paper).
 
         continuous: d/dt nu = -N nu,   d/dt c = -M c + pi(t) (x) Q,       d/dt pi = Gamma^T pi
@@ -212,6 +219,8 @@ def transient(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Fl
         (T,) >= 0, ascending; units of time, or whole numbers of steps
     steady
         (n, d, d) of ``MomentSolver(system).steady()``; None where there is no steady state
+    most_unknowns
+        up to which the joint equations are propagated as a whole
 
     Raises
     ------
@@ -220,9 +229,9 @@ def transient(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Fl
     """
     times = np.asarray(times, dtype=float)
     _check_times(system, times)
-    if unknowns(system) > MAX_UNKNOWNS and system.time == "discrete":
+    if unknowns(system) > most_unknowns and system.time == "discrete":
         return _stepped(system, start, times, steady)
-    return _powered(system, start, times, steady)
+    return _powered(system, start, times, steady, most_unknowns)
 
 
 def unknowns(system: JumpSystem) -> int:
@@ -230,18 +239,27 @@ def unknowns(system: JumpSystem) -> int:
     return system.modes * (packed_symmetric.size(system.dimension) + 1)
 
 
-def joint_flow(system: JumpSystem, stack: FloatArray, slow: Callable[[], float], *, decays: bool) -> Flow:
+def joint_flow(
+    system: JumpSystem,
+    stack: FloatArray,
+    slow: Callable[[], float],
+    *,
+    decays: bool,
+    most_unknowns: int = MAX_UNKNOWNS,
+) -> Flow:
     """The flow of the joint equations for one ``joint_stack`` (n, p + 1): reduced for it where they are large.
 
     ``slow`` gives the slowest rate of interest [1 / unit of time]; ``decays``: the stack is a distance from the steady
     state.
     """
-    if unknowns(system) <= MAX_UNKNOWNS:
+    if unknowns(system) <= most_unknowns:
         return second_moment_propagator(system)
     return RationalFlow(system, stack, slow(), decays=decays)
 
 
-def _powered(system: JumpSystem, start: Snapshot, times: FloatArray, steady: FloatArray | None) -> Transient:
+def _powered(
+    system: JumpSystem, start: Snapshot, times: FloatArray, steady: FloatArray | None, most_unknowns: int
+) -> Transient:
     """By powers of matrices."""
     longest = float(times[-1]) or 1.0
 
@@ -250,7 +268,7 @@ def _powered(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Flo
 
     def course(snapshot: Snapshot, when: FloatArray, *, decays: bool) -> tuple[FloatArray, FloatArray]:
         stack = joint_stack(snapshot)
-        joint = joint_flow(system, stack, slow, decays=decays).grid(stack, when)
+        joint = joint_flow(system, stack, slow, decays=decays, most_unknowns=most_unknowns).grid(stack, when)
         return joint[:, :, :-1], joint[:, :, -1]
 
     means = np.zeros((len(times), *start.means.shape))

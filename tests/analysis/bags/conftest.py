@@ -1,7 +1,5 @@
 """A small run; rosbags parses what stands in every bag of ours once."""
 
-from __future__ import annotations
-
 import functools
 import uuid
 from collections.abc import Callable
@@ -11,9 +9,7 @@ import pytest
 from rosbags.highlevel import anyreader
 from rosbags.rosbag2 import storage_mcap
 
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.model.run import Completeness, Trajectory
-from msg_analysis.model.run_record import RunRecord
+from experiments import Completeness, RunRecord, Trajectory, line_ring
 
 _QOS = functools.cache(storage_mcap.get_qos)
 _TYPES = functools.cache(anyreader.get_types_from_msg)
@@ -31,18 +27,9 @@ def make_run() -> Callable[..., Trajectory]:
     """A trajectory with random states; no theory in it."""
 
     def make(agents: int = 3, steps: int = 40, replicas: int = 2, seed: int = 0, name: str = "small") -> Trajectory:
-        everybody = list(range(1, agents + 1))
-        experiment = ValidExperiment.parse(
-            {
-                "name": name,
-                "problem": "consensus",
-                "time": "continuous",
-                "graphs": {"line": {"path": everybody}, "star": {"star": {"center": 1}}},
-                "agents": agents,
-                "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
-                "run": {"dt": 0.05, "duration": steps * 0.05, "replicas": replicas, "start": "zero"},
-            }
-        )
+        graphs = {"line": {"path": list(range(1, agents + 1))}, "star": {"star": {"center": 1}}}
+        run = {"duration": steps * 0.05, "replicas": replicas, "start": "zero"}
+        experiment = line_ring(agents, 0.5, name=name, graphs=graphs, agents=agents, run=run)
         rng = np.random.default_rng(seed)
         states = rng.standard_normal((steps + 1, agents, replicas))
         modes = np.repeat(rng.integers(0, 2, steps // 4 + 1), 4)[:steps]

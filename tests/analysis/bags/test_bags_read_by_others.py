@@ -1,7 +1,5 @@
 """Bags of ours in every combination of options, read by rosbags and by mcap's own reader with CRCs validated."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from pathlib import Path
@@ -14,13 +12,9 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
+from experiments import Trajectory, line_ring, read_bag, simulate, write_trajectory
 from msg_analysis.bags.mcap_chunks import COMPRESSIONS, Compression, Storage
-from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.model.run import Trajectory
-from msg_analysis.twin.simulate import simulate
 
 AGENTS, STEPS, REPLICAS = 3, 120, 4
 NOISE: dict[str, dict[str, float]] = {
@@ -34,41 +28,35 @@ NOISE: dict[str, dict[str, float]] = {
 @pytest.fixture(scope="module", params=NOISE)
 def run(request: pytest.FixtureRequest) -> Trajectory:
     """A run of the twin, with a second topic of states where they are published with noise."""
-    experiment = {
-        "name": "peers",
-        "graphs": {"line": {"path": [1, 2, 3]}, "all": {"cycle": [1, 2, 3]}},
-        "switching": {"generator": [[-2, 2], [2, -2]]},
-        "noise": NOISE[request.param],
-        "run": {"dt": 0.05, "duration": STEPS * 0.05, "replicas": REPLICAS, "seed": 5, "start": "zero"},
-    }
-    return simulate(ValidExperiment.parse(experiment))
+    setting = {"duration": STEPS * 0.05, "replicas": REPLICAS, "seed": 5, "start": "zero"}
+    return simulate(line_ring(AGENTS, 2.0, name="peers", noise=NOISE[request.param], run=setting))
 
 
 @pytest.mark.parametrize("split", [None, 3])
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_every_peer_reads_every_bag(
-    run: Trajectory, compression: Compression, split: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Trajectory, compression: Compression, split: int | None, tmp_path: Path, typestore: Any
 ) -> None:
     """Every message, in the order of time, with the right counts and values, in one file or in several."""
-    monkeypatch.setattr("msg_analysis.bags.writing.CHUNK_SIZE", 3000)
     bag = tmp_path / "bag"
     if split is not None:  # so many files
-        write_trajectory(run, tmp_path / "one", Storage(compression))
+        write_trajectory(run, tmp_path / "one", Storage(compression, chunk_size=3000))
         split = (tmp_path / "one" / "one_0.mcap").stat().st_size // split
-    write_trajectory(run, bag, Storage(compression, split))
+    write_trajectory(run, bag, Storage(compression, split, 3000))
     files = sorted(bag.glob("*.mcap"), key=lambda file: int(file.stem.removeprefix("bag_")))
     assert [file.name for file in files] == [f"bag_{i}.mcap" for i in range(len(files))]
     assert len(files) in ((1,) if split is None else (2, 3))
-    topics = _values(run, bag)
+    topics = _values(run, bag, typestore)
     _files(bag, files, compression, topics, split)
     assert {"metadata.yaml", *(file.name for file in files)} == {file.name for file in bag.iterdir()}
     found = read_bag(bag)
     assert np.array_equal(found.states, run.states)
     assert found.completeness == run.completeness
-    assert found.lost is None or np.array_equal(found.lost, run.lost)
+    np.testing.assert_array_equal(found.lost, run.lost)
+    np.testing.assert_array_equal(found.published, run.published)
 
 
-def _values(run: Trajectory, bag: Path) -> Counter[str]:
+def _values(run: Trajectory, bag: Path, typestore: Any) -> Counter[str]:
     """All messages by rosbags, with the definitions in the bag: right values; their numbers by topic."""
     expected = {"state": run.states if run.published is None else run.published, "truth": run.states}
     found = {kind: np.full_like(states, np.nan) for kind, states in expected.items()}
@@ -82,6 +70,9 @@ def _values(run: Trajectory, bag: Path) -> Counter[str]:
             count[connection.topic] += 1
             message: Any = reader.deserialize(raw, connection.msgtype)
             if connection.topic == "/graph":
+                graph = run.record.experiment.graph_list[message.mode - 1]
+                arcs = zip(message.source, message.target, message.weight, strict=True)
+                assert (message.name, [tuple(arc) for arc in arcs]) == (graph.name, graph.arcs)
                 modes[message.first_step : message.last_step + 1] = message.mode - 1
             elif connection.topic == "/experiment":
                 assert message.data == run.record.to_json()
@@ -97,6 +88,7 @@ def _values(run: Trajectory, bag: Path) -> Counter[str]:
     with Reader(bag) as plain:
         assert Counter(connection.topic for connection, _, _ in plain.messages()) == count
         for connection in plain.connections:
+            assert connection.digest == typestore.hash_rihs01(connection.msgtype)
             assert connection.ext.offered_qos_profiles  # type: ignore[union-attr]
     assert np.array_equal(modes, run.modes)
     assert np.array_equal(found["state"], expected["state"])
@@ -122,7 +114,6 @@ def _files(bag: Path, files: list[Path], compression: Compression, topics: Count
         with file.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
             summary = reader.get_summary()
-            assert summary is not None
             assert summary.statistics is not None
             kinds = {index.compression for index in summary.chunk_indexes}
             assert kinds == {"" if compression == "none" else compression}
@@ -158,7 +149,6 @@ def _files(bag: Path, files: list[Path], compression: Compression, topics: Count
         alone = read_bag(file)
         assert str(alone.record.run) == record["run"]
         if len(messages) > 30:  # more than a step; not the rest in the last file
-            assert alone.stretch is not None
             assert alone.stretch[0] >= min(times) // 50_000_000
     assert counted == topics
     assert all(numbers == list(range(len(numbers))) for numbers in sequences.values())  # a gap would tell of a loss

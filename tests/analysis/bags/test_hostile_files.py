@@ -1,8 +1,10 @@
-"""Files that are small, and are meant to take long or to fill the memory. All of `make fuzz` has more of them."""
+"""Files that are small, and are meant to take long or to fill the memory; and a share of `make fuzz`."""
 
-from __future__ import annotations
-
+import os
+import re
 import struct
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -133,7 +135,22 @@ def test_many_torn_files(tmp_path: Path) -> None:
         _file(tmp_path / f"bag/bag_{number}.mcap", _channel(1, "/a") + _message(1, bytes(number)))
     report = salvage(tmp_path / "bag", tmp_path / "out")
     assert report.kept_messages == 50
-    assert report.torn is not None
     assert report.torn.startswith("ends after")
     assert report.torn.endswith("; ...")
     assert len(report.torn) < 600
+
+
+SCRIPT = Path(__file__).parents[3] / "benchmarks/fuzz.py"
+
+
+def test_a_share_of_the_fuzzing(tmp_path: Path) -> None:
+    """Other seeds than those of `make fuzz`, which begins at 0."""
+    numbers = ["--bags", "30", "--experiments", "100", "--seed", "1000000", "--jobs", "1", "--no-bombs"]
+    command = [sys.executable, str(SCRIPT), *numbers, "--findings", str(tmp_path)]
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    result = subprocess.run(command, capture_output=True, text=True, timeout=110, check=False, env=environment)
+    assert result.returncode == 0, result.stderr + result.stdout
+    bags, experiments = result.stdout.splitlines()
+    assert re.search(r"^bags: 30 damaged: \d+ complete, \d+ incomplete, \d+ refused, 0 findings", bags)
+    assert re.search(r"^experiments: 100 damaged: \d+ refused, \d+ valid, 0 findings", experiments)
+    assert list(tmp_path.iterdir()) == []

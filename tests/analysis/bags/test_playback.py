@@ -1,16 +1,13 @@
 """The order in which the messages of a bag are played, against sorting all of them, and against MCAP's own reader."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 from typing import Any
 
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 
-from msg_analysis.bags import playback
 from msg_analysis.bags.playback import Playback
 from msg_analysis.errors import BagError
 
@@ -31,8 +28,8 @@ def write(path: Path, messages: list[tuple[str, int]], *, qos: str = "", **optio
         writer.finish()
 
 
-def played(path: Path, *topics: str, until: int = 2**63) -> list[tuple[str, int, int]]:
-    bag = Playback(path)
+def played(path: Path, *topics: str, until: int = 2**63, **options: int) -> list[tuple[str, int, int]]:
+    bag = Playback(path, **options)
     found = bag.messages(topics or list(bag.topics), until)
     return [(message.topic, message.time, int.from_bytes(message.data, "little")) for message in found]
 
@@ -57,13 +54,11 @@ def disorder(seed: int, spread: int, count: int = 400) -> list[tuple[str, int]]:
 
 
 @pytest.mark.parametrize("spread", [1, 60, 2000])
-@pytest.mark.parametrize("options", [{}, {"use_chunking": False}, {"use_statistics": False}, {"index_types": 0}])
+@pytest.mark.parametrize(
+    "options", [{}, {"use_chunking": False}, {"use_statistics": False}, {"index_types": IndexType.NONE}]
+)
 def test_order(tmp_path: Path, spread: int, options: dict[str, Any]) -> None:
     """In chunks, loose, and without a summary that could be relied on."""
-    if options == {"index_types": 0}:
-        from mcap.writer import IndexType
-
-        options = {"index_types": IndexType.NONE}
     for seed in range(5):
         messages = disorder(seed, spread)
         write(tmp_path / f"{seed}.mcap", messages, **options)
@@ -106,12 +101,11 @@ def test_selection_and_end(tmp_path: Path) -> None:
     assert played(tmp_path / "bag.mcap", "/b", until=2000) == some
 
 
-def test_a_bag_far_out_of_order_does_not_fill_the_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bag_far_out_of_order_does_not_fill_the_memory(tmp_path: Path) -> None:
     """The last message is the earliest: the order gives way, and nothing is lost."""
-    monkeypatch.setattr(playback, "MOST_HELD", 1000)
     messages = [("/a", 1000 + i) for i in range(300)] + [("/b", 1)]
     write(tmp_path / "bag.mcap", messages)
-    found = played(tmp_path / "bag.mcap")
+    found = played(tmp_path / "bag.mcap", most_held=1000)
     assert sorted(found) == sorted(expected(messages))
     assert found[0][0] == "/a"
     assert [entry for entry in found if entry[0] == "/a"] == [entry for entry in expected(messages) if entry[0] == "/a"]

@@ -1,7 +1,5 @@
 """Bags in sqlite3, made by hand in the schemas of rosbag2's versions, and by rosbags: read, played, salvaged."""
 
-from __future__ import annotations
-
 import shutil
 import signal
 import sqlite3
@@ -18,13 +16,11 @@ import zstandard
 from click.testing import CliRunner
 from rosbags.highlevel import AnyReader
 
+from experiments import Trajectory, read_bag, write_trajectory
 from msg_analysis.bags.playback import Playback
-from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.cli.main import main
 from msg_analysis.errors import BagError
-from msg_analysis.model.run import Trajectory
 from msg_analysis.report.documents import describe_bag
 
 MakeRun = Callable[..., Trajectory]

@@ -1,7 +1,5 @@
 """The commands ``runs`` and ``diff``: what they print, and their exit codes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The command: files, texts, exit codes; interrupted and resumed. Real workers."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os
@@ -18,11 +16,9 @@ import pytest
 import yaml
 from click.testing import CliRunner
 
+from experiments import ValidExperiment, compare, simulate
 from msg_analysis.cli.main import main
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.inference.verdict import compare
 from msg_analysis.sweep.workers import ENDING
-from msg_analysis.twin.simulate import simulate
 
 Call = Callable[..., tuple[int, str, str]]
 PROGRAM = Path(sys.executable).with_name("msg-analysis")

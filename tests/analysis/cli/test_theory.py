@@ -1,25 +1,24 @@
-"""The commands transient, facts, plan and spectrum: what is printed where, and what is refused."""
+"""The commands transient, facts, plan, spectrum, leaders and figures: what is printed where, and what is refused."""
 
 import csv
 import dataclasses
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
 
+from experiments import GOLDEN, ValidExperiment, predict
 from msg_analysis import Experiment, Run, read_bag
+from msg_analysis.cli import console
 from msg_analysis.cli import main as cli
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.theory.prediction import predict
+from msg_analysis.paper import examples
 
-GOLDEN = Path(__file__).parents[2] / "data/golden"
 LINE_RING = str(GOLDEN / "line_ring.yaml")
-
-
-def call(*arguments):
-    return CliRunner().invoke(cli.main, [str(argument) for argument in arguments])
+NO_TIMES = ["soon", "0:1", "1:0:0.5", "0,nan"]
 
 
 def document_of(*arguments):
@@ -93,26 +92,34 @@ def test_without_noise_nothing_settles(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("file", "options", "message"),
+    ("command", "file", "options", "message"),
     [
-        ("line_ring", ["--times", "soon"], "expected START:STOP:STEP"),
-        ("line_ring", ["--times", "0:1"], "expected START:STOP:STEP"),
-        ("line_ring", ["--times", "1:0:0.5"], "expected START:STOP:STEP"),
-        ("line_ring", ["--times", "0,nan"], "expected START:STOP:STEP"),
-        ("line_ring", ["--times", "2,1"], "ascending"),
-        ("line_ring", ["--times", "0.51"], "0.51 is not a multiple of the step 0.05"),
-        ("line_ring", ["--times", "1", "--fraction", "2"], "settling fraction"),
-        ("line_ring", ["--times", "1", "--csv", "/nowhere/file.csv"], "no such directory /nowhere"),
-        ("air", ["--times", "1", "--law", "continuous"], "belong to steps"),
-        ("discrete", ["--times", "1", "--law", "continuous"], "expected an experiment in continuous time"),
-        ("tracking", ["--times", "1", "--unreduced"], "tracking has no reduction"),
+        *[("transient", "line_ring", ["--times", times], "expected START:STOP:STEP") for times in NO_TIMES],
+        ("transient", "line_ring", ["--times", "0.51"], "0.51 is not a multiple of the step 0.05"),
+        ("transient", "line_ring", ["--times", "1", "--csv", "/nowhere/file.csv"], "no such directory /nowhere"),
+        ("transient", "air", ["--times", "1", "--law", "continuous"], "belong to steps"),
+        ("transient", "discrete", ["--times", "1", "--law", "continuous"], "expected an experiment in continuous time"),
+        ("transient", "tracking", ["--times", "1", "--unreduced"], "tracking has no reduction"),
+        ("plan", "line_ring", ["--precision", "much"], "--precision much: expected a share above 0, below 1"),
+        ("plan", "line_ring", ["--precision", "150%"], "--precision 150%: expected a share"),
+        ("plan", "line_ring", ["--budget", "soon", "--speed", "9"], "--budget soon: expected a number above 0 with s"),
+        ("plan", "line_ring", ["--budget", "10ms", "--speed", "1"], "--budget 10ms: expected a number above 0 with s"),
+        ("plan", "line_ring", ["--budget", "1h"], "give its speed in steps per second too"),
+        (
+            "spectrum",
+            "line_ring",
+            ["--figure", "picture.gif"],
+            "picture.gif: expected a name that ends with .png, .svg",
+        ),
+        ("spectrum", "line_ring", ["--figure", "/nowhere/a.png"], "no such directory /nowhere"),
+        ("leaders", "line_ring", ["--count", "5"], "count 5: expected 1 to 4"),
+        ("leaders", "line_ring", [], "has no leaders: give their number"),
     ],
 )
-def test_transient_refuses(file, options, message):
-    result = call("transient", GOLDEN / f"{file}.yaml", *options)
-    assert result.exit_code == 2
-    assert message in result.stderr
-    assert result.stdout == ""
+def test_refused(command, file, options, message):
+    result = call(command, GOLDEN / f"{file}.yaml", *options)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert message in " ".join(result.stderr.split())
 
 
 def test_facts_of_a_large_network(tmp_path):
@@ -129,25 +136,25 @@ def test_facts_of_a_large_network(tmp_path):
     assert "3200" in call("facts", file).stdout
 
 
-@pytest.mark.parametrize("name", ["line_ring", "discrete", "tracking", "air"])
-def test_facts(name):
+@pytest.mark.parametrize(
+    ("name", "law"), [("line_ring", "emulated"), ("discrete", "discrete"), ("tracking", None), ("air", None)]
+)
+def test_facts(name, law):
+    """The closed form of two graphs, where it is one: with equal noise and no leader."""
     document = document_of("facts", GOLDEN / f"{name}.yaml")
     assert all(fact["holds"] for fact in document["facts"])
     assert set(document) == {"names", "modes", "facts", "bounds", "graphs", "two_topology", "notes"}
     prediction = predict(ValidExperiment.load(GOLDEN / f"{name}.yaml"))
-    if name in ("line_ring", "discrete"):
-        law = "emulated" if name == "line_ring" else "discrete"
-        form = document["two_topology"][law]
-        assert form["system"]["error"] == pytest.approx(prediction.emulated.system_error, rel=1e-11)
-        assert form["nodes"]["error"] == pytest.approx(prediction.emulated.node_errors.tolist(), rel=1e-11)
-        assert document["bounds"]["upper"] is not None
-    else:
-        assert document["two_topology"] is None
-        assert document["bounds"]["upper"] is None
+    moments = prediction.emulated
+    nothing = {"system": {"error": None}, "nodes": {"error": None}}
+    form = (document["two_topology"] or {None: nothing})[law]
+    assert form["system"]["error"] == (law and pytest.approx(moments.system_error, rel=1e-11))
+    assert form["nodes"]["error"] == (law and pytest.approx(moments.node_errors.tolist(), rel=1e-11))
+    assert (document["bounds"]["upper"] is None) == (law is None)
     result = call("facts", GOLDEN / f"{name}.yaml")
     assert result.exit_code == 0
     assert "does not hold" not in result.stdout
-    assert ("Two graphs in closed form" in result.stdout) == (document["two_topology"] is not None)
+    assert ("Two graphs in closed form" in result.stdout) == (law is not None)
 
 
 def test_plan(tmp_path):
@@ -164,28 +171,9 @@ def test_plan(tmp_path):
 
 
 def test_plan_of_a_start(from_zero):
-    text = " ".join(call("plan", from_zero, "--budget", "10ms", "--speed", "1").stderr.split())
-    assert text.startswith("error: --budget 10ms: expected a number above 0 with s, min, h or d")
     text = " ".join(call("plan", from_zero, "--budget", "1s", "--speed", "20").stdout.split())
     assert "warm-up" in text
     assert "ends before the effect of the start does" in text
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--precision", "much"], "--precision much: expected a share above 0, below 1: for example 1% or 0.01"),
-        (["--precision", "150%"], "--precision 150%: expected a share"),
-        (["--budget", "soon", "--speed", "9"], "--budget soon: expected a number above 0 with s, min, h or d"),
-        (["--budget", "1h"], "give its speed in steps per second too"),
-        (["--speed", "-3"], "speed: -3 steps per second: expected a number above 0"),
-    ],
-)
-def test_plan_refuses(options, message):
-    result = call("plan", LINE_RING, *options)
-    assert result.exit_code == 2
-    assert message in result.stderr
-    assert result.stdout == ""
 
 
 @pytest.fixture(scope="module")
@@ -252,15 +240,119 @@ def test_spectrum_of_runs_that_are_not_tested(tmp_path):
     assert run.completeness.complete
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--figure", "picture.gif"], "picture.gif: expected a name that ends with .png, .svg or .pdf"),
-        (["--figure", "/nowhere/a.png"], "no such directory /nowhere"),
-    ],
-)
-def test_spectrum_refuses(options, message):
-    result = call("spectrum", LINE_RING, *options)
-    assert result.exit_code == 2
-    assert message in result.stderr
-    assert result.stdout == ""
+ROOT = Path(__file__).parents[3]
+EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"
+
+
+def call(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(cli.main, [str(argument) for argument in arguments])
+
+
+def leaders(*arguments: str | Path) -> dict:
+    result = call("leaders", *arguments, "--json")
+    assert (result.exit_code, result.stderr) == (0, "")
+    return json.loads(result.stdout)
+
+
+@pytest.mark.parametrize("method", ["auto", "exhaustive", "greedy", "swap"])
+def test_leaders_json(method: str) -> None:
+    document = leaders(LINE_RING, "--count", "2", "--method", method, "--top", "2")
+    assert document["method"] == ("exhaustive" if method == "auto" else method)
+    best = document["sets"][0]
+    assert set(best) == {"agents", "system_error", "joint_centrality"}
+    assert best["joint_centrality"] == 1 / best["system_error"]
+    agents = [entry["agents"] for entry in document["sets"]]
+    assert len(agents) == 2
+    assert method == "greedy" or agents == [[1, 4], [2, 5]]  # the same by symmetry
+    assert document["bound"]["system_error"] <= best["system_error"]
+    assert document["supermodular"]
+
+
+def test_orders_of_the_third_example() -> None:
+    document = leaders(EXPERIMENTS / "leader_knife_edge.yaml", "--count", "1")
+    assert [entry["agents"] for entry in document["sets"]] == [[3], [1], [4], [5], [2]]
+    assert round(document["sets"][0]["system_error"], 5) == 1.63896
+    assert document["bound"] == {"system_error": document["sets"][0]["system_error"], "gap": 0.0}
+
+
+def test_laws_and_gains() -> None:
+    held = leaders(LINE_RING, "--count", "1")["sets"][0]["system_error"]
+    assert leaders(LINE_RING, "--count", "1", "--law", "emulated")["sets"][0]["system_error"] > held
+    weak = leaders(LINE_RING, "--count", "1", "--gain", "0.5")
+    assert weak["gain"] == 0.5
+    assert weak["sets"][0]["system_error"] > held
+    assert leaders(EXPERIMENTS / "discrete.yaml", "--count", "1")["law"] == "discrete"
+
+
+def test_leaders_of_the_file() -> None:
+    """Their number and gain unless others are given, and what they achieve beside the best."""
+    tracking = EXPERIMENTS / "tracking.yaml"
+    document = leaders(tracking)
+    assert (document["count"], document["gain"]) == (2, 0.7)
+    predicted = Experiment.load(tracking).predict().continuous
+    assert document["present"]["agents"] == [1, 4]
+    assert document["present"]["system_error"] == pytest.approx(predicted.system_error, rel=1e-9)
+    assert document["sets"][0]["system_error"] < document["present"]["system_error"]
+    other = leaders(tracking, "--count", "1", "--gain", "inf")
+    assert (other["count"], other["gain"], other["present"]["agents"]) == (1, "inf", [1, 4])
+    assert "leaders now: 1, 4" in call("leaders", tracking).stdout
+    assert leaders(LINE_RING, "--count", "1")["present"] is None
+
+
+def test_leaders_text() -> None:
+    result = call("leaders", LINE_RING, "--count", "2")
+    assert (result.exit_code, result.stderr) == (0, "")
+    for part in ("Sets of 2 leaders, held at the reference", "joint centrality", "1, 4", "no better set exists"):
+        assert part in result.stdout
+    swap = call("leaders", LINE_RING, "--count", "2", "--method", "swap", "--gain", "2").stdout
+    assert "gain 2" in swap
+    assert "% above the best" in " ".join(swap.split())
+    assert "Single leaders" in call("leaders", LINE_RING, "--count", "1").stdout
+
+
+def test_no_guarantee_says_why(tmp_path: Path) -> None:
+    file = tmp_path / "correlated.yaml"
+    file.write_text(
+        "name: correlated\ngraphs: {g: {path: [1, 2, 3, 4]}}\n"
+        "noise: {process: [[1, 0, 0, 0], [-1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}\n"
+    )
+    result = call("leaders", file, "--count", "2", "--method", "greedy")
+    assert result.exit_code == 0
+    assert "none: the noise of some agents is negatively correlated" in " ".join(result.stdout.split())
+    assert leaders(file, "--count", "2", "--method", "greedy")["bound"] == {"system_error": None, "gap": None}
+
+
+def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(console, "_LINE_PERIOD", 0.0)
+    result = call("leaders", LINE_RING, "--count", "2", "--method", "swap", "--json")
+    assert json.loads(result.stdout)["sets"]
+    assert "line_ring: greedy: 1 of 10, smallest system error" in result.stderr
+    assert "\x1b" not in result.stderr
+
+
+def test_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number, example in list(examples.EXAMPLES.items()):
+        monkeypatch.setitem(examples.EXAMPLES, number, lambda example=example: example(5))
+    result = call("figures", "--out", tmp_path / "all", "--format", "svg")
+    assert (result.exit_code, result.stderr) == (0, "")
+    names = [f"example_{number}.{kind}" for number in (1, 2, 3) for kind in ("svg", "csv")]
+    assert result.stdout.splitlines() == [str(tmp_path / "all" / name) for name in names]
+    assert sorted(path.name for path in (tmp_path / "all").iterdir()) == sorted(names)
+    result = call("figures", "1", "--out", tmp_path / "one", "--format", "pdf", "--format", "pdf", "--format", "svg")
+    assert sorted(path.suffix for path in (tmp_path / "one").iterdir()) == [".csv", ".pdf", ".svg"]
+    (tmp_path / "file").touch()
+    result = call("figures", "1", "--out", tmp_path / "file")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "choose another place with --out" in result.stderr
+    assert call("figures", "4").exit_code == 2
+
+
+def test_help_of_leaders_is_light() -> None:
+    code = (
+        "import sys\nfrom msg_analysis.cli.main import main\n"
+        "for command in ('leaders', 'figures'):\n    main([command, '--help'], standalone_mode=False)\n"
+        "print([name for name in ('numpy', 'matplotlib', 'rich') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert "Examples:" in done.stdout
+    assert done.stdout.endswith("[]\n")

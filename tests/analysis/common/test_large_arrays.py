@@ -1,7 +1,5 @@
 """Arrays in files: the same numbers as in memory, whatever becomes of the disk."""
 
-from __future__ import annotations
-
 import resource
 import subprocess
 import sys
@@ -11,14 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from experiments import compare, line_ring, read_bag, simulate, write_trajectory
 from msg_analysis.bags import run_builder
-from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import LARGE, LargeRows, in_file, large_zeros, release
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.inference.verdict import compare
-from msg_analysis.twin.simulate import simulate
 
 
 def test_small_ones_are_in_memory() -> None:
@@ -66,40 +60,12 @@ assert array.sum() == 25_000_000
     subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
 
 
-def test_without_room_on_the_disk() -> None:
-    """Files of this process may have 1 MB: the array is in memory instead, and can be used."""
-    script = """
-import numpy as np
-from msg_analysis.common.arrays import in_file, large_zeros
-array = large_zeros((300_000,), np.float64, total=10**9)
-assert not in_file(array)
-array[:] = 1.0
-"""
-    subprocess.run(
-        [sys.executable, "-c", script],
-        check=True,
-        timeout=60,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (10**6, 10**6)),
-    )
-
-
 @pytest.mark.parametrize("changes", [{}, {"noise": {"process": 1.0, "broadcast": 0.2, "loss": 0.1}}])
 def test_a_run_that_is_read_into_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]
 ) -> None:
     """Trajectory and comparison are the same as in memory, also of an incomplete bag."""
-    run = simulate(
-        ValidExperiment.parse(
-            {
-                "name": "net",
-                "graphs": {"line": {"path": [1, 2, 3]}, "star": {"star": {"center": 1}}},
-                "agents": 3,
-                "switching": {"generator": [[-1, 1], [1, -1]]},
-                "run": {"dt": 0.1, "duration": 200, "replicas": 2},
-            }
-            | changes
-        )
-    )
+    run = simulate(line_ring(run={"dt": 0.1, "duration": 200}, **changes))
     run.states[1500, 1] = np.nan
     write_trajectory(run, tmp_path / "bag")
     one = read_bag(tmp_path / "bag")
@@ -114,8 +80,7 @@ def test_a_run_that_is_read_into_files(
     assert np.array_equal(one.states, other.states, equal_nan=True)
     for name in ("modes", "agent_modes", "lost"):
         assert np.array_equal(getattr(one, name), getattr(other, name)), name
-    if one.published is not None and other.published is not None:
-        assert np.array_equal(one.published, other.published, equal_nan=True)
+    np.testing.assert_array_equal(one.published, other.published)
     assert (one.published is None) == (other.published is None) == (not changes)
     assert compare(one).to_json() == compare(other).to_json()
 
@@ -134,12 +99,15 @@ def test_rows_one_part_after_the_other(limit: int | None, monkeypatch: pytest.Mo
     assert LargeRows(2, np.int64).array().shape == (0, 2)
 
 
-def test_rows_without_room_on_the_disk() -> None:
-    """Files of this process may have 1 MB: what does not fit stays in memory, and no row is lost."""
+def test_without_room_on_the_disk() -> None:
+    """Files of this process may have 1 MB: what does not fit stays in memory, and can be used."""
     script = """
 import signal
 import numpy as np
 from msg_analysis.common import large_arrays
+array = large_arrays.large_zeros((300_000,), np.float64, total=10**9)
+assert not large_arrays.in_file(array)
+array[:] = 1.0
 large_arrays.LARGE = 8
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 rows, parts = large_arrays.LargeRows(2, np.int64), [np.full((20_000, 2), number) for number in range(9)]

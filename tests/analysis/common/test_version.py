@@ -1,7 +1,5 @@
 """The name of the ROS 2 distribution that is used here."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 import subprocess
@@ -27,17 +25,14 @@ def test_wheels_name_theirs_whatever_is_sourced(tmp_path: Path, sourced: str) ->
 
 
 def test_an_installed_ros_names_itself_in_the_environment(tmp_path: Path) -> None:
-    """Its rclpy is found first, in another folder than the wheels."""
+    """Its rclpy is found first, in another folder than the wheels; without one, the sourced one or none."""
     assert distribution_at(installed(tmp_path, "numpy-2.0.0"), "kilted") == "kilted"
+    assert (distribution_at(None, "jazzy"), distribution_at(None, "")) == ("jazzy", "")
 
 
 @pytest.mark.parametrize("packages", [(), ("ros_rclpy-7.1.6",), ("ros_jazzy_std_msgs-5.3.6",)])
 def test_wheels_that_do_not_say(tmp_path: Path, packages: tuple[str, ...]) -> None:
     assert distribution_at(installed(tmp_path, *packages), "") == ""
-
-
-def test_without_rclpy_the_sourced_one_or_none() -> None:
-    assert (distribution_at(None, "jazzy"), distribution_at(None, "")) == ("jazzy", "")
 
 
 @pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not installed")

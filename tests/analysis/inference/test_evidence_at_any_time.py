@@ -1,30 +1,18 @@
 """Evidence on the law of runs: each part against a computation by hand, false alarms, faults that are found."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.support.line_and_ring import experiment
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from experiments import Observation, ValidExperiment, compare, five, observed, predict, simulate
 from msg_analysis.inference.evidence import Evidence, usual_looks
-from msg_analysis.inference.observation import Observation, spaced_steps
+from msg_analysis.inference.observation import spaced_steps
 from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.inference.sequential_questions import ErrorMartingale, kind_weights
 from msg_analysis.inference.sequential_sums import EvidenceSums, WatchedEvidence, any_time_evidence
-from msg_analysis.inference.verdict import compare
 from msg_analysis.theory import packed_symmetric
-from msg_analysis.theory.prediction import predict
-from msg_analysis.twin.simulate import simulate
-
-
-def observed(truth: ValidExperiment, law: ValidExperiment | None = None) -> Observation:
-    """A run of ``truth`` next to the prediction of ``law``."""
-    trajectory = simulate(truth)
-    return Observation.of(trajectory, predict(law or truth))
 
 
 def test_the_error_martingale_is_fair() -> None:
@@ -67,7 +55,7 @@ def test_the_error_martingale_is_fair() -> None:
     ids=["plain", "on the air", "delay", "leader"],
 )
 def test_sums_are_those_of_a_loop_over_the_steps(changes: dict[str, Any]) -> None:
-    observation = observed(experiment(duration=12.0, **changes))
+    observation = observed(five(duration=12.0, **changes))
     sums = EvidenceSums(observation.prediction, 1)
     for first in range(0, observation.steps, 50):
         sums.add(observation, first, min(first + 50, observation.steps))
@@ -106,9 +94,9 @@ def test_sums_are_those_of_a_loop_over_the_steps(changes: dict[str, Any]) -> Non
 )
 def test_correct_runs_seldom_pass_at_any_time(changes: dict[str, Any]) -> None:
     """Of 40 runs, watched 100 times each, at level 10 %: false-alarm rate P(binomial(40, 0.1) > 10) = 0.2 %."""
-    passed, prediction = 0, predict(experiment(seed=100, duration=25.0, **changes))
+    passed, prediction = 0, predict(five(seed=100, duration=25.0, **changes))
     for seed in range(40):
-        trajectory = simulate(experiment(seed=100 + seed, duration=25.0, **changes))
+        trajectory = simulate(five(seed=100 + seed, duration=25.0, **changes))
         if trajectory.made is None:
             prediction = prediction.for_run(trajectory.record.experiment)
         else:  # the seed says in which order the agents step
@@ -133,7 +121,7 @@ WEAK = {"line": {"arcs": ARCS}, "ring": {"arcs": [*ARCS, [5, 1, 1.0], [1, 5, 1.0
     ],
 )
 def test_faults_are_found_and_named(changes: dict[str, Any], words: str) -> None:
-    observation = observed(experiment(duration=600.0, **changes), experiment(duration=600.0))
+    observation = observed(five(duration=600.0, **changes), five(duration=600.0))
     looks = np.arange(100, observation.steps + 1, 100)
     found = any_time_evidence(WatchedEvidence.of(observation, looks), 0.01, ["line", "ring"])
     assert found.disagrees
@@ -143,16 +131,16 @@ def test_faults_are_found_and_named(changes: dict[str, Any], words: str) -> None
 
 def test_a_fault_of_the_system_error() -> None:
     """Its own martingale sees agents that have twice the noise variance, without asking for any agent."""
-    noisy = experiment(duration=600.0, noise={"process": 2.0**0.5})
-    observation = observed(noisy, experiment(duration=600.0))
+    noisy = five(duration=600.0, noise={"process": 2.0**0.5})
+    observation = observed(noisy, five(duration=600.0))
     sums = EvidenceSums(observation.prediction, 1)
     sums.add(observation, 0, observation.steps)
     assert sums.families()["system error"].max() > np.log(1000.0)
 
 
 def test_what_never_moves_is_infinite_evidence() -> None:
-    still = experiment(noise={"process": [1.0, 0.0, 1.0, 1.0, 1.0]})
-    observation = observed(experiment(noise={"process": [1.0, 0.01, 1.0, 1.0, 1.0]}), still)
+    still = five(noise={"process": [1.0, 0.0, 1.0, 1.0, 1.0]})
+    observation = observed(five(noise={"process": [1.0, 0.01, 1.0, 1.0, 1.0]}), still)
     sums = EvidenceSums(observation.prediction, 1)
     sums.add(observation, 0, observation.steps)
     assert sums.evidence() == np.inf
@@ -176,7 +164,7 @@ def test_what_never_moves_is_infinite_evidence() -> None:
 )
 def test_many_looks_in_one_pass_are_those_of_a_pass_each(changes: dict[str, Any]) -> None:
     """With innovations that are too large, an agent that stands still, and looks after 1 to 150 steps."""
-    observation = observed(experiment(duration=40.0, **changes))
+    observation = observed(five(duration=40.0, **changes))
     observation.states[301, 2] += 3.0
     observation.states[401:407, 3] = observation.states[400, 3]
     looks = np.cumsum([1, 1, 2, 5, 3, 120, 150, 100, 7, 12, 1, 150])
@@ -192,7 +180,7 @@ def test_many_looks_in_one_pass_are_those_of_a_pass_each(changes: dict[str, Any]
 
 
 def test_in_a_comparison() -> None:
-    comparison = compare(simulate(experiment(duration=200.0)))
+    comparison = compare(simulate(five(duration=200.0)))
     document = comparison.to_json()["any_time"]
     assert not document["disagrees"]
     assert document["crossed_at"] is None
@@ -206,14 +194,13 @@ def test_in_a_comparison() -> None:
 
 def test_runs_together_are_one_game() -> None:
     """Sums are added up, and looked at once."""
-    truth = [simulate(experiment(seed=seed, duration=300.0)) for seed in (1, 2)]
+    truth = [simulate(five(seed=seed, duration=300.0)) for seed in (1, 2)]
     apart = [compare(run).any_time for run in truth]
     both = compare_pooled([("one", truth[0]), ("two", truth[1])]).any_time
-    assert both is not None
     assert both.time is None
     sums = []
     for run in truth:
-        observation = Observation.of(run, predict(run.record.experiment))
+        observation = observed(run)
         one = EvidenceSums(observation.prediction, 1, in_detail=True)
         one.add(observation, 0, observation.steps)
         sums.append(one)
@@ -247,7 +234,7 @@ def test_questions_of_single_parts_keep_their_share() -> None:
 )
 def test_one_pass_for_the_tests_and_the_evidence(changes: dict[str, Any]) -> None:
     """In the pass of the innovations the evidence is the same as in a pass of its own."""
-    observation = observed(experiment(duration=40.0, **changes))
+    observation = observed(five(duration=40.0, **changes))
     looks = spaced_steps(observation.steps, usual_looks(observation.steps))
     shared, own = Evidence.of(observation, 0.01).watched, WatchedEvidence.of(observation, looks)
     assert shared.steps is not None

@@ -1,32 +1,21 @@
-"""Innovation tests against sums written as loops."""
+"""Innovation and switching tests against sums written as loops, scipy, and exact means."""
+
+import dataclasses
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.inference import residuals as module
+from experiments import observed, pieces
 from msg_analysis.inference.gains import regressors
-from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.residuals import InnovationSums, innovations
-from msg_analysis.theory.prediction import predict
-from msg_analysis.twin.simulate import simulate
+from msg_analysis.inference.switching import simulate_counts, switching_test
 
 
 def observe(**changes):
-    document = {
-        "name": "tiny",
-        "problem": "tracking",
-        "time": "continuous",
-        "graphs": {"left": {"edges": [[1, 2]]}, "right": {"edges": [[2, 3, 2.0]]}},
-        "agents": 3,
-        "switching": {"generator": [[-2.0, 2.0], [1.0, -1.0]]},
-        "noise": {"process": [[1.0, 0.3, 0.0], [0.0, 0.5, 0.2], [0.0, 0.0, 2.0]]},
-        "leaders": {"agents": [1], "gain": 1.5, "reference": 2.0},
-        "run": {"dt": 0.1, "duration": 6.0, "replicas": 3, "seed": 5},
-    }
-    trajectory = simulate(ValidExperiment.parse(document | changes))
-    return Observation.of(trajectory, predict(trajectory.record.experiment))
+    leaders = {"agents": [1], "gain": 1.5, "reference": 2.0}
+    return observed(pieces(**{"leaders": leaders} | changes, run={"duration": 6, "replicas": 3, "seed": 5}))
 
 
 @pytest.fixture(scope="module")
@@ -101,24 +90,22 @@ def test_gain_is_the_score_test_written_out(observation):
     assert InnovationSums(observation).tests().p_gain == pytest.approx(expected, rel=1e-8)
 
 
-def test_blocks_change_nothing(observation, monkeypatch):
+def test_blocks_change_nothing(observation):
     whole = InnovationSums(observation).tests()
-    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 40)
-    split = InnovationSums(observation).tests()
+    split = InnovationSums(dataclasses.replace(observation, block_numbers=40)).tests()
     assert split.p_covariance == pytest.approx(whole.p_covariance, rel=1e-9)
     assert split.p_whiteness == pytest.approx(whole.p_whiteness, rel=1e-9)
     assert split.p_gain == pytest.approx(whole.p_gain, rel=1e-9)
 
 
 @pytest.mark.parametrize(("limit", "count"), [(400, 9), (10, 9), (8, 6)])
-def test_regressors_stay_few(observation, monkeypatch, limit, count):
+def test_regressors_stay_few(observation, limit, count):
     """Coarser regressors: 3 constants + 2 x 3 rows, then 3 constants + 3 rows."""
-    monkeypatch.setattr(module, "MAX_REGRESSORS", limit)
     rows, inputs, terms = regressors(observation.step, limit)
     assert len(terms) == count
     assert rows.shape == (count,)
     assert inputs.shape == (2, count, 4)
-    assert 0.0 < InnovationSums(observation).tests().p_gain < 1.0
+    assert 0.0 < InnovationSums(observation, most_regressors=limit).tests().p_gain < 1.0
 
 
 def test_a_direction_without_noise_must_stand_still():
@@ -151,3 +138,63 @@ def test_replicas_with_the_same_noise_are_found():
     copied = observe()
     copied.states[:] = copied.states[:, :, :1]
     assert InnovationSums(copied).tests().p_whiteness < 1e-6
+
+
+def path(transition, steps, seed, first=0):
+    random = np.random.default_rng(seed)
+    modes = [first]
+    for _ in range(steps - 1):
+        modes.append(int(random.choice(len(transition), p=transition[modes[-1]])))
+    return np.array(modes)
+
+
+P = np.array([[0.9, 0.1], [0.3, 0.7]])
+RARE = np.array([[0.97, 0.03, 0.0], [0.02, 0.97, 0.01], [0.05, 0.0, 0.95]])
+
+
+def test_counts_and_likelihood_ratio():
+    modes = path(P, 500, 1)
+    result = switching_test(modes, P)
+    counts = np.zeros((2, 2))
+    for a, b in pairwise(modes):
+        counts[a, b] += 1
+    np.testing.assert_array_equal(result.counts, counts)
+    np.testing.assert_allclose(result.expected, counts.sum(axis=1)[:, None] * P)
+    rows = [stats.power_divergence(counts[i], counts[i].sum() * P[i], lambda_="log-likelihood") for i in range(2)]
+    assert result.p == pytest.approx(stats.chi2.sf(sum(r.statistic for r in rows), 2))
+
+
+def test_what_cannot_be_or_is_not_tested():
+    assert switching_test(np.array([0, 0, 2, 2, 0, 1, 1]), RARE).p == 0.0
+    result = switching_test(np.zeros(50, dtype=int), np.ones((1, 1)))
+    assert result.p is None
+    assert result.counts.tolist() == [[49]]
+    counts = simulate_counts(np.array([[0.5, 0.5], [0.0, 1.0]]), 0, 10, 50, np.random.default_rng(3))
+    assert (counts.sum(axis=(1, 2)) == 10).all()
+    assert (counts[:, 1, 0] == 0).all()
+
+
+def test_simulated_counts_have_the_exact_means():
+    """Mean counts of 20000 paths within 4.5 standard errors; false alarms below 1e-4."""
+    paths, steps = 20_000, 40
+    counts = simulate_counts(RARE, 1, steps, paths, np.random.default_rng(2))
+    assert (counts.sum(axis=(1, 2)) == steps).all()
+    law, exact = np.array([0.0, 1.0, 0.0]), np.zeros((3, 3))
+    for _ in range(steps):
+        exact += law[:, None] * RARE
+        law = law @ RARE
+    error = counts.std(axis=0) / np.sqrt(paths)
+    assert (np.abs(counts.mean(axis=0) - exact) <= 4.5 * error).all()
+
+
+def test_short_paths_give_uniform_p_values():
+    """Kolmogorov-Smirnov at 1e-3 over 60 paths; discrete p-values only make it more cautious."""
+    p = [switching_test(path(RARE, 300, seed), RARE).p for seed in range(60)]
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+
+
+def test_a_wrong_rate_is_found_in_short_and_long_paths():
+    twice = np.array([[0.94, 0.06, 0.0], [0.04, 0.94, 0.02], [0.1, 0.0, 0.9]])
+    assert switching_test(path(twice, 1000, 4), RARE).p < 1e-3
+    assert switching_test(path(np.array([[0.8, 0.2], [0.3, 0.7]]), 1000, 5), P).p < 1e-6
+    assert switching_test(np.zeros(1000, dtype=int), np.array([[0.98, 0.02], [0.02, 0.98]])).p < 1e-4

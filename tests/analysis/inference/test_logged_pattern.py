@@ -5,33 +5,23 @@ import dataclasses
 import numpy as np
 import pytest
 
+from experiments import CORRELATED, TRACKING, directed, observed, simulate
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import in_file
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.inference import realtime_laws as module
 from msg_analysis.inference.estimates import covariance_test, estimates
 from msg_analysis.inference.event_order import EventOrder, newest_steps, order_events, sampled
-from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.pattern_events import Periods
 from msg_analysis.inference.realtime_laws import PatternUnavailableError, pattern_means
-from msg_analysis.theory.prediction import predict
-from msg_analysis.twin.simulate import simulate
 
-CORRELATED = [[1.0, 0.3, 0.0], [0.0, 0.5, 0.2], [0.0, 0.0, 2.0]]
 STEPS = 90
 
 
 def experiment(run=None, **changes):
-    document = {
-        "name": "pattern",
-        "graphs": {"a": {"path": [1, 2, 3]}, "b": {"arcs": [[1, 2], [2, 3, 2.0], [3, 1], [1, 3]]}},
-        "switching": {"generator": [[-3.0, 3.0], [2.0, -2.0]]},
-        "run": {"dt": 0.1, "duration": STEPS / 10, "replicas": 2, "seed": 3, "pace": "realtime"} | (run or {}),
-    }
-    return ValidExperiment.parse(document | changes)
+    chain = {"generator": [[-3.0, 3.0], [2.0, -2.0]]}
+    run = {"duration": STEPS / 10, "pace": "realtime"} | (run or {})
+    return directed(**{"switching": chain, **changes}, run=run)
 
 
-TRACKING = {"problem": "tracking", "leaders": {"agents": [1], "gain": 0.7, "reference": 2.0}}
 CASES = {
     "consensus": experiment(),
     "zero": experiment(run={"start": "zero"}),
@@ -51,10 +41,6 @@ def timing(late_timers, kind):
         "slow": {"slow": busy(0.7, 3.0)},
         "all": {"late": busy(0.3, 1.5), "slow": busy(0.5, 1.5), "switch": busy(0.8, 2.0)},
     }[kind]
-
-
-def observe(trajectory):
-    return Observation.of(trajectory, predict(trajectory.record.experiment))
 
 
 def written_out(observation):
@@ -131,7 +117,7 @@ def written_out(observation):
 @pytest.mark.parametrize("kind", ["ideal", "late", "slow", "all"])
 def test_against_all_noise_written_out(late_timers, case, kind):
     """Expectation and standard errors of the system error, of all nodes, and chi-square of all moments."""
-    observation = observe(late_timers.run(CASES[case], **timing(late_timers, kind)))
+    observation = observed(late_timers.run(CASES[case], **timing(late_timers, kind)))
     order = order_events(observation)
     assert order.contradiction is None
     means = pattern_means(observation, order)
@@ -161,17 +147,17 @@ def test_against_all_noise_written_out(late_timers, case, kind):
 
 def test_what_has_to_be_remembered(late_timers):
     """Nothing with ideal timers; with slow messages what others still use; noise of a step half made, if correlated."""
-    ideal = observe(simulate(CASES["correlated"]))
+    ideal = observed(simulate(CASES["correlated"]))
     assert Periods(ideal, order_events(ideal)).largest == 3
-    slow = observe(late_timers.run(CASES["consensus"], slow=late_timers.busy(0.7, 3.0)))
+    slow = observed(late_timers.run(CASES["consensus"], slow=late_timers.busy(0.7, 3.0)))
     assert 3 < Periods(slow, order_events(slow)).largest < 12
     late = late_timers.run(CASES["correlated"], late=late_timers.busy(0.4, 2.5))
-    late = observe(late)
+    late = observed(late)
     assert Periods(late, order_events(late)).largest > 5
 
 
 def test_ideal_periods_are_the_sequential_law():
-    observation = observe(simulate(experiment(noise={"process": CORRELATED}, **TRACKING)))
+    observation = observed(simulate(experiment(noise={"process": CORRELATED}, **TRACKING)))
     periods = Periods(observation, order_events(observation))
     system = observation.prediction.system
     for number in range(1, STEPS):
@@ -187,7 +173,7 @@ def test_a_clock_that_jumps(late_timers):
     trajectory = late_timers.run(CASES["consensus"], **timing(late_timers, "all"))
     tick = 70_000_000
     made = -(-trajectory.made // tick) * tick
-    observation = observe(dataclasses.replace(trajectory, made=made))
+    observation = observed(dataclasses.replace(trajectory, made=made))
     order = order_events(observation)
     assert order.contradiction is None
     expected, covariance = written_out(observation)
@@ -201,38 +187,35 @@ def test_clocks_that_disagree(late_timers):
     trajectory = late_timers.run(CASES["consensus"])
     ahead = trajectory.made.copy()
     ahead[1:, 1] += 250_000_000
-    observation = observe(dataclasses.replace(trajectory, made=ahead))
+    observation = observed(dataclasses.replace(trajectory, made=ahead))
     with pytest.raises(PatternUnavailableError, match=r"a value that agent 2 computed 0\.\d+ units of time later"):
         pattern_means(observation, order_events(observation))
     back = trajectory.made.copy()
     back[50, 1] = back[48, 1]
-    order = order_events(observe(dataclasses.replace(trajectory, made=back)))
+    order = order_events(observed(dataclasses.replace(trajectory, made=back)))
     assert order.contradiction is not None
 
 
 def test_blocks_change_nothing(late_timers, monkeypatch):
-    observation = observe(late_timers.run(CASES["correlated"], **timing(late_timers, "all")))
+    observation = observed(late_timers.run(CASES["correlated"], **timing(late_timers, "all")))
     order = order_events(observation)
     whole = pattern_means(observation, order)
-    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 40)
-    monkeypatch.setattr("msg_analysis.inference.pattern_events.CACHED_NUMBERS", 50)
     monkeypatch.setattr("msg_analysis.inference.realtime_laws.math.isqrt", lambda _: 7)
     monkeypatch.setattr(arrays, "LARGE", 1)
-    split = pattern_means(observation, order)
+    split = pattern_means(dataclasses.replace(observation, block_numbers=40), order)
     for name in ("measured", "predicted", "covariance", "system_series", "system_variances"):
         np.testing.assert_allclose(getattr(split, name), getattr(whole, name), rtol=1e-9, atol=1e-14)
     assert whole.system_variances.sum() / STEPS**2 == pytest.approx(whole.trace @ whole.covariance @ whole.trace)
 
 
-def test_less_is_tested_when_there_is_much(late_timers, monkeypatch):
-    observation = observe(late_timers.run(CASES["tracking"], **timing(late_timers, "all")))
+def test_less_is_tested_when_there_is_much(late_timers):
+    observation = observed(late_timers.run(CASES["tracking"], **timing(late_timers, "all")))
     system, order = observation.prediction.system, order_events(observation)
     whole = estimates(pattern_means(observation, order), system)
     entries = Periods(observation, order).largest
     for forms, joint in ((3, False), (1, False)):
         work = STEPS * entries**2 * (forms**2 + (3 * forms + 4) * entries)
-        monkeypatch.setattr(module, "MAX_WORK", work)
-        means = pattern_means(observation, order)
+        means = pattern_means(observation, order, most_work=work)
         error, nodes = estimates(means, system)
         assert means.joint is joint
         assert error.z == pytest.approx(whole[0].z)
@@ -240,34 +223,28 @@ def test_less_is_tested_when_there_is_much(late_timers, monkeypatch):
         assert [node.measured for node in nodes] == pytest.approx([node.measured for node in whole[1]])
         assert [node.predicted for node in nodes] == pytest.approx([node.predicted for node in whole[1]])
         assert (nodes[0].z is None) == (forms == 1)
-    monkeypatch.setattr(module, "MAX_WORK", 1)
     with pytest.raises(PatternUnavailableError, match="too many to compute"):
-        pattern_means(observation, order)
-    monkeypatch.setattr(module, "MAX_ENTRIES", 3)
+        pattern_means(observation, order, most_work=1)
     with pytest.raises(PatternUnavailableError, match="expected at most 3"):
-        pattern_means(observation, order)
+        pattern_means(observation, order, most_entries=3)
 
 
 def test_order_in_blocks_and_in_files(late_timers, monkeypatch):
     """With clocks that jump, agents that catch up, and many states of one time: as at once."""
     trajectory = late_timers.run(CASES["consensus"], **timing(late_timers, "all"))
     tick = 300_000_000
-    observation = observe(dataclasses.replace(trajectory, made=-(-trajectory.made // tick) * tick))
+    observation = observed(dataclasses.replace(trajectory, made=-(-trajectory.made // tick) * tick))
     whole = order_events(observation)
     assert sorted(whole.position.ravel().tolist()) == list(range(3 * STEPS))
     by_time = np.argsort(whole.position.ravel())
     made, used = observation.timers.made, observation.timers.used
     assert (np.diff(made[1:].ravel()[by_time]) >= 0).all()
+    assert (np.diff(whole.position, axis=0) > 0).all()
     for k, i in np.ndindex(whole.position.shape):
-        if k:
-            assert whole.position[k - 1, i] < whole.position[k, i]
         for d, j in enumerate(observation.step.neighbours(int(observation.timers.graphs[k, i]), i).tolist()):
-            if used[k, i, d] > 0:
-                assert whole.position[used[k, i, d] - 1, j] < whole.position[k, i]
-    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 90)
-    monkeypatch.setattr("msg_analysis.inference.event_order.TIES_AT_ONCE", 2)
+            assert used[k, i, d] <= 0 or whole.position[used[k, i, d] - 1, j] < whole.position[k, i]
     monkeypatch.setattr(arrays, "LARGE", 1)
-    split = order_events(observation)
+    split = order_events(dataclasses.replace(observation, block_numbers=90), ties_at_once=2)
     assert in_file(split.position)
     assert np.array_equal(split.position, whole.position)
     assert np.array_equal(split.newest, whole.newest)
@@ -276,7 +253,7 @@ def test_order_in_blocks_and_in_files(late_timers, monkeypatch):
 
 def test_the_order_in_lockstep():
     """Of the states of a run in which all agents step at the same time, that by step and agent."""
-    observation = observe(simulate(experiment(run={"pace": "lockstep"}))).as_timed()
+    observation = observed(simulate(experiment(run={"pace": "lockstep"}))).as_timed()
     one, other = EventOrder.of_lockstep(STEPS, 3), order_events(observation)
     assert np.array_equal(one.position, other.position)
     assert np.array_equal(one.newest, other.newest)

@@ -4,28 +4,23 @@ Runs come from a simulator of its own (``tests.support.message_runs``). Expectat
 force: every state as a combination of the start and of all noise.
 """
 
-from __future__ import annotations
-
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 from tests.support.message_runs import message_run
-from tests.support.switching_systems import LINE_RING
 
+from experiments import Observation, compare, line_ring, predict
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import in_file
-from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.inference import pattern_events
 from msg_analysis.inference.event_order import newest_steps, order_events
 from msg_analysis.inference.messages import LossTally, loss_test
-from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.period_tables import period_tables
 from msg_analysis.inference.realtime_laws import means_in_lockstep, pattern_means
 from msg_analysis.inference.received_values import HeardValues, RepeatedNoise
 from msg_analysis.inference.residuals import innovations
-from msg_analysis.inference.verdict import compare
-from msg_analysis.theory.prediction import predict
 
 AIR = {"broadcast": 0.4, "link": 0.6}
 LATE = {"late": 0.4, "latency": 0.5}
@@ -44,9 +39,8 @@ CASES = {
 
 
 def experiment(noise, more=None, **run):
-    pace = run.pop("pace", "lockstep")
-    run = {"dt": 0.2, "duration": 4, "start": [1.0, -2.0, 0.5, 0.0, 1.0], "pace": pace, "seed": 4} | run
-    return ValidExperiment.parse(LINE_RING | {"noise": {"process": 1.0, **noise}, "run": run} | (more or {}))
+    run = {"dt": 0.2, "duration": 4, "replicas": 1, "start": [1.0, -2.0, 0.5, 0.0, 1.0], "seed": 4} | run
+    return line_ring(5, 0.5, noise={"process": 1.0, **noise}, run=run, **(more or {}))
 
 
 def observed(case, seed=1, **run):
@@ -302,8 +296,8 @@ def test_values_in_use_in_blocks_and_in_files(case, monkeypatch):
     observation = observed(case, duration=60)
     timed = observation if observation.timers else observation.as_timed()
     whole = period_tables(timed, order_events(timed))
-    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 300)
     monkeypatch.setattr(arrays, "LARGE", 1)
+    observation = dataclasses.replace(observation, block_numbers=300)
     again = observation if observation.timers else observation.as_timed()
     split = period_tables(again, order_events(again))
     assert in_file(split.events)

@@ -1,7 +1,5 @@
 """Plans of runs: lengths, replicas and power against formulas written out, scipy.stats, and sums over runs."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any
@@ -10,16 +8,13 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from experiments import Observation, compare, predict, simulate
 from msg_analysis import Experiment, InputError, NotAvailableError
 from msg_analysis.inference.fault_power import Fault, FaultPower, StepInformation, fault_powers
-from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.sample_size import REPLICAS
 from msg_analysis.inference.sequential_sums import EvidenceSums
 from msg_analysis.inference.statistics import needed_noncentrality, noncentral_chi2_tail, simultaneous_half_width
 from msg_analysis.inference.time_means import time_means
-from msg_analysis.inference.verdict import compare
-from msg_analysis.theory.prediction import predict
-from msg_analysis.twin.simulate import simulate
 
 
 def line_ring(**run: Any) -> Experiment:
@@ -61,7 +56,6 @@ def test_the_interval_of_a_run_is_the_planned_one() -> None:
     measured = math.sqrt(means.system_variances.sum()) / run.steps / plan.precision.error
     assert measured == pytest.approx(plan.precision.standard_error(run.steps, 4), rel=0.05)
     any_time = compare(trajectory).any_time
-    assert any_time is not None
     assert any_time.half_width is not None
     planned = plan.to_json()["file"]["any_time_half_width"] * plan.precision.error
     assert any_time.half_width == pytest.approx(planned, rel=0.05)

@@ -1,53 +1,34 @@
 """Several runs, one verdict: against sums and quotients of what the single runs say."""
 
-import dataclasses
 import json
 
 import numpy as np
 import pytest
+from p_values import assert_few_alarms, kolmogorov_smirnov
 from scipy import stats
-from tests.support.p_values import kolmogorov_smirnov
 
+from experiments import claimed, compare, cut, observed, pieces, simulate
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.inference.evidence import Evidence
-from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.inference.residuals import innovations
 from msg_analysis.inference.statistics import quadratic_form
 from msg_analysis.inference.switching import Transitions
-from msg_analysis.inference.verdict import compare
-from msg_analysis.model.run import Completeness
-from msg_analysis.theory.prediction import predict
-from msg_analysis.twin.simulate import simulate
-
-DOCUMENT = {
-    "name": "tiny",
-    "problem": "tracking",
-    "graphs": {"left": {"edges": [[1, 2]]}, "right": {"edges": [[2, 3, 2.0]]}},
-    "agents": 3,
-    "switching": {"generator": [[-2.0, 2.0], [1.0, -1.0]]},
-    "noise": {"process": [1.0, 0.5, 2.0]},
-    "leaders": {"agents": [1, 3], "gain": 1.5, "reference": 2.0},
-    "run": {"dt": 0.1, "duration": 30.0, "replicas": 2},
-}
-AIR = DOCUMENT | {"noise": {"process": 1.0, "broadcast": 0.3, "link": 0.2, "loss": 0.2}}
 
 
-def runs(document=DOCUMENT, durations=(30.0, 60.0, 20.0), first_seed=1):
-    experiment = ValidExperiment.parse(document)
+def law(process=(1.0, 0.5, 2.0), **air):
+    return pieces(noise={"process": list(process), **air}, run={"duration": 30})
+
+
+AIR = law([1.0] * 3, broadcast=0.3, link=0.2, loss=0.2)
+
+
+def runs(experiment=None, durations=(30.0, 60.0, 20.0), first_seed=1):
+    experiment = experiment or law()
     return [
         (f"bag_{seed}", simulate(experiment.with_run(seed=seed, duration=duration)))
         for seed, duration in enumerate(durations, start=first_seed)
     ]
-
-
-def cut(trajectory, step):
-    states = trajectory.states.copy()
-    states[step:] = np.nan
-    missing = states[step:, :, 0].size
-    count = Completeness(states[:, :, 0].size, states[:, :, 0].size - missing, missing)
-    return dataclasses.replace(trajectory, states=states, completeness=count)
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +57,7 @@ def test_every_step_counts_the_same(three):
 def test_innovations_are_added_up(three):
     """Covariance and gains of all innovations put one after the other."""
     pooled = compare_pooled(three)
-    observations = [Observation.of(run, predict(run.record.experiment)) for _, run in three]
+    observations = [observed(run) for _, run in three]
     e = np.concatenate([innovations(one, 0, one.steps) for one in observations])
     whitened = np.einsum("i,kir->kri", 1 / np.sqrt(np.diag(observations[0].step.noise[0])), e).reshape(-1, 3)
     n, scatter = len(whitened), whitened.T @ whitened / len(whitened)
@@ -108,24 +89,21 @@ def test_document(three):
     assert document["verdict"] == "agrees"
 
 
-@pytest.mark.parametrize("document", [DOCUMENT, AIR], ids=["quiet", "air"])
+@pytest.mark.parametrize("experiment", [law(), AIR], ids=["quiet", "air"])
 @pytest.mark.usefixtures("predicted_once")
-def test_calibration(document):
+def test_calibration(experiment):
     """p-values of 25 pools of two runs: Kolmogorov-Smirnov at 2e-4 for each of at most 21 tests."""
-    results = [compare_pooled(runs(document, (50.0, 70.0), first_seed=10 * i)) for i in range(25)]
+    results = [compare_pooled(runs(experiment, (50.0, 70.0), first_seed=10 * i)) for i in range(25)]
     for place, test in enumerate(results[0].tests):
         assert kolmogorov_smirnov(test.name, [result.tests[place].p for result in results]) > 2e-4, test.name
-    assert sum(result.verdict == "disagrees" for result in results) <= stats.binom.isf(1e-4, 25, 0.01)
+    assert_few_alarms(results)
 
 
 def test_a_fault_that_one_run_does_not_show():
     """10 % more noise variance: seen in twelve runs together."""
-    louder = DOCUMENT | {"noise": {"process": [1.05**0.5, 0.5 * 1.05**0.5, 2.0 * 1.05**0.5]}}
-    claimed = ValidExperiment.parse(DOCUMENT)
     found = []
-    for name, run in runs(louder, (60.0,) * 12):
-        experiment = claimed.with_run(seed=run.record.experiment.run.seed, duration=60.0)
-        found.append((name, dataclasses.replace(run, record=dataclasses.replace(run.record, experiment=experiment))))
+    for name, run in runs(law(np.sqrt(1.05) * np.array([1.0, 0.5, 2.0])), (60.0,) * 12):
+        found.append((name, claimed(run, law().with_run(seed=run.record.experiment.run.seed, duration=60.0))))
     assert compare(found[0][1]).verdict == "agrees"
     pooled = compare_pooled(found)
     assert pooled.verdict == "disagrees"
@@ -165,7 +143,7 @@ def test_what_is_not_one_experiment_is_refused(three):
     twin = simulate(run.record.experiment)
     with pytest.raises(InputError, match=r"twin: run\.seed: 1 as in bag_1"):
         compare_pooled([(first, run), ("twin", twin)])
-    wrong = ValidExperiment.parse(DOCUMENT | {"noise": {"process": [1.0, 0.6, 2.0]}}).with_run(seed=9)
+    wrong = law([1.0, 0.6, 2.0]).with_run(seed=9)
     with pytest.raises(InputError, match=r"wrong: noise\.process: \[1\.0, 0\.6, 2\.0\], but \[1"):
         compare_pooled([(first, run), ("wrong", simulate(wrong))])
     fewer = simulate(other.record.experiment.with_run(replicas=1))

@@ -1,7 +1,5 @@
 """Running estimates against the comparison of the whole run, and against plain sums."""
 
-from __future__ import annotations
-
 import math
 import random
 from typing import Any
@@ -9,32 +7,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from experiments import Observation, Trajectory, ValidExperiment, line_ring, predict, simulate
 from msg_analysis.arithmetic.update_law import to_payload
-from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.inference.estimates import Estimate, estimates
-from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.online_errors import LiveEstimate, RunningErrors
-from msg_analysis.inference.online_steps import StepCollector
+from msg_analysis.inference.online_steps import WINDOW, Lateness, RecentSteps, StepCollector
 from msg_analysis.inference.time_means import time_means
-from msg_analysis.model.run import Trajectory
-from msg_analysis.theory.prediction import predict
-from msg_analysis.twin.simulate import simulate
-
-GRAPHS = {"a": {"path": [1, 2, 3, 4]}, "b": {"cycle": [1, 2, 3, 4]}}
+from msg_analysis.model.phases import phases
 
 
 def experiment(**changes: Any) -> ValidExperiment:
-    run = {"dt": 0.1, "duration": 30, "replicas": 2, "seed": 5} | changes.pop("run", {})
-    document = {
-        "name": "small",
-        "problem": "consensus",
-        "time": "continuous",
-        "graphs": GRAPHS,
-        "switching": {"generator": [[-1.0, 1.0], [0.5, -0.5]]},
-        **changes,
-        "run": run,
-    }
-    return ValidExperiment.parse(document)
+    chain = {"generator": [[-1.0, 1.0], [0.5, -0.5]]}
+    graphs = {"a": {"path": [1, 2, 3, 4]}, "b": {"cycle": [1, 2, 3, 4]}}
+    run = {"dt": 0.1, "duration": 30, "seed": 5} | changes.pop("run", {})
+    return line_ring(**{"graphs": graphs, "switching": chain} | changes, run=run)
 
 
 def messages(trajectory: Trajectory) -> list[tuple[int, int, int, bytes]]:
@@ -234,11 +220,17 @@ def test_what_cannot_be_trusted_does_not_count(wrong: tuple[int, int, int, float
     assert collector.refused[reason] >= 1
 
 
-def test_repetitions_and_strangers_are_counted() -> None:
+def test_repetitions_and_who_comes_in_the_middle() -> None:
     good = [(i, k, min(k, 1), 3.0) for k in range(3) for i in (0, 1)]
     collector, steps = collect(*good, good[-1], (0, 1001, 1, 0.0), good[0])
     assert steps == [0, 1]
     assert collector.refused == {"received again": 1, "too late": 1, "step out of range": 1, "not finite": 0}
+    collector = StepCollector(2, 2, 10**12, lockstep=True)
+    for step in range(10**11, 10**11 + 3):
+        for agent in (0, 1):
+            collector.add(agent, step, 1, bytes(8))
+    assert collector.take()[0].tolist() == [10**11, 10**11 + 1]
+    assert RecentSteps().newest() is None
 
 
 def test_waiting_is_bounded() -> None:
@@ -266,9 +258,37 @@ def test_what_was_lost_and_sent_again_counts() -> None:
     assert not collector.refused["too late"]
 
 
-def test_who_comes_in_the_middle_of_a_long_run() -> None:
-    collector = StepCollector(2, 2, 10**12, lockstep=True)
-    for step in range(10**11, 10**11 + 3):
-        for agent in (0, 1):
-            collector.add(agent, step, 1, bytes(8))
-    assert collector.take()[0].tolist() == [10**11, 10**11 + 1]
+def test_the_newest_steps_are_kept_in_order() -> None:
+    """Whatever the pieces in which they come, and with what is missing between them."""
+    generator = np.random.default_rng(4)
+    steps = np.sort(generator.choice(2000, 900, replace=False))
+    states = generator.normal(size=(900, 3, 2))
+    kept, order = RecentSteps(), []
+    for piece in np.array_split(np.arange(900), np.sort(generator.integers(0, 900, 40))):
+        mixed = generator.permutation(piece)
+        order += mixed.tolist()
+        if len(mixed):
+            kept.add(steps[mixed], steps[mixed] % 4, states[mixed])
+    newest = kept.newest()
+    assert newest.steps.tolist() == steps[-WINDOW:].tolist()
+    assert np.array_equal(newest.modes, newest.steps % 4)
+    assert np.array_equal(newest.states, states[-WINDOW:, :, 0])
+
+
+def test_lateness_is_that_of_the_newest_steps_in_wall_time() -> None:
+    """Agent i makes x(k) at (k - 1 + phi_i) dt of simulated time, of which there are four units in a second."""
+    experiment = ValidExperiment.parse(
+        {
+            "name": "late",
+            "graphs": {"line": {"path": [1, 2, 3]}},
+            "run": {"dt": 0.1, "duration": 100, "seed": 2, "pace": "realtime", "speed": 4},
+        }
+    )
+    late, phi = Lateness(experiment), phases(experiment)
+    assert late.medians() == [None, None, None]
+    late.add(0, 0, 0)  # x(0) has no time
+    assert late.medians()[0] is None
+    for step in range(1, 1001):
+        for agent, delay in ((0, 0.008), (1, 0.02 if step % 2 else 0.04), (2, 1.0 if step <= 1000 - WINDOW else 0.012)):
+            late.add(agent, step, round(((step - 1 + phi[agent]) * 0.1 + delay) * 1e9))
+    assert late.medians() == pytest.approx([0.002, 0.0075, 0.003], abs=1e-8)

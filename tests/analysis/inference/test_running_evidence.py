@@ -1,31 +1,23 @@
 """Evidence and intervals of a running network: against the sums over the whole run, and how often they miss."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.support import line_and_ring
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from experiments import Observation, RunRecord, ValidExperiment, compare, five, predict, simulate
 from msg_analysis.inference import online_errors, online_evidence
 from msg_analysis.inference.estimates import Estimate
-from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.online_errors import LiveEstimate, LiveReport, precision_words, reached
 from msg_analysis.inference.online_evidence import AnyTime, HeardEvidence, RunningEvidence, supports
 from msg_analysis.inference.sequential_sums import EvidenceSums
 from msg_analysis.inference.statistics import RunningBatches, simultaneous_half_width, steps_to_half_width
-from msg_analysis.inference.verdict import compare
-from msg_analysis.model.run_record import RunRecord, Until
-from msg_analysis.theory.prediction import predict
-from msg_analysis.twin.simulate import simulate
+from msg_analysis.model.run_record import Until
 
 
 def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> ValidExperiment:
-    """Of two replicas."""
-    return line_and_ring.experiment(seed, duration, run={"replicas": 2} | changes.pop("run", {}), **changes)
+    return five(seed, duration, run={"replicas": 2} | changes.pop("run", {}), **changes)
 
 
 @pytest.mark.parametrize("pieces", [1, 7, 300])
@@ -87,22 +79,6 @@ def test_the_last_step_of_a_run_that_ends_early() -> None:
     later = np.arange(1500, 1600)
     seen.add(later, run.modes[later], run.states[later], run.states[later + 1])
     assert seen.count == 1500
-
-
-def test_a_fault_is_found_and_named() -> None:
-    """Noise that is half as strong as the law says, seen in pieces."""
-    run = simulate(experiment(noise={"process": 0.7}))
-    seen = RunningEvidence(predict(experiment()), 2)
-    for steps in np.array_split(np.arange(2000), 20):
-        seen.add(steps, run.modes[steps], run.states[steps], run.states[steps + 1])
-        found = seen.look(0.1)
-        if found.crossed:
-            break
-    assert found.crossed is not None
-    assert found.crossed < 1000
-    assert found.strongest is not None
-    assert found.strongest.startswith("noise of agent")
-    assert found.to_json()["disagrees"]
 
 
 def record_of(law: ValidExperiment, until: Until | None) -> tuple[RunRecord, Any]:

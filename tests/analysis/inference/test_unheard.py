@@ -1,38 +1,17 @@
 """Messages that were not heard in time, against the twin's draws and a count message by message."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from experiments import claimed, directed, observed, predict, simulate
 from msg_analysis.inference.messages import unheard_messages
-from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.timing import measure_timing
 from msg_analysis.model.reception import Losses
-from msg_analysis.theory.prediction import predict
-from msg_analysis.twin.simulate import simulate
 
 
 def experiment(duration=400, **noise):
-    return ValidExperiment.parse(
-        {
-            "name": "unheard",
-            "graphs": {"a": {"path": [1, 2, 3]}, "b": {"arcs": [[1, 2], [2, 3, 2.0], [3, 1], [1, 3]]}},
-            "switching": {"generator": [[-1.0, 1.0], [2.0, -2.0]]},
-            "run": {"dt": 0.1, "duration": duration, "seed": 3, "pace": "realtime"},
-            "noise": {"process": 1.0} | noise,
-        }
-    )
-
-
-def observe(trajectory):
-    return Observation.of(trajectory, predict(trajectory.record.experiment))
-
-
-def claimed(trajectory, what):
-    """The same log, under another experiment."""
-    return dataclasses.replace(trajectory, record=dataclasses.replace(trajectory.record, experiment=what))
+    run = {"duration": duration, "pace": "realtime", "replicas": 1}
+    return directed(noise={"process": 1.0} | noise, run=run)
 
 
 def by_hand(trajectory, receiver, sender):
@@ -67,7 +46,7 @@ def by_hand(trajectory, receiver, sender):
 
 
 def test_with_ideal_timers_every_message_is_heard():
-    found = unheard_messages(observe(simulate(experiment())))
+    found = unheard_messages(observed(simulate(experiment())))
     assert found.messages.min() > 500
     assert found.unheard.sum() == 0
     assert found.words() is None
@@ -77,7 +56,7 @@ def test_with_ideal_timers_every_message_is_heard():
 def test_lost_messages_are_those_that_were_drawn(on_loss):
     """|z| < 4: false-alarm rate 6e-5 for each of the two."""
     trajectory = simulate(experiment(100, loss=0.2, on_loss=on_loss))
-    found = unheard_messages(observe(trajectory))
+    found = unheard_messages(observed(trajectory))
     share, (low, high), expected = found.share()
     assert expected == pytest.approx(0.2)
     assert abs(share - 0.2) < 4 * np.sqrt(0.2 * 0.8 / found.messages.sum())
@@ -90,7 +69,7 @@ def test_lost_messages_are_those_that_were_drawn(on_loss):
 def test_of_a_link_that_is_always_there_the_lost_ones_are_found():
     """Message by message, in the order of the twin's draws."""
     what = experiment(100, loss={"arcs": [[2, 3, 0.3]]}, on_loss="hold")
-    found = unheard_messages(observe(simulate(what)))
+    found = unheard_messages(observed(simulate(what)))
     place = found.links.tolist().index([2, 1])
     lost = np.concatenate([Losses(what).block(2, 1, number) for number in range(4)])[:1000]
     # The first two and the last two may not be judged.
@@ -101,23 +80,19 @@ def test_of_a_link_that_is_always_there_the_lost_ones_are_found():
 
 @pytest.mark.parametrize("delay", [1, 2])
 def test_what_the_experiment_delays_is_not_late(delay):
-    found = unheard_messages(observe(simulate(experiment(40, delay=delay))))
+    found = unheard_messages(observed(simulate(experiment(40, delay=delay))))
     assert found.messages.min() > 50
     assert found.unheard.sum() == 0
 
 
-def test_losses_that_the_experiment_does_not_have_are_put_into_words():
+def test_other_losses_are_put_into_words():
+    """That the experiment does not have, and that were not made."""
     trajectory = claimed(simulate(experiment(loss={"arcs": [[2, 3, 0.3]]}, on_loss="hold")), experiment())
-    words = unheard_messages(observe(trajectory)).words()
-    assert words is not None
+    words = unheard_messages(observed(trajectory)).words()
     assert "while the experiment loses 0 %: the network lost them or was late" in words
     assert words.endswith("% of those from agent 2 to agent 3")
-
-
-def test_losses_that_were_not_made_are_put_into_words():
     trajectory = claimed(simulate(experiment()), experiment(loss=0.2, on_loss="hold"))
-    words = unheard_messages(observe(trajectory)).words()
-    assert words is not None
+    words = unheard_messages(observed(trajectory)).words()
     assert words.startswith("0 % (0 to ")
     assert "while the experiment loses 20 %: the experiment's losses were not made" in words
 
@@ -126,16 +101,16 @@ def test_late_agents_and_messages(late_timers):
     """Receivers that are late have not missed what came twice in their period; slow messages are overtaken."""
     what = experiment(40)
     punctual = late_timers.run(what)
-    assert unheard_messages(observe(punctual)).unheard.sum() == 0
+    assert unheard_messages(observed(punctual)).unheard.sum() == 0
     slow = late_timers.run(what, slow=late_timers.busy(0.5, 2.5), late=late_timers.busy(0.3, 1.5))
-    found = unheard_messages(observe(slow))
+    found = unheard_messages(observed(slow))
     assert found.unheard.sum() > 0
     for (receiver, sender), messages, unheard in zip(found.links.tolist(), found.messages, found.unheard, strict=True):
         assert (messages, unheard) == by_hand(slow, receiver, sender)
 
 
 def test_document():
-    document = measure_timing(observe(simulate(experiment(loss=0.2, on_loss="hold")))).to_json()["unheard"]
+    document = measure_timing(observed(simulate(experiment(loss=0.2, on_loss="hold")))).to_json()["unheard"]
     assert document["unheard"] == sum(link["unheard"] for link in document["links"])
     assert document["expected"] == pytest.approx(0.2)
     assert document["words"] is None

@@ -1,7 +1,5 @@
 """The experiment file: what valid files mean, and that they survive being written and read again."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -143,12 +141,6 @@ def test_noise_gain_by_graph() -> None:
     assert not experiment.noise.steps_only
 
 
-def test_noise_that_only_steps_have() -> None:
-    for key in ("broadcast", "link", "loss", "delay"):
-        assert small(noise={key: 0.5 if key != "delay" else 2}).noise.steps_only
-    assert not small().noise.steps_only
-
-
 def test_leaders() -> None:
     leaders = {"agents": [3, 1], "gain": 2, "reference": -1.5}
     experiment = small(problem="tracking", leaders=leaders)
@@ -180,12 +172,6 @@ def test_rows_within_the_tolerance_are_made_exact() -> None:
     graphs = {name: {"path": [1, 2, 3]} for name in "abc"}
     experiment = small(graphs=graphs, time="discrete", switching={"transition": [[third, third, 1 - 2 * third]] * 3})
     assert experiment.chain.matrix.sum(axis=1) == pytest.approx(1.0, abs=1e-15)
-
-
-def test_dt_is_one_in_discrete_time() -> None:
-    experiment = small(time="discrete", run={"duration": 7})
-    assert experiment.step_length == 1.0
-    assert experiment.steps == 7
 
 
 @pytest.mark.parametrize(
@@ -348,10 +334,7 @@ def documents(draw: st.DrawFn) -> dict[str, Any]:
     if draw(st.booleans()):
         leaders = draw(st.lists(st.integers(1, m), min_size=1, max_size=m - 1, unique=True))
         pull = draw(st.one_of(st.just("inf"), st.floats(0.1, 10)))
-        document |= {
-            "problem": "tracking",
-            "leaders": {"agents": leaders, "gain": pull, "reference": draw(number)},
-        }
+        document |= {"problem": "tracking", "leaders": {"agents": leaders, "gain": pull, "reference": draw(number)}}
     return document
 
 

@@ -1,7 +1,5 @@
 """Graphs from elsewhere against networkx, and the names of their nodes."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
@@ -11,10 +9,10 @@ import networkx as nx
 import numpy as np
 import pytest
 
+from experiments import RunRecord, ValidExperiment
 from msg_analysis.api import Experiment
-from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.experiment.experiment import ExperimentError
 from msg_analysis.inference.comparison import law_identity
-from msg_analysis.model.run_record import RunRecord
 
 TOWNS = ["Ulm", "Bonn", "Kiel", "Jena"]
 
@@ -179,42 +177,22 @@ def test_files_that_are_not_there_or_not_text(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("graphs", "others", "words"),
     [
-        (
-            {"net": {"adjacency": [[0, 1], [1]]}},
-            {},
-            "graphs.net.adjacency: 2 rows of 1 or 2 entries: expected a sq",
-        ),
+        ({"net": {"adjacency": [[0, 1], [1]]}}, {}, "graphs.net.adjacency: 2 rows of 1 or 2 entries: expected a sq"),
         ({"net": {"adjacency": [[0, 1], [1, 2]]}}, {}, "graphs.net.adjacency[2][2]: 2.0: expected 0 on the diagonal"),
         ({"net": {"adjacency": [[0, -1], [1, 0]]}}, {}, "graphs.net.adjacency[1][2]: -1: expected a number >= 0"),
         ({"net": {"adjacency": [[0, "x"], [1, 0]]}}, {}, 'graphs.net.adjacency[1][2]: "x": expected a number'),
-        (
-            {"net": nx.MultiGraph([("a", "b")])},
-            {},
-            "graphs.net: a MultiGraph: expected a networkx.Graph or",
-        ),
+        ({"net": nx.MultiGraph([("a", "b")])}, {}, "graphs.net: a MultiGraph: expected a networkx.Graph or"),
         ({"net": nx.Graph()}, {}, "graphs.net: a graph without nodes: expected a graph with nodes"),
         ({"net": nx.Graph([("", "b")])}, {}, 'graphs.net: node "": expected a node\'s name'),
         ({"net": nx.Graph([("1", 1)])}, {}, 'graphs.net: node "1" twice: expected different names'),
         ({"net": nx.Graph([("a", "b", {"weight": -1})])}, {}, "graphs.net: weight -1 of a - b: expected a weight > 0"),
         ({"net": nx.Graph([("a", "a"), ("a", "b")])}, {}, 'graphs.net: ["a", "a"]: agent a is linked with itself'),
-        (
-            {"net": nx.Graph([("a", "b")])},
-            {"agents": 3},
-            "names: 2 names from the files of the graphs: expected",
-        ),
+        ({"net": nx.Graph([("a", "b")])}, {"agents": 3}, "names: 2 names from the files of the graphs: expected"),
         ({"net": {"path": [1, 2, 3]}}, {"names": ["a", "b"]}, "names: 2 names: expected one for each of the 3 agents"),
         ({"net": {"path": [1, 2]}}, {"names": ["a", "a"]}, 'names: "a": expected different names: rename one'),
         ({"net": {"path": [1, 2]}}, {"names": ["a", " b"]}, 'names[2]: " b": expected a name of the form'),
-        (
-            {"net": nx.Graph([("a", "b")])},
-            {"names": ["a", "c"]},
-            'graphs.net: node "b": expected one of the names a',
-        ),
-        (
-            {"net": nx.Graph({"a": ["b"], "c": []})},
-            {},
-            "graphs: agent c cannot be reached from agents a, b in",
-        ),
+        ({"net": nx.Graph([("a", "b")])}, {"names": ["a", "c"]}, 'graphs.net: node "b": expected one of the names a'),
+        ({"net": nx.Graph({"a": ["b"], "c": []})}, {}, "graphs: agent c cannot be reached from agents a, b in"),
     ],
 )
 def test_a_graph_with_a_mistake(graphs: dict[str, Any], others: dict[str, Any], words: str) -> None:
@@ -235,12 +213,9 @@ def test_graphml_that_is_none(tmp_path: Path, content: str) -> None:
         ValidExperiment.parse(_ring_from("net.graphml"), directory=tmp_path)
 
 
-def test_graphml_without_an_end() -> None:
+def test_graphml_with_mistakes(tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match=r"graphs\.ring\.graphml: /dev/zero: cannot be read: longer than 64 MB"):
         ValidExperiment.parse(_ring_from("/dev/zero"))
-
-
-def test_graphml_weights_must_be_positive(tmp_path: Path) -> None:
     graph = nx.Graph()
     graph.add_edge(1, 2, weight=-1.0)
     nx.write_graphml(graph, tmp_path / "net.graphml")

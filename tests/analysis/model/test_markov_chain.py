@@ -1,6 +1,4 @@
-"""Chain, path and step model against scipy and direct formulas."""
-
-from __future__ import annotations
+"""Chain, path, step model and the largest stable step against scipy, networkx and direct formulas."""
 
 import itertools
 import math
@@ -14,6 +12,8 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.experiment import validation
 from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.experiment.graphs import Graph, hops
 from msg_analysis.experiment.markov_chain import MarkovChain, stationary_law
@@ -60,8 +60,8 @@ def test_reachability_and_period_against_networkx(seed: int, n: int, density: fl
     assert {v: d for v, d in enumerate(level.tolist()) if d >= 0} == nx.single_source_shortest_path_length(digraph, 0)
     chain = MarkovChain("discrete", jumps / np.maximum(jumps.sum(axis=1, keepdims=True), 1))
     assert chain.irreducible == nx.is_strongly_connected(digraph)
-    if chain.irreducible and jumps.any():
-        assert chain.period == math.gcd(*(len(cycle) for cycle in nx.simple_cycles(digraph)))
+    period = math.gcd(*(len(cycle) for cycle in nx.simple_cycles(digraph)))
+    assert not (chain.irreducible and jumps.any()) or chain.period == period
 
 
 @given(st.integers(0, 10_000), st.integers(2, 8), st.floats(0.05, 0.4))
@@ -132,14 +132,11 @@ def test_sojourns_cover_every_step_once() -> None:
     assert all(s.first_step <= s.last_step for s in found)
 
 
-def test_first_graph_can_be_given() -> None:
+def test_first_graph_can_be_given_and_one_never_switches() -> None:
     case = setup("continuous", generator_of(4, 3), 5, initial="g2")
     model = build_step_model(case)
     assert model.initial.tolist() == [0, 0, 1]
     assert mode_path(case, model.initial)[0] == 2
-
-
-def test_one_graph_never_switches() -> None:
     case = setup("continuous", np.zeros((1, 1)), 7)
     assert mode_path(case, np.ones(1)).tolist() == [0] * 7
 
@@ -169,3 +166,31 @@ def test_step_of_grounded_leaders() -> None:
     limit = scipy.linalg.expm(-(laplacian + np.diag([1e9, 0, 0])))
     np.testing.assert_allclose(model.weights[0], limit, atol=1e-8)
     np.testing.assert_allclose(model.noise[0], 4 * np.eye(3))
+
+
+def contracts(laplacian: FloatArray, dt: float) -> bool:
+    """Whether powers of I - dt L keep their size (a stable step) by taking one."""
+    step = np.linalg.matrix_power(np.eye(len(laplacian)) - dt * laplacian, 5000)
+    return bool(np.abs(step).max() < 10)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_stability_limit_against_powers_of_the_step(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    adjacency = random.uniform(0.2, 2, (5, 5)) * (random.random((5, 5)) < 0.6)
+    if seed % 2:
+        adjacency = adjacency + adjacency.T
+    np.fill_diagonal(adjacency, 0)
+    graph = Graph("graph", adjacency)
+    limit = validation.stability_limit(graph, np.zeros(5))
+    assert contracts(graph.laplacian, 0.99 * limit)
+    assert not contracts(graph.laplacian, 1.01 * limit)
+
+
+def test_stability_limit_of_leaders() -> None:
+    star = Graph("star", np.array([[0, 1, 1], [1, 0, 0], [1, 0, 0]], dtype=float))
+    gains = np.array([math.inf, 0, 0])
+    assert validation.stability_limit(star, gains) == 2.0  # followers alone: Z = I
+    z = star.laplacian + np.diag([4.0, 0, 0])
+    assert validation.stability_limit(star, np.array([4.0, 0, 0])) == pytest.approx(2 / np.linalg.eigvalsh(z)[-1])
+    assert validation.stability_limit(Graph("none", np.zeros((3, 3))), np.zeros(3)) == math.inf

@@ -1,7 +1,5 @@
 """Every mistake in an experiment file is one line: the key, the value, what was expected and what to do."""
 
-from __future__ import annotations
-
 import copy
 import math
 from typing import Any
@@ -55,10 +53,7 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
     ({"graphs": ...}, ["graphs: missing: expected named graphs"]),
     ({"name": "Line ring"}, ['name: "Line ring": expected a name of the form [a-z][a-z0-9_]*']),
     ({"name": "good\n"}, ['name: "good\\n": expected a name']),
-    (
-        {"problem": "consenus"},
-        ["problem: \"consenus\": expected 'consensus' or", "did you mean 'consensus'?"],
-    ),
+    ({"problem": "consenus"}, ["problem: \"consenus\": expected 'consensus' or", "did you mean 'consensus'?"]),
     ({"time": 3}, ["time: 3: expected 'continuous' or 'discrete'"]),
     ({"run": None}, ["run: null: expected keys with values: for example run:"]),
     ({"run.dt": True}, ["run.dt: true: expected a number: for example dt: 0.05"]),
@@ -102,54 +97,30 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
     # graphs
     ({"graphs": {}}, ["graphs: {}: expected at least 1"]),
     ({"graphs.ring": {}}, ["graphs.ring: nothing: expected one of path, cycle, edges"]),
-    (
-        {"graphs.ring": {"path": [1, 2], "complete": True}},
-        ["graphs.ring: path and complete: expected one of"],
-    ),
+    ({"graphs.ring": {"path": [1, 2], "complete": True}}, ["graphs.ring: path and complete: expected one of"]),
     ({"graphs.ring": {"complete": False}}, ["graphs.ring.complete: false: expected true"]),
     ({"graphs.ring": {"path": [0, 1]}}, ["graphs.ring.path[1]: 0: expected a number >= 1"]),
     ({"graphs.ring": {"path": [1]}}, ["graphs.ring.path: [1]: expected at least 2 entries"]),
-    (
-        {"graphs.ring": {"path": [1, 1, 2]}},
-        ["graphs.ring.path: [1, 1]: agent 1 is linked with itself", "remove"],
-    ),
-    (
-        {"graphs.ring": {"edges": [[1, 2], [2, 1]]}},
-        ["graphs.ring.edges: [2, 1]: expected every edge", "once"],
-    ),
+    ({"graphs.ring": {"path": [1, 1, 2]}}, ["graphs.ring.path: [1, 1]: agent 1 is linked with itself", "remove"]),
+    ({"graphs.ring": {"edges": [[1, 2], [2, 1]]}}, ["graphs.ring.edges: [2, 1]: expected every edge", "once"]),
     ({"graphs.ring": {"arcs": [[1, 2], [1, 2]]}}, ["graphs.ring.arcs: [1, 2]: expected every arc once"]),
     ({"graphs.ring": {"arcs": [[3, 3]]}}, ["graphs.ring.arcs: [3, 3]: agent 3 is linked with itself"]),
     ({"graphs.ring": {"path": [1, 2, 1]}}, ["graphs.ring.path: [2, 1]: expected every edge"]),
     ({"graphs.ring": {"edges": [[1, 2, 0]]}}, ["graphs.ring.edges[1]: [1, 2, 0]: expected a weight > 0"]),
     ({"graphs.ring": {"edges": [[1, 2, True]]}}, ["graphs.ring.edges[1]: [1, 2, true]: expected a weight"]),
     ({"graphs.ring": {"arcs": [[1, 2, math.inf]]}}, ["graphs.ring.arcs[1]", "expected a weight > 0"]),
-    (
-        {"graphs.ring": {"edges": [[1, 2], [1, 2, 3, 4]]}},
-        ["graphs.ring.edges[2]: [1, 2, 3, 4]: expected [agent, "],
-    ),
+    ({"graphs.ring": {"edges": [[1, 2], [1, 2, 3, 4]]}}, ["graphs.ring.edges[2]: [1, 2, 3, 4]: expected [agent, "]),
     ({"graphs.ring": {"edges": [[1, True]]}}, ["graphs.ring.edges[1]: [1, true]: expected [agent, agent]"]),
-    (
-        {"graphs.ring": {"path": [1, 10**400]}},
-        ["graphs.ring.path[2]: 1000", "expected a number <= 4294967295"],
-    ),
-    (
-        {"graphs.ring": {"edges": [[1, 10**400]]}},
-        ["graphs.ring.edges[1]: [1, 1000", "expected [agent, agent]"],
-    ),
-    (
-        {"graphs.ring": {"edges": [[1, 2, 1e308]]}},
-        ["graphs.ring.edges[1]: [1, 2, 1e+308]: expected a weight"],
-    ),
+    ({"graphs.ring": {"path": [1, 10**400]}}, ["graphs.ring.path[2]: 1000", "expected a number <= 4294967295"]),
+    ({"graphs.ring": {"edges": [[1, 10**400]]}}, ["graphs.ring.edges[1]: [1, 1000", "expected [agent, agent]"]),
+    ({"graphs.ring": {"edges": [[1, 2, 1e308]]}}, ["graphs.ring.edges[1]: [1, 2, 1e+308]: expected a weight"]),
     ({"graphs.ring": {"grid": [3, 0]}}, ["graphs.ring.grid: [3, 0]: expected [rows, columns]"]),
     ({"graphs.ring": {"graphml": "nope"}}, ["graphs.ring.graphml: nope: no such file", "relative"]),
     ({"agents": 4}, ["graphs.line.path: agent 5: expected agents 1 to 4"]),
     ({"agents": 4}, ["graphs.ring.cycle: agent 5: expected agents 1 to 4"]),
     ({"agents": 1}, ["agents: 1: expected a number >= 2"]),
     ({"agents": 5, "graphs.ring": {"grid": [2, 3]}}, ["graphs.ring.grid: agent 6: expected agents 1 to 5"]),
-    (
-        {"graphs": {"all": {"complete": True}}, "switching": ...},
-        ["agents: missing: expected the number of agents"],
-    ),
+    ({"graphs": {"all": {"complete": True}}, "switching": ...}, ["agents: missing: expected the number of agents"]),
     ({"graphs.stationary": {"complete": True}}, ["graphs: 'stationary': expected another name"]),
     # connection
     ({"agents": 7}, ["graphs: agents 6, 7 cannot be reached from agents 1, 2, 3, 4, 5 in the union"]),
@@ -167,24 +138,12 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
     ),
     # switching
     ({"switching": ...}, ["switching: missing: expected generator or rates, since there are 2 graphs"]),
-    (
-        {"switching.generator": [[-1, 0.9], [1, -1]]},
-        ["switching.generator[1]: row 1 (line) sums to -0.1: expected 0"],
-    ),
-    (
-        {"switching.generator": [[-1e-10, 2e-10], [1, -1]]},
-        ["switching.generator[1]: row 1 (line) sums to 1e-10"],
-    ),
+    ({"switching.generator": [[-1, 0.9], [1, -1]]}, ["switching.generator[1]: row 1 (line) sums to -0.1: expected 0"]),
+    ({"switching.generator": [[-1e-10, 2e-10], [1, -1]]}, ["switching.generator[1]: row 1 (line) sums to 1e-10"]),
     ({"switching.generator": [[1, -1], [1, -1]]}, ["switching.generator[1][2]: -1.0: expected a rate >= 0"]),
-    (
-        {"switching.generator": [[-1e308, 1e308], [1, -1]]},
-        ["switching.generator[1][1]: -1e+308: expected a number"],
-    ),
+    ({"switching.generator": [[-1e308, 1e308], [1, -1]]}, ["switching.generator[1][1]: -1e+308: expected a number"]),
     ({"switching.generator": [[-1, 1]]}, ["switching.generator: 1 rows of 2 entries: expected 2 x 2"]),
-    (
-        {"switching.generator": [[-1, 1], [1]]},
-        ["switching.generator: 2 rows of 1 or 2 entries: expected 2 x 2"],
-    ),
+    ({"switching.generator": [[-1, 1], [1]]}, ["switching.generator: 2 rows of 1 or 2 entries: expected 2 x 2"]),
     ({"switching.generator": [[-1, 1], [1, True]]}, ["switching.generator[2][2]: true: expected a number"]),
     (
         {"switching.generator": [[0, 0], [1, -1]]},
@@ -195,21 +154,12 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
         ["switching.rates.lin: unknown graph: expected one of the graphs"],
     ),
     ({"switching": {"rates": {"line": {"rin": 1}}}}, ["switching.rates.line.rin: unknown graph"]),
-    (
-        {"switching": {"rates": {"line": {"line": 1}}}},
-        ["switching.rates.line.line: 1.0: expected rates to other"],
-    ),
-    (
-        {"switching": {"rates": {"line": {"ring": -1}}}},
-        ["switching.rates.line.ring: -1: expected a number >= 0"],
-    ),
+    ({"switching": {"rates": {"line": {"line": 1}}}}, ["switching.rates.line.line: 1.0: expected rates to other"]),
+    ({"switching": {"rates": {"line": {"ring": -1}}}}, ["switching.rates.line.ring: -1: expected a number >= 0"]),
     ({"switching": {"rates": {"line": {"ring": 1}}}}, ["switching.rates: line cannot be reached from ring"]),
     ({"switching.scale": 2}, ["switching.scale: 2.0: expected with rates only"]),
     ({"switching.rates": {}}, ["switching: generator and rates: expected one of them"]),
-    (
-        {"switching": {"transition": [[0.5, 0.5]] * 2}},
-        ["switching.transition: given in continuous time: expected gen"],
-    ),
+    ({"switching": {"transition": [[0.5, 0.5]] * 2}}, ["switching.transition: given in continuous time: expected gen"]),
     (
         {"switching.initial": "rng"},
         ["switching.initial: \"rng\": expected 'stationary' or one of the graphs line, ring"],
@@ -229,23 +179,11 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
     ),
     # noise
     ({"noise.process": -1}, ["noise.process: -1: expected a standard deviation >= 0"]),
-    (
-        {"noise.process": [1, 1, 1, 1, -1]},
-        ["noise.process: [1, 1, 1, 1, -1]: expected standard deviations >= 0"],
-    ),
-    (
-        {"noise.process": [1, 2]},
-        ["noise.process: 2 entries: expected a number, 5 numbers or a 5 x 5 matrix F"],
-    ),
-    (
-        {"noise.process": [[1] * 5] * 4},
-        ["noise.process: 4 x 5: expected a number, 5 numbers or a 5 x 5 matrix F"],
-    ),
+    ({"noise.process": [1, 1, 1, 1, -1]}, ["noise.process: [1, 1, 1, 1, -1]: expected standard deviations >= 0"]),
+    ({"noise.process": [1, 2]}, ["noise.process: 2 entries: expected a number, 5 numbers or a 5 x 5 matrix F"]),
+    ({"noise.process": [[1] * 5] * 4}, ["noise.process: 4 x 5: expected a number, 5 numbers or a 5 x 5 matrix F"]),
     ({"noise.process": [[1, 2], [1]]}, ["noise.process: rows of different lengths: expected a number"]),
-    (
-        {"noise.process": [[1, "a"]]},
-        ["noise.process:", "expected a finite number, one per agent, or a square"],
-    ),
+    ({"noise.process": [[1, "a"]]}, ["noise.process:", "expected a finite number, one per agent, or a square"]),
     ({"noise.process": True}, ["noise.process: true: expected a finite number"]),
     ({"noise.process": 10**400}, ["noise.process: 1000", "expected a finite number"]),
     ({"noise.broadcast": -0.1}, ["noise.broadcast: -0.1: expected a number >= 0"]),
@@ -275,10 +213,7 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
     ({"noise.process": {"line": {"ring": 1}, "ring": 1}}, ["noise.process:", "expected for graph line a finite num"]),
     # leaders
     ({"problem": "tracking"}, ["leaders: missing: expected leaders, since problem is tracking"]),
-    (
-        {"leaders": {"agents": [1]}},
-        ["leaders: given with problem: consensus: expected none: set problem: tracking"],
-    ),
+    ({"leaders": {"agents": [1]}}, ["leaders: given with problem: consensus: expected none: set problem: tracking"]),
     (TRACKING | {"leaders.agents": []}, ["leaders.agents: []: expected at least 1"]),
     (TRACKING | {"leaders.agents": [1, 1]}, ["leaders.agents: agent 1 twice: expected every leader once"]),
     (TRACKING | {"leaders.agents": [6]}, ["leaders.agents: agent 6: expected agents 1 to 5"]),
@@ -290,16 +225,10 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
         ["leaders.agents: all agents, with gain inf: expected at least one agent that follows"],
     ),
     # the run
-    (
-        {"run.dt": 0.625},
-        [f"run.dt: 0.625: expected less than {STABLE_DT:.6g}, the stability limit of graph ring"],
-    ),
+    ({"run.dt": 0.625}, [f"run.dt: 0.625: expected less than {STABLE_DT:.6g}, the stability limit of graph ring"]),
     (DISCRETE | {"run.dt": 0.5}, ["run.dt: 0.5: expected 1 in discrete time"]),
     ({"run.dt": 0.03}, ["run.duration: 400.0: expected a whole number of steps of 0.03: for example 399.99"]),
-    (
-        {"run.duration": 1e-9},
-        ["run.duration: 1e-09: expected a whole number of steps of 0.05: for example 0.05"],
-    ),
+    ({"run.duration": 1e-9}, ["run.duration: 1e-09: expected a whole number of steps of 0.05: for example 0.05"]),
     ({"run.dt": 1e-320}, ["run.dt: 1e-320: expected at most 1e+15 steps"]),
     ({"run.replicas": 10**400}, ["run.replicas: 1000", "expected a number <= 4294967295"]),
     ({"run.duration": 3e9}, ["run.duration: 3000000000.0: expected at most 2147483647"]),
@@ -307,14 +236,8 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
     ({"run.start": "stationry"}, ["run.start: \"stationry\": expected 'stationary', 'zero' or a list"]),
     ({"run.start": [1, 2, 3, 4, math.nan]}, ["run.start: [1, 2, 3, 4, .nan]: expected"]),
     # memory
-    (
-        {"run.replicas": 10**9},
-        ["run: 8000 steps of 5 agents with 1000000000 replicas need 320 TB: expected at most"],
-    ),
-    (
-        {"graphs.ring": {"grid": [10**5, 10**5]}},
-        ["graphs: 2 graphs of 10000000000 agents need", "lower the number"],
-    ),
+    ({"run.replicas": 10**9}, ["run: 8000 steps of 5 agents with 1000000000 replicas need 320 TB: expected at most"]),
+    ({"graphs.ring": {"grid": [10**5, 10**5]}}, ["graphs: 2 graphs of 10000000000 agents need", "lower the number"]),
 ]
 
 
@@ -328,38 +251,23 @@ def test_mistake(changes: dict[str, Any], fragments: list[str]) -> None:
     assert line.count(": ") >= 2, "key: value: what was expected: what to do"
 
 
-def test_the_good_document_is_good() -> None:
+def test_other_mistakes() -> None:
+    """A period of three, and a key that is no text; the document itself is good."""
     assert ValidExperiment.parse(GOOD).agents == 5
-
-
-def test_a_chain_of_three_has_its_period_named() -> None:
     graphs = {name: {"path": [1, 2, 3]} for name in "abc"}
     ring = {"transition": [[0, 1, 0], [0, 0, 1], [1, 0, 0]]}
     problems = problems_of(DISCRETE | {"graphs": graphs, "switching": ring})
     assert "the chain has period 3" in problems[0]
+    with pytest.raises(ExperimentError, match="experiment: key 1: expected a text"):
+        ValidExperiment.parse({**GOOD, 1: 2})
 
 
 def test_all_mistakes_come_together() -> None:
     problems = problems_of(
-        {
-            "foo": 1,
-            "noise.process": -1,
-            "run.dt": 0,
-            "leaders": {"agents": [1]},
-            "agents": 4,
-            "switching": ...,
-        }
+        {"foo": 1, "noise.process": -1, "run.dt": 0, "leaders": {"agents": [1]}, "agents": 4, "switching": ...}
     )
     keys = sorted(line.split(":")[0] for line in problems)
-    assert keys == [
-        "foo",
-        "graphs.line.path",
-        "graphs.ring.cycle",
-        "leaders",
-        "noise.process",
-        "run.dt",
-        "switching",
-    ]
+    assert keys == ["foo", "graphs.line.path", "graphs.ring.cycle", "leaders", "noise.process", "run.dt", "switching"]
 
 
 def test_text_names_the_source_and_lists_the_problems() -> None:
@@ -370,11 +278,6 @@ def test_text_names_the_source_and_lists_the_problems() -> None:
     assert [line.split(":")[0] for line in lines[1:]] == ["  foo", "  bar"]
     with pytest.raises(ExperimentError, match=r"^file\.yaml: foo: unknown key"):
         ValidExperiment.parse(changed({"foo": 1}), source="file.yaml")
-
-
-def test_keys_that_are_no_text() -> None:
-    with pytest.raises(ExperimentError, match="experiment: key 1: expected a text"):
-        ValidExperiment.parse({**GOOD, 1: 2})
 
 
 def test_memory_is_compared_with_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,5 @@
 """Every way in which a protocol, or an experiment that asks for one, can be wrong: said in a line, with its name."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -14,14 +12,13 @@ import pytest
 from click.testing import CliRunner
 from euler import DIRECTED, Euler, EulerSteps, document, experiment
 
+from experiments import ValidExperiment, predict, simulate
 from msg_analysis.cli.main import main
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import protocols
-from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.experiment.experiment import ExperimentError
 from msg_analysis.protocol import Heard, LinearProtocol, Parameters, Protocol
-from msg_analysis.theory.prediction import predict
-from msg_analysis.twin.simulate import simulate
 
 SATURATED, METROPOLIS = {"name": "saturated"}, {"name": "metropolis"}
 MISTAKES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [

@@ -1,7 +1,5 @@
 """Protocols of other packages: what they are given, what becomes of it."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable
@@ -15,24 +13,28 @@ import scipy.linalg
 import yaml
 from euler import DIRECTED, Euler, EulerSteps, experiment
 
-from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from experiments import (
+    RunRecord,
+    ValidExperiment,
+    check,
+    compare,
+    new_record,
+    predict,
+    read_bag,
+    simulate,
+    stored,
+    write_trajectory,
+)
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.inference.observation import transient_length
-from msg_analysis.inference.verdict import compare
 from msg_analysis.model.agent_law import agent_law
 from msg_analysis.model.graph_path import mode_path
-from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import build_model, build_step_model
 from msg_analysis.protocol import Heard, LinearProtocol, Network, Protocol
 from msg_analysis.report.documents import describe_experiment, describe_facts, describe_transient
 from msg_analysis.report.page import render
 from msg_analysis.theory.leaders import select_leaders
-from msg_analysis.theory.prediction import predict
-from msg_analysis.twin.check import check
-from msg_analysis.twin.simulate import new_record, simulate
 
 AIR = {"process": 0.3, "broadcast": 0.2, "link": 0.1, "loss": 0.25}
 
@@ -226,27 +228,28 @@ def test_integral_action_against_a_loop() -> None:
 
 @pytest.mark.parametrize("name", ["integral_action", "rounding"])
 def test_a_bag_keeps_all_of_the_state(name: str, offer: Callable[..., None], tmp_path: Path) -> None:
+    what = experiment({"name": "integral_action"}, noise=AIR)
     if name == "rounding":
         offer((name, Rounding))
-    what = experiment({"name": name}, noise=AIR)
+        what = experiment({"name": name}, noise=AIR)
     trajectory = simulate(what)
-    assert trajectory.published is not None
-    if name == "rounding":
-        quiet = simulate(experiment({"name": name}))
-        assert np.array_equal(quiet.published, np.round(quiet.states))
-    write_trajectory(trajectory, tmp_path / "bag")
-    read = read_bag(tmp_path / "bag")
+    read = stored(trajectory, tmp_path)
     assert read.completeness == trajectory.completeness
     assert read.completeness.expected == 2 * 5 * 601
     for key in ("states", "published", "lost", "modes"):
         assert np.array_equal(getattr(read, key), getattr(trajectory, key)), key
     assert read.record.experiment == what
     assert check(read).difference is None
-    if name == "integral_action":
-        read.states[7, 2, 4] += 1.0
-        difference = check(read).difference
-        assert difference is not None
-        assert difference.startswith("agent 3 at step 7, replica 2, number 2 of the state: logged ")
+
+
+def test_what_is_published_and_where_it_differs(offer: Callable[..., None]) -> None:
+    trajectory = simulate(experiment({"name": "integral_action"}, noise=AIR))
+    trajectory.states[7, 2, 4] += 1.0
+    found = check(trajectory).difference
+    assert found.startswith("agent 3 at step 7, replica 2, number 2 of the state: logged ")
+    offer(("rounding", Rounding))
+    quiet = simulate(experiment({"name": "rounding"}))
+    assert np.array_equal(quiet.published, np.round(quiet.states))
 
 
 def test_an_agent_goes_on_from_its_state() -> None:
@@ -254,7 +257,6 @@ def test_an_agent_goes_on_from_its_state() -> None:
     what = experiment({"name": "integral_action", "disturbance": [1, 0, 0, 0, -1]}, noise=AIR)
     record = new_record(what)
     model, trajectory = build_model(what), simulate(what, record=record)
-    assert trajectory.published is not None
     law = agent_law(record, model, 2)
     law.resume(300, trajectory.states[300, 2].tobytes())
     for k in range(300, 600):

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.theory.prediction import predict
+from experiments import ValidExperiment, predict
 
 ROOT = Path(__file__).parents[3]
 SCRIPT = ROOT / "benchmarks/errata.py"

@@ -1,7 +1,5 @@
 """Exported runs, read by pyarrow, pandas, numpy and csv, against the messages in the bag as rosbags has them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import sys
@@ -161,12 +159,10 @@ def test_numbers_of_other_runs(tmp_path: Path) -> None:
     noisy = Experiment.parse(document | {"noise": {"broadcast": 0.5, "loss": 0.1}}).simulate(duration=1)
     frame = noisy.to_dataframe()
     assert list(frame.columns) == ["step", "time", "agent", "replica", "state", "published"]
-    assert noisy.published is not None
     assert frame["published"].tolist() == noisy.published.ravel().tolist()
     timed = Experiment.parse(document).with_run(pace="realtime", duration=1).simulate()
     frame = timed.to_dataframe()
     assert list(frame.columns) == ["step", "time", "agent", "replica", "state", "made"]
-    assert timed.made is not None
     assert frame["made"].tolist() == np.repeat(timed.made.ravel() / 1e9, 2).tolist()
     export_files.export_run(noisy, tmp_path, ["npz"])
     assert {"published", "lost"} <= set(np.load(tmp_path / "run.npz"))

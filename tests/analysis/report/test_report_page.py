@@ -1,11 +1,10 @@
-"""The report: valid, self-contained, complete, and safe with any name."""
-
-from __future__ import annotations
+"""The report and the page of the runs: valid, self-contained, complete, and safe with any name."""
 
 import dataclasses
+import json
 import re
 import uuid
-from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,22 +13,19 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from experiments import Completeness, RunRecord, Trajectory, compare, late, line_ring, simulate
+from msg_analysis import Experiment, InputError
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.comparison import Test as FamilyTest
 from msg_analysis.inference.estimates import CovarianceTest, Estimate
 from msg_analysis.inference.residuals import InnovationTests
 from msg_analysis.inference.switching import SwitchingTest
-from msg_analysis.inference.verdict import compare
-from msg_analysis.model.run import Completeness, Trajectory
-from msg_analysis.model.run_record import RunRecord
 from msg_analysis.report import page as report_page
+from msg_analysis.report.list_pages import render_runs, write_runs_page
 from msg_analysis.report.page import render, write_report
-from msg_analysis.twin.simulate import simulate
+from msg_analysis.runs import RunEntry, list_runs
 
 VOID = {"meta", "img", "link", "br", "hr", "input"}
-MakeComparison = Callable[..., Comparison]
 
 
 class Page(HTMLParser):
@@ -41,19 +37,21 @@ class Page(HTMLParser):
         self.tags: list[str] = []
         self.references: list[str] = []
         self.classes: list[str] = []
-        self.text = ""
+        self.text, self.data, self._kind = "", "", ""
         self.feed(text)
         self.close()
         assert self.open == []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
         self.tags.append(tag)
         self.references += [value or "" for name, value in attrs if name in ("src", "href", "action", "data")]
-        self.classes += (dict(attrs).get("class") or "").split()
-        if tag == "svg" or "plot" in (dict(attrs).get("class") or "").split():
-            assert dict(attrs)["aria-label"]
+        self.classes += (given.get("class") or "").split()
+        shown = tag == "svg" or "plot" in (given.get("class") or "").split()
+        assert not shown or {"aria-label", "aria-hidden"} & given.keys()
         if tag not in VOID:
             self.open.append(tag)
+        self._kind = given.get("type") or ""
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
@@ -61,23 +59,15 @@ class Page(HTMLParser):
     def handle_data(self, data: str) -> None:
         if not self.open or self.open[-1] not in ("style", "script"):
             self.text += data
+        elif self._kind == "application/json":
+            self.data += data
 
 
 def _trajectory(agents: int, steps: int, **names: str) -> Trajectory:
-    everybody = list(range(1, agents + 1))
-    experiment = ValidExperiment.parse(
-        {
-            "name": "small",
-            "problem": "consensus",
-            "time": "continuous",
-            "graphs": {
-                "line": {"path": everybody},
-                "ring": {"cycle": everybody} if agents > 2 else {"path": everybody},
-            },
-            "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
-            "run": {"dt": 0.1, "duration": steps * 0.1, "replicas": 2, "start": "zero"},
-        }
-    )
+    run = {"dt": 0.1, "duration": steps * 0.1, "start": "zero"}
+    ring = {"cycle" if agents > 2 else "path": list(range(1, agents + 1))}
+    graphs = {"line": {"path": list(range(1, agents + 1))}, "ring": ring}
+    experiment = line_ring(agents, 0.5, graphs=graphs, run=run)
     if names:
         graphs = tuple(dataclasses.replace(g, name=names.get(g.name, g.name)) for g in experiment.graph_list)
         experiment = dataclasses.replace(experiment, graph_list=graphs)
@@ -218,19 +208,10 @@ def test_replaces_and_leaves_nothing_half_written(tmp_path: Path, monkeypatch: p
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
 
 
-def in_real_time(late: int) -> Comparison:
+def in_real_time(nanoseconds: int) -> Comparison:
     """Every step of every agent is late by so many ns of simulated time."""
-    document = {
-        "name": "timers",
-        "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
-        "switching": {"generator": [[-1, 1], [1, -1]]},
-        "run": {"dt": 0.1, "duration": 20, "replicas": 2, "pace": "realtime", "speed": 10},
-    }
-    trajectory = simulate(ValidExperiment.parse(document))
-    assert trajectory.made is not None
-    made = trajectory.made.copy()
-    made[1:] += late
-    return compare(dataclasses.replace(trajectory, made=made))
+    run = {"dt": 0.1, "pace": "realtime", "speed": 10}
+    return compare(late(simulate(line_ring(run=run)), nanoseconds))
 
 
 def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -257,7 +238,73 @@ def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "0 of 600 (0 %)" in text
 
 
-def test_lockstep_has_no_timing() -> None:
+def test_lockstep_has_no_timing_and_no_runs_no_rows(tmp_path: Path) -> None:
     page = Page(_made_up(5)[1])
     assert "Real time" not in page.text
     assert "predicted, steps of the run" in page.text
+    assert "0 runs" in Page(render_runs([], tmp_path, tmp_path)).text
+    with pytest.raises(InputError, match="cannot be written"):
+        write_runs_page([], tmp_path, tmp_path / "none" / "index.html")
+
+
+DAY = datetime(2026, 11, 25, 12, tzinfo=UTC)
+EVIL = "</script><img src=http://x onerror=alert(1)>"
+
+
+def test_rows_links_and_data(tmp_path: Path) -> None:
+    """Newest first; the experiment of a bag is in it once, however many runs have it."""
+    document = {"name": "pair", "graphs": {"line": {"path": [1, 2, 3]}}, "run": {"dt": 0.1, "duration": 5, "seed": 7}}
+    run = Experiment.parse(document | {"run": document["run"] | {"start": "zero"}}).simulate()
+    names = ("pair 1_20261125_120000", "pair_20261126_120000")
+    for name in names:
+        run.save(tmp_path / "runs" / name)
+    (tmp_path / "runs" / names[0] / "report.html").write_text("")
+    page = Page(render_runs(list_runs(tmp_path / "runs"), tmp_path / "runs", tmp_path / "pages"))
+    assert "2 runs" in page.text
+    quoted = names[0].replace(" ", "%20")
+    wanted = [f"../runs/{names[1]}/", f"../runs/{quoted}/", f"../runs/{quoted}/report.html"]
+    assert [each for each in page.references if not each.startswith("data:")] == wanted
+    data = json.loads(page.data)
+    assert {each["experiment"] for each in data["runs"]} == {0}
+    assert {each["versions"] for each in data["runs"]} == {1}
+    assert data["documents"][0]["run.seed"] == "7"
+    assert data["documents"][0]["graphs.line.path"] == "[1, 2, 3]"
+    assert data["documents"][1]["numpy"] == run.record.versions["numpy"]
+
+
+def test_hostile_names_of_runs(tmp_path: Path) -> None:
+    runs = [
+        RunEntry(
+            str(tmp_path / EVIL.replace("/", "")),
+            "compared",
+            DAY + timedelta(1),
+            name=EVIL,
+            seed=1,
+            verdict=EVIL,
+            measured=1.0,
+        ),
+        RunEntry(str(tmp_path / "\udcff"), "foreign", DAY, problem=EVIL),
+    ]
+    path = tmp_path / "index.html"
+    write_runs_page(runs, tmp_path, path)
+    text = path.read_text(encoding="utf-8")
+    page = Page(text)
+    assert "img" not in page.tags
+    assert page.tags.count("script") == 2
+    assert EVIL in page.text
+    assert json.loads(page.data)["runs"][0]["name"] == EVIL
+    assert "default-src 'none'" in text
+    assert not re.search(r"url\(|@import", text)
+    assert not any(reference.startswith(("http", "//", "javascript")) for reference in page.references)
+
+
+def test_long_values_are_short_and_differ(tmp_path: Path) -> None:
+    document = {"name": "ring", "graphs": {"ring": {"cycle": list(range(1, 151))}}, "run": {"dt": 0.1, "duration": 1}}
+    for name, last in (("a", [149, 150]), ("b", [150, 149])):
+        document["graphs"] = {"ring": {"cycle": [*range(1, 149), *last]}}
+        document["run"] = {"dt": 0.1, "duration": 1, "start": "zero"}
+        Experiment.parse(document).simulate().save(tmp_path / name)
+    data = json.loads(Page(render_runs(list_runs(tmp_path), tmp_path, tmp_path)).data)
+    values = [each["graphs.ring.cycle"] for each in data["documents"] if "name" in each]
+    assert len(set(values)) == 2
+    assert all(len(value) < 300 for value in values)

@@ -1,7 +1,5 @@
 """The report in a browser: no complaint, no request, figures that answer, and all of it on paper."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import functools
@@ -16,13 +14,10 @@ import pytest
 from browser import CUT, FAINT, Log, Tab
 from PIL import Image
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from experiments import Completeness, Trajectory, ValidExperiment, claimed, compare, late, simulate
 from msg_analysis.inference.pool import compare_pooled
-from msg_analysis.inference.verdict import compare
-from msg_analysis.model.run import Completeness, Trajectory
 from msg_analysis.report.page import write_report
 from msg_analysis.report.plot_style import BLUE, DARK
-from msg_analysis.twin.simulate import simulate
 
 # Not stationary: a run of 100 agents from their stationary law has a long past to be simulated.
 HUNDRED: dict[str, Any] = {"duration": 50, "replicas": 16, "start": "zero"}
@@ -158,7 +153,7 @@ def test_agents_by_name(tab: Tab, tmp_path: Path) -> None:
     _check(page, log, path)
     page.fill("#agents", "Kiel, Bad Ems ,3; 1")
     assert page.locator("#node-table tbody tr:visible td:first-child").all_inner_texts() == [
-        *("Bad Ems", "$$x$$", "Kiel", "1"),
+        *("Bad Ems", "$$x$$", "Kiel", "1")
     ]
     chosen = "Bokeh.documents[0].get_model_by_name('lines').data.agent"
     assert page.evaluate(chosen) == ["agent Bad Ems", "agent $$x$$", "agent Kiel", "agent 1"]
@@ -358,11 +353,8 @@ def test_replicas(tab: Tab, reports: Callable[..., tuple[Path, Trajectory]], age
 
 def _in_real_time() -> tuple[Any, Trajectory]:
     trajectory = _trajectory(3, pace="realtime", speed=5.0)
-    assert trajectory.made is not None
-    made = trajectory.made.copy()
-    made[1:] += 60_000_000
-    late = dataclasses.replace(trajectory, made=made)
-    return compare(late), late
+    trajectory = late(trajectory, 60_000_000)
+    return compare(trajectory), trajectory
 
 
 def _disagreeing() -> tuple[Any, Trajectory]:
@@ -370,7 +362,7 @@ def _disagreeing() -> tuple[Any, Trajectory]:
     wrong = document | {"graphs": document["graphs"] | {"ring $$x$$": {"edges": [[1, 2], [2, 3], [3, 4], [1, 4, 0.3]]}}}
     said, did = ValidExperiment.parse(document), simulate(ValidExperiment.parse(wrong).with_run(duration=100))
     said = said.with_run(duration=100)
-    trajectory = dataclasses.replace(did, record=dataclasses.replace(did.record, experiment=said))
+    trajectory = claimed(did, said)
     return compare(trajectory), trajectory
 
 

@@ -1,7 +1,5 @@
 """Tables for a terminal: they show the numbers of the document, also where some are missing."""
 
-from __future__ import annotations
-
 import io
 from typing import Any
 
@@ -103,12 +101,7 @@ def test_many_agents_are_cut_and_it_says_so() -> None:
 
 
 def test_prediction() -> None:
-    law = {
-        "system_error": 3.5,
-        "node_errors": [1.5, 2.0],
-        "system_certainty": 2 / 7,
-        "node_certainty": [2 / 3, 0.5],
-    }
+    law = {"system_error": 3.5, "node_errors": [1.5, 2.0], "system_certainty": 2 / 7, "node_certainty": [2 / 3, 0.5]}
     document = {
         "agents": 2,
         "modes": ["[red]", "b"],
@@ -120,14 +113,7 @@ def test_prediction() -> None:
     }
     output = shown(theory_text.print_prediction, document)
     assert "[red]" in output
-    for part in (
-        "continuous time",
-        "steps of the run",
-        "3.5",
-        "0.285714",
-        "0.25",
-        "graphs held fixed: not",
-    ):
+    for part in ("continuous time", "steps of the run", "3.5", "0.285714", "0.25", "graphs held fixed: not"):
         assert part in output
 
 
@@ -159,13 +145,7 @@ def test_experiment_explained() -> None:
     assert [graph["stationary"] for graph in document["graphs"]] == pytest.approx([s / sum(shares) for s in shares])
     assert document["memory"]["states"] == 1001 * 4 * 2 * 8
     output = shown(tables.print_experiment, document)
-    for part in (
-        "tracking of 4 agents in continuous time",
-        "gain inf",
-        "1000 of 0.05",
-        "1>2 (0.5)",
-        "1-2, 2-3, 3-4",
-    ):
+    for part in ("tracking of 4 agents in continuous time", "gain inf", "1000 of 0.05", "1>2 (0.5)", "1-2, 2-3, 3-4"):
         assert part in output
 
 
@@ -247,13 +227,7 @@ def test_bag() -> None:
         *("and 2 more with 25 messages", "8 messages, lz4, torn: cut off", "2 damaged chunks, 77 messages"),
     ):
         assert part in output
-    nothing = dict.fromkeys(document) | {
-        "bag": "b",
-        "problem": "no [run]",
-        "topics": [],
-        "files": [],
-        "versions": {},
-    }
+    nothing = dict.fromkeys(document) | {"bag": "b", "problem": "no [run]", "topics": [], "files": [], "versions": {}}
     assert "no [run]" in shown(tables.print_bag, nothing)
 
 

@@ -1,7 +1,5 @@
 """What is done is done once, what fails fails alone, and all runs are judged together."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import signal
@@ -12,23 +10,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
+import experiments
+from experiments import ValidExperiment, simulate
 from msg_analysis.errors import InputError
 from msg_analysis.sweep import results as conducting
 from msg_analysis.sweep.figure_series import picture
+from msg_analysis.sweep.grid import load_sweep
 from msg_analysis.sweep.points import DONE, FAILED, Job, Outcome, evaluate
 from msg_analysis.sweep.results import JOURNAL, OutcomeStore, arrow_table, conduct, judge_sweep, rows_of
 from msg_analysis.sweep.workers import Lost, Workers
-from msg_analysis.twin.simulate import simulate
 
 
 def document(rate: float = 1.0, **run: Any) -> dict[str, Any]:
-    return {
-        "name": "two",
-        "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
-        "switching": {"generator": [[-rate, rate], [rate, -rate]]},
-        "run": {"dt": 0.1, "duration": 100, **run},
-    }
+    return experiments.document(5, rate, run={"dt": 0.1, "duration": 100, "replicas": 1, **run})
 
 
 def with_p(p: float | None, **result: Any) -> Outcome:
@@ -46,7 +42,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
     class Here:
         def __init__(self, *_: Any) -> None: ...
 
-        def __enter__(self) -> Here:
+        def __enter__(self) -> Any:
             return self
 
         def __exit__(self, *_: object) -> None: ...
@@ -76,19 +72,8 @@ def test_ctrl_c_while_an_outcome_is_written(tmp_path: Path, monkeypatch: pytest.
         assert len(store.outcomes) == (tmp_path / JOURNAL).read_bytes().count(b"\n") == 1
 
 
-def test_predictions_are_those_of_the_paper() -> None:
-    """Example 1 of the paper: system certainty .73561 at r12 = r21 = 1 and epsilon = 0.5 [theory, closed form]."""
-    outcome = evaluate(Job.of("predict", document(0.5)))
-    assert outcome.status == DONE
-    assert outcome.result["continuous"]["system_certainty"] == pytest.approx(0.73561, abs=5e-6)
-    certainties = 1 / np.array(outcome.result["continuous"]["node_errors"])
-    np.testing.assert_allclose(certainties, [2.90277, 4.25156, 5, 4.25156, 2.90277], atol=5e-6)
-
-
 def test_simulated_runs_are_those_of_the_twin() -> None:
     """Mean square of the disagreement, by numpy."""
-    from msg_analysis.experiment.experiment import ValidExperiment
-
     what = document(seed=5)
     outcome = evaluate(Job.of("simulate", what))
     states = simulate(ValidExperiment.parse(what)).values[:-1]
@@ -174,8 +159,6 @@ def test_a_failure_does_not_hide_a_disagreement() -> None:
 
 def cubes(number: int, _stopping: Any) -> int:
     if number == 13:
-        import os
-
         os.kill(os.getpid(), 9)
     return number**3
 
@@ -201,10 +184,6 @@ def test_what_kills_its_workers_is_given_up_and_the_others_are_done() -> None:
 
 
 def test_columns_and_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import yaml
-
-    from msg_analysis.sweep.grid import load_sweep
-
     in_this_process(monkeypatch)
     over = {"noise.process": [1.0, [1, 2, 1, 1, 1]], "switching.generator": [[[-1, 1], [1, -1]], [[-9, 9], [9, -9]]]}
     file = {"experiment": document(), "kind": "simulate", "over": over, "repetitions": 3}
@@ -225,7 +204,6 @@ def test_columns_and_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert shown.series[0].places[0].value == pytest.approx(np.mean([row["node_errors[2].measured"] for row in three]))
     error = np.sqrt(np.sum([row["node_errors[2].standard_error"] ** 2 for row in three])) / 3
     high = shown.series[0].places[0].high
-    assert high is not None
     assert high - shown.series[0].places[0].value == pytest.approx(1.96 * error, rel=1e-4)
     with pytest.raises(InputError, match="not a column of numbers: expected one of"):
         picture(sweep, rows, "nonsense")

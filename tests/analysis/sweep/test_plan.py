@@ -1,7 +1,5 @@
 """The sweep file: which points it stands for, and what is wrong with it, before anything runs."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -8,36 +8,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from experiments import line_ring
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.theory.facts import check_facts
 
 MODELS = settings(max_examples=20, deadline=None, derandomize=True)
 
 
 def experiment(graphs, *, agents, time="continuous", leaders=None, seed=0, chain=None):
-    random = np.random.default_rng(seed)
     n = len(graphs)
     if chain is None:
-        chain = random.uniform(0.1, 1.0, (n, n))
-        if time == "continuous":
-            np.fill_diagonal(chain, 0.0)
-            chain -= np.diag(chain.sum(axis=1))
-        else:
-            chain /= chain.sum(axis=1, keepdims=True)
-    document = {
-        "name": "facts",
-        "problem": "tracking" if leaders else "consensus",
-        "time": time,
-        "agents": agents,
-        "graphs": graphs,
-        "switching": {"generator" if time == "continuous" else "transition": np.asarray(chain).tolist()},
-        "noise": {"process": 1.0},
-        "run": {"dt": 0.01, "duration": 1} if time == "continuous" else {"duration": 10},
-    }
-    if leaders:
-        document["leaders"] = leaders
-    return ValidExperiment.parse(document)
+        chain = np.random.default_rng(seed).uniform(0.1, 1.0, (n, n))
+        chain = chain / chain.sum(axis=1, keepdims=True) if time == "discrete" else chain - np.diag(chain.sum(axis=1))
+    changes = {"problem": "tracking", "leaders": leaders} if leaders else {}
+    switching = {"generator" if time == "continuous" else "transition": np.asarray(chain).tolist()}
+    run = {"dt": 0.01, "duration": 1} if time == "continuous" else {"dt": 1, "duration": 10}
+    return line_ring(agents=agents, graphs=graphs, time=time, switching=switching, run=run, **changes)
 
 
 def by_name(facts):
@@ -128,15 +114,12 @@ def test_others_of_one_graph_are_its_own_eigenvalues():
     assert discrete["Abar_c"].others == pytest.approx(np.exp(-2 * connectivity))
 
 
-def test_slow_chains_are_told_from_zero_or_refused():
+def test_slow_chains_are_told_from_zero_or_refused_like_large_ones():
     graphs = {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}}
     slow = by_name(check_facts(experiment(graphs, agents=3, chain=[[-1e-7, 1e-7], [1e-7, -1e-7]])))
     assert slow["M_c"].holds
     assert slow["M_c"].others == pytest.approx(2e-7, rel=1e-6)
     with pytest.raises(InputError, match="rounding hides"):
         check_facts(experiment(graphs, agents=3, chain=[[-1e-11, 1e-11], [1e-11, -1e-11]]))
-
-
-def test_too_large():
     with pytest.raises(InputError, match="1600 rows"):
         check_facts(experiment({"path": {"path": list(range(1, 41))}}, agents=40, chain=[[0.0]]))

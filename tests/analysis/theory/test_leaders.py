@@ -1,7 +1,5 @@
 """Leader sets against brute-force Kronecker algebra, networkx, and exact algorithms for paths and rings."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import cache
@@ -17,7 +15,6 @@ from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.theory.leader_search import LeaderSearch
 from msg_analysis.theory.leaders import (
     LeaderProblem,
     joint_robustness_centrality,
@@ -113,7 +110,6 @@ def test_leaders_of_the_experiment_do_not_count() -> None:
     tracking = ValidExperiment.parse(random_document(1) | led)
     assert system_error(tracking, [0, 3]) == system_error(consensus, [0, 3])
     assert joint_robustness_centrality(tracking, [0, 3]) == 1.0 / system_error(consensus, [0, 3])
-    assert tracking.leaders is not None
     assert tracking.leaders.agents == [2]
 
 
@@ -173,8 +169,7 @@ def test_optimal_leaders_on_paths_and_rings(kind: str, agents: int, count: int) 
         assert selection.bound is not None
         assert selection.bound <= best * (1 + 1e-9)
         assert selection.sets[0][0] >= best * (1 - 1e-9)
-        if method == "swap":
-            assert selection.sets[0][0] == pytest.approx(best, rel=1e-9)
+        assert method == "greedy" or selection.sets[0][0] == pytest.approx(best, rel=1e-9)
 
 
 def test_optimal_leaders_of_a_longer_path() -> None:
@@ -184,7 +179,6 @@ def test_optimal_leaders_of_a_longer_path() -> None:
     best = best_on_path(24, 4)
     assert selection.method == "swap"
     assert selection.sets[0][0] == pytest.approx(best, rel=1e-9)
-    assert selection.bound is not None
     assert 0.4 * best < selection.bound <= best
 
 
@@ -229,28 +223,6 @@ def test_supermodular_with_noise_on_the_air_loss_and_delay(seed: int, directed: 
             both = error(a, u, v)
             assert alone - pairs[0] >= pairs[1] - both - 1e-9 * alone
             assert both <= min(pairs) * (1 + 1e-9) <= alone * (1 + 2e-9)
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.integers(0, 10**6), st.booleans(), st.sampled_from(["greedy", "swap"]))
-def test_lazy_is_plain_and_the_bound_holds(seed: int, directed: bool, method: str) -> None:
-    """3 of 7 agents; every E that the plain search and the best of all sets need is computed once."""
-    experiment = ValidExperiment.parse(random_document(seed, agents=7, directed=directed))
-    lazy = select_leaders(experiment, 3, method=method)  # type: ignore[arg-type]
-    error = errors_of(LeaderProblem(experiment, "continuous"))
-    best = min(error(*leaders) for leaders in combinations(range(7), 3))
-    assert lazy.bound is not None
-    assert lazy.bound <= best * (1 + 1e-9) <= lazy.sets[0][0] * (1 + 2e-9)
-
-    class Plain(LeaderProblem):
-        supermodular = False  # type: ignore[assignment]
-
-        def system_error(self, leaders: frozenset[int]) -> float:
-            return error(*leaders)
-
-    search = LeaderSearch(Plain(experiment, "continuous"))
-    order = search.greedy(3) if method == "greedy" else search.swap(3)
-    assert tuple(order) == lazy.order
 
 
 CORRELATED = [[1.0, 0.0, 0.0], [-0.9, 0.4, 0.0], [0.0, 0.0, 0.5]]
@@ -323,10 +295,16 @@ def test_noise_on_the_air_is_looked_at_in_the_steps_law() -> None:
         resolve_law(experiment, "continuous")
 
 
-def test_everybody_leads() -> None:
+def test_limits_and_everybody() -> None:
     experiment = ValidExperiment.parse(random_document(5))
     assert system_error(experiment, list(range(5))) == 0.0
     assert select_leaders(experiment, 5, gain=2.0).sets[0][1] == (0, 1, 2, 3, 4)
+    path = ValidExperiment.parse({"name": "path", "graphs": {"g": {"path": list(range(1, 61))}}})
+    with pytest.raises(InputError, match="5461512 sets of 5 leaders: use swap"):
+        select_leaders(path, 5, method="exhaustive")
+    experiment = ValidExperiment.parse(random_document(7))
+    with pytest.raises(InputError, match=r"run\.dt"):
+        select_leaders(experiment, 1, law="emulated", gain=1000.0)
 
 
 @pytest.mark.parametrize(
@@ -348,22 +326,10 @@ def test_bad_questions(changes: dict[str, Any], message: str) -> None:
         select_leaders(experiment, **{"count": 2} | changes)
 
 
-def test_enumeration_has_a_limit() -> None:
-    path = ValidExperiment.parse({"name": "path", "graphs": {"g": {"path": list(range(1, 61))}}})
-    with pytest.raises(InputError, match="5461512 sets of 5 leaders: use swap"):
-        select_leaders(path, 5, method="exhaustive")
-
-
-def test_unstable_gain_is_refused_by_the_solver() -> None:
-    experiment = ValidExperiment.parse(random_document(7))
-    with pytest.raises(InputError, match=r"run\.dt"):
-        select_leaders(experiment, 1, law="emulated", gain=1000.0)
-
-
 def test_document() -> None:
     document = select_leaders(ValidExperiment.parse(random_document(8)), 2, method="swap", top=3).to_json()
     assert [document[key] for key in ("experiment", "law", "gain", "count", "method")] == [
-        *("random", "continuous", "inf", 2, "swap"),
+        *("random", "continuous", "inf", 2, "swap")
     ]
     assert len(document["sets"]) == 3
     errors = [entry["system_error"] for entry in document["sets"]]

@@ -90,11 +90,7 @@ def scaled(name, rate):
     return (np.array(CHAINS[name]) * rate).tolist()
 
 
-GRAPHS = {
-    "connected": [PATH, RING, STAR],
-    "disconnected": [PAIRS, BRIDGE, BRIDGE],
-    "directed": [LISTEN, RING, STAR],
-}
+GRAPHS = {"connected": [PATH, RING, STAR], "disconnected": [PAIRS, BRIDGE, BRIDGE], "directed": [LISTEN, RING, STAR]}
 
 
 @pytest.mark.parametrize("chain", CHAINS)

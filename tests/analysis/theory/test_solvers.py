@@ -1,19 +1,19 @@
 """The matrix-free solvers on hard chains and graphs, against the dense reference, scipy and python-control.
 
-The reference is itself checked against the paper's Kronecker formulas in test_moments.py.
+The reference is itself checked against brute force in test_extensions.py.
 """
 
 import control
-import networkx as nx
 import numpy as np
 import pytest
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from switching_systems import generator, laplacian, system
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.markov_chain import stationary_law
-from msg_analysis.theory import coupled_equations, moments
+from msg_analysis.theory import coupled_equations, moments, solvers
+from msg_analysis.theory import packed_symmetric as symmetric
 from msg_analysis.theory.coupled_equations import AveragedEquations, CoupledEquations
 from msg_analysis.theory.jump_system import JumpSystem, held
 from msg_analysis.theory.krylov import plain_conjugate_gradients
@@ -23,47 +23,6 @@ from msg_analysis.theory.moments import MomentSolver
 MODELS = settings(max_examples=30, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
 rates = st.sampled_from([1e-6, 1e-2, 1.0, 1e2, 1e6])
-
-
-def generator(random, n, rate=1.0, *, reversible=False):
-    flow = random.uniform(0.05, 2.0, (n, n)) * rate
-    if reversible:
-        flow = (flow + flow.T) / random.uniform(0.2, 1.0, n)[:, None]
-    np.fill_diagonal(flow, 0.0)
-    return flow - np.diag(flow.sum(axis=1))
-
-
-def laplacian(random, m, kind):
-    a = np.zeros((m, m))
-    if kind == "pieces":  # a few edges only: disconnected; the union is made to hold together below
-        for i, j in random.integers(m, size=(max(1, m // 3), 2)):
-            a[i, j] = a[j, i] = 1.0
-    elif kind == "chain":  # everybody hears the one before: no eigenvectors
-        a[range(1, m), range(m - 1)] = 1.0
-    else:
-        a = random.uniform(0.2, 1.5, (m, m)) * (random.random((m, m)) < 3.0 / m)
-        a[range(1, m), range(m - 1)] = 1.0
-        if kind == "symmetric":
-            a = a + a.T
-    np.fill_diagonal(a, 0.0)
-    return np.diag(a.sum(axis=1)) - a
-
-
-def system(random, m, gamma, kind="symmetric", dt=None, loss=False):
-    """Consensus; with dt in discrete time."""
-    n = len(gamma)
-    z = np.stack([laplacian(random, m, kind) for _ in range(n)])
-    if kind == "pieces":
-        z[0] += nx.laplacian_matrix(nx.path_graph(m)).toarray()
-    f = random.standard_normal((n, m, m))
-    lift = scipy.linalg.helmert(m).T
-    noise, law = lift.T @ (f @ f.transpose(0, 2, 1)) @ lift, stationary_law(gamma)
-    if dt is None:
-        return JumpSystem("continuous", lift.T @ z @ lift, noise, gamma, law, lift)
-    chain = np.clip(scipy.linalg.expm(gamma * dt), 0.0, None)
-    chain /= chain.sum(axis=1, keepdims=True)
-    variance = 0.2 * (dt * z * ~np.eye(m, dtype=bool)) ** 2 if loss else None
-    return JumpSystem("discrete", np.eye(m - 1) - dt * lift.T @ z @ lift, noise, chain, law, lift, variance)
 
 
 def agree(model, rtol=1e-9):
@@ -256,34 +215,6 @@ def test_one_graph_is_the_h2_norm(kind):
     assert np.trace(MomentSolver(model).steady()[0]) == pytest.approx(control.system_norm(plant, 2) ** 2, rel=1e-8)
 
 
-@MODELS
-@given(seeds, st.integers(4, 12))
-def test_one_graph_with_unit_noise_is_its_resistance(seed, m):
-    graph = nx.connected_watts_strogatz_graph(m, 3, 0.5, seed=seed)
-    lift = scipy.linalg.helmert(m).T
-    z = lift.T @ nx.laplacian_matrix(graph).toarray() @ lift
-    model = JumpSystem("continuous", z[None], np.eye(m - 1)[None], np.zeros((1, 1)), np.ones(1), lift)
-    resistance = nx.effective_graph_resistance(graph)
-    assert np.trace(MomentSolver(model).steady()[0]) == pytest.approx(resistance / (2 * m), rel=1e-10)
-
-
-def test_path_and_ring_of_forty():
-    """Kf of a path is (m^3 - m) / 6, of a ring (m^3 - m) / 12; switching keeps E below their mean."""
-    m = 40
-    lift = scipy.linalg.helmert(m).T
-    z = np.stack([nx.laplacian_matrix(g(m)).toarray().astype(float) for g in (nx.path_graph, nx.cycle_graph)])
-    noise = np.stack([np.eye(m - 1)] * 2)
-    gamma = np.array([[-1.0, 1.0], [1.0, -1.0]])
-    model = JumpSystem("continuous", lift.T @ z @ lift, noise, gamma, np.array([0.5, 0.5]), lift)
-    path, ring = ((m**3 - m) / (k * 2 * m) for k in (6, 12))
-    for mode, error in enumerate((path, ring)):
-        assert np.trace(MomentSolver(held(model, mode)).steady()[0]) == pytest.approx(error, rel=1e-11)
-    agree(model)
-    total = np.trace(MomentSolver(model).steady().sum(axis=0))
-    assert np.trace(np.linalg.inv(z.mean(axis=0)[1:, 1:])) > 0
-    assert 0.5 * np.trace(np.linalg.inv(lift.T @ z.mean(axis=0) @ lift)) < total < (path + ring) / 2
-
-
 @pytest.mark.parametrize("dt", [None, 0.05])
 def test_a_guess_saves_iterations_and_changes_nothing(dt):
     random = np.random.default_rng(9)
@@ -358,8 +289,6 @@ def test_drift_that_pushes_away_is_refused():
 
 
 def test_no_convergence_is_an_error_or_a_dense_solve(monkeypatch):
-    from msg_analysis.theory import solvers
-
     monkeypatch.setattr(solvers, "MAX_ITERATIONS", 2)
     monkeypatch.setattr(solvers, "MAX_RELATIVE_ERROR", 1e-14)
     random = np.random.default_rng(12)
@@ -375,11 +304,43 @@ def test_no_convergence_is_an_error_or_a_dense_solve(monkeypatch):
 
 
 def test_many_forms_are_solved_in_batches(monkeypatch):
-    from msg_analysis.theory import solvers
-
     random = np.random.default_rng(13)
     model = system(random, 9, generator(random, 3))
     forms = np.stack([a + a.T for a in random.standard_normal((7, 8, 8))])
     together = MomentSolver(model).dual(forms)
     monkeypatch.setattr(solvers, "CHUNK", 400)
     np.testing.assert_allclose(MomentSolver(model).dual(forms), together, rtol=1e-10, atol=1e-12)
+
+
+@pytest.fixture
+def random():
+    return np.random.default_rng(1)
+
+
+def symmetric_matrices(random, d, count=2):
+    a = random.standard_normal((count, d, d))
+    return a + a.transpose(0, 2, 1)
+
+
+@pytest.mark.parametrize("d", [0, 1, 2, 5])
+def test_pack_and_unpack_are_inverse_and_keep_the_inner_product(random, d):
+    a, b = symmetric_matrices(random, d)
+    assert symmetric.pack(a).shape == (symmetric.size(d),)
+    np.testing.assert_allclose(symmetric.unpack(symmetric.pack(a), d), a, rtol=1e-15)
+    assert symmetric.pack(a) @ symmetric.pack(b) == pytest.approx(np.trace(a @ b), abs=1e-12)
+
+
+@pytest.mark.parametrize("d", [1, 2, 5])
+def test_packed_lyapunov(random, d):
+    c, _ = symmetric_matrices(random, d)
+    w = random.standard_normal((d, d))
+    np.testing.assert_allclose(symmetric.lyapunov(w) @ symmetric.pack(c), symmetric.pack(w @ c + c @ w.T), atol=1e-12)
+
+
+def test_adjoint_is_the_transpose(random):
+    c, h = symmetric_matrices(random, 4)
+    w = random.standard_normal((4, 4))
+    np.testing.assert_allclose(
+        symmetric.unpack(symmetric.lyapunov(w).T @ symmetric.pack(h), 4), w.T @ h + h @ w, atol=1e-12
+    )
+    assert np.trace(h @ (w @ c + c @ w.T)) == pytest.approx(np.trace((w.T @ h + h @ w) @ c))

@@ -1,7 +1,5 @@
 """Autocovariance and density: one graph in closed form, brute force, integrals, and long runs by scipy.signal.welch."""
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 
@@ -11,7 +9,6 @@ import scipy.linalg
 import scipy.signal
 
 from msg_analysis import Experiment, InputError
-from msg_analysis.theory import spectrum as module
 from msg_analysis.theory.prediction import predict
 from msg_analysis.theory.spectrum import spectrum
 
@@ -120,21 +117,18 @@ def test_default_lags_end_where_little_is_left() -> None:
     assert found.frequencies[-1] == 10.0
 
 
-def test_in_python() -> None:
+def test_in_python_and_without_noise() -> None:
     found = of("line_ring").spectrum([0, 1], [0.0, 1.0])
     assert found.to_json()["lags"] == [0.0, 0.05]
     assert "Spectrum of 'line_ring'" in repr(found)
     assert [len(axes.get_lines()) for axes in found.plot().axes] == [7, 6]
-
-
-def test_without_noise() -> None:
     quiet = {"name": "q", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "noise": {"process": 0.0}}
     found = spectrum(predict(Experiment.parse(quiet | {"run": {"duration": 10, "start": "zero"}})))
     assert not found.system_autocovariance.any()
     assert not found.system_density.any()
 
 
-def test_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refused() -> None:
     prediction = predict(of("line_ring"))
     for lags in ([], [-1, 2], [3, 3]):
         with pytest.raises(InputError, match="lags: expected ascending whole numbers"):
@@ -142,6 +136,5 @@ def test_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     for frequencies in ([-1.0], [11.0], [1.0, 0.5], [np.nan]):
         with pytest.raises(InputError, match=r"frequencies: expected ascending numbers from 0 to 1 / \(2 dt\) = 10"):
             spectrum(prediction, None, np.array(frequencies))
-    monkeypatch.setattr(module, "MAX_SIZE", 7)
     with pytest.raises(InputError, match="make 8 unknowns; at most 7 are computed"):
-        spectrum(prediction)
+        spectrum(prediction, most_unknowns=7)

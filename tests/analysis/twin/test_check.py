@@ -1,131 +1,121 @@
-"""The comparison with the twin finds what was changed, and says where."""
-
-from __future__ import annotations
+"""The comparison with the twin finds what was changed, and says where; with noise and losses on the air, too."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from experiments import Trajectory, check, flipped, line_ring, simulate, stored
 from msg_analysis.common import arrays
-from msg_analysis.common.arrays import FloatArray, IntArray, in_file
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.model.run import Trajectory
-from msg_analysis.twin.check import check
-from msg_analysis.twin.simulate import simulate
+from msg_analysis.common.arrays import in_file
+from msg_analysis.twin.check import Check
 
 
 @pytest.fixture(scope="module")
 def twin() -> Trajectory:
-    experiment = ValidExperiment.parse(
-        {
-            "name": "checked",
-            "problem": "consensus",
-            "time": "continuous",
-            "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
-            "switching": {"generator": [[-1, 1], [1, -1]]},
-            "run": {"dt": 0.05, "duration": 20, "replicas": 2, "seed": 5},
-        }
-    )
-    return simulate(experiment)
+    return simulate(line_ring(run={"seed": 5}))
 
 
-@pytest.fixture
-def stored(twin: Trajectory, tmp_path: Path) -> Callable[..., Trajectory]:
-    """The twin with other states or modes, written to a bag and read again."""
-
-    def store(states: FloatArray | None = None, modes: IntArray | None = None) -> Trajectory:
-        changed = dataclasses.replace(
-            twin,
-            states=twin.states if states is None else states,
-            modes=twin.modes if modes is None else modes,
-        )
-        write_trajectory(changed, tmp_path / "bag")
-        return read_bag(tmp_path / "bag")
-
-    return store
+@pytest.fixture(scope="module")
+def noisy() -> Trajectory:
+    """Values are published with noise, and messages lost."""
+    return simulate(line_ring(noise={"broadcast": 0.2, "loss": 0.3}, run={"seed": 5}))
 
 
-def flip(states: FloatArray, *where: int) -> FloatArray:
-    """The last bit of one number turned over."""
-    changed = states.copy()
-    bits = changed.view(np.uint64)
-    bits[where] ^= np.uint64(1)
-    return changed
+def checked(run: Trajectory, directory: Path, **changes: object) -> Check:
+    """Of a bag of the run with these changes."""
+    return check(stored(dataclasses.replace(run, **changes), directory))
 
 
-def test_a_long_run(stored: Callable[..., Trajectory], twin: Trajectory, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_run(tmp_path: Path, twin: Trajectory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Logged and computed states are in files and compared in pieces, here of ten steps."""
     monkeypatch.setattr(arrays, "LARGE", 1)
     monkeypatch.setattr(arrays, "BLOCK_NUMBERS", 60)
     again = simulate(twin.record.experiment, record=twin.record)
     assert in_file(again.states)
     assert np.array_equal(again.states, twin.states)
-    changed = flip(flip(twin.states, 237, 1, 0), 310, 0, 1)
+    changed = flipped(flipped(twin.states, 237, 1, 0), 310, 0, 1)
     changed[100, 2] = np.nan
-    logged = stored(changed)
+    logged = stored(dataclasses.replace(twin, states=changed), tmp_path)
     assert in_file(logged.states)
     outcome = check(logged)
-    assert outcome.difference is not None
     assert outcome.difference.startswith("agent 2 at step 237, replica 1: ")
     assert outcome.missing == 1
 
 
-def test_equal(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
-    outcome = check(stored())
-    assert outcome.difference is None
-    assert outcome.compared == twin.states.shape[0] * 3
-    assert outcome.missing == 0
+@pytest.mark.parametrize("kind", ["twin", "noisy"])
+def test_equal(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+    outcome = checked(request.getfixturevalue(kind), tmp_path)
+    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert outcome.compared == 401 * 3 * (2 if kind == "noisy" else 1)
 
 
 @pytest.mark.parametrize("where", [(0, 0, 0), (17, 2, 1), (400, 1, 0)])
-def test_one_bit(twin: Trajectory, stored: Callable[..., Trajectory], where: tuple[int, int, int]) -> None:
+def test_one_bit(twin: Trajectory, tmp_path: Path, where: tuple[int, int, int]) -> None:
     step, agent, replica = where
-    changed = flip(twin.states, *where)
-    difference = check(stored(changed)).difference
-    assert difference == (
+    changed = flipped(twin.states, *where)
+    assert checked(twin, tmp_path, states=changed).difference == (
         f"agent {agent + 1} at step {step}, replica {replica + 1}: logged {float(changed[where])!r}, "
         f"the law gives {float(twin.states[where])!r}"
     )
 
 
-def test_the_first_of_several_is_named(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
-    changed = flip(flip(flip(twin.states, 30, 0, 1), 29, 2, 0), 29, 1, 1)
-    assert str(check(stored(changed)).difference).startswith("agent 2 at step 29, replica 2:")
+def test_the_first_of_several_is_named(twin: Trajectory, tmp_path: Path) -> None:
+    changed = flipped(flipped(flipped(twin.states, 30, 0, 1), 29, 2, 0), 29, 1, 1)
+    assert checked(twin, tmp_path, states=changed).difference.startswith("agent 2 at step 29, replica 2:")
 
 
-def test_wrong_graph(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
-    modes = twin.modes.copy()
+def test_wrong_graph(twin: Trajectory, tmp_path: Path) -> None:
+    modes, names = twin.modes.copy(), ["line", "ring"]
     modes[40:50] = 1 - modes[40:50]
-    names = ["line", "ring"]
     expected = f"graph of step 40: logged {names[modes[40]]}, the seed gives {names[twin.modes[40]]}"
-    assert check(stored(modes=modes)).difference == expected
+    assert checked(twin, tmp_path, modes=modes).difference == expected
 
 
 @pytest.mark.parametrize(("state_step", "first"), [(40, "agent 1"), (41, "graph")])
-def test_state_or_graph_whichever_came_first(
-    twin: Trajectory, stored: Callable[..., Trajectory], state_step: int, first: str
-) -> None:
+def test_state_or_graph_whichever_came_first(twin: Trajectory, tmp_path: Path, state_step: int, first: str) -> None:
     """x(40) is older than the choice of g(40), x(41) comes out of it."""
     modes = twin.modes.copy()
     modes[40] = 1 - modes[40]
-    outcome = check(stored(flip(twin.states, state_step, 0, 0), modes))
-    assert str(outcome.difference).startswith(first)
+    outcome = checked(twin, tmp_path, states=flipped(twin.states, state_step, 0, 0), modes=modes)
+    assert outcome.difference.startswith(first)
 
 
-def test_missing_states_are_counted_and_do_not_differ(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
+def test_missing_states_are_counted_and_do_not_differ(twin: Trajectory, noisy: Trajectory, tmp_path: Path) -> None:
     states = twin.states.copy()
     states[100:, 1] = np.nan
-    outcome = check(stored(states))
-    assert outcome.difference is None
-    assert outcome.missing == len(states) - 100
-    assert outcome.compared == states.shape[0] * 3 - outcome.missing
+    outcome = checked(twin, tmp_path, states=states)
+    assert (outcome.difference, outcome.missing, outcome.compared) == (None, 301, 401 * 3 - 301)
+    published, states = noisy.published.copy(), noisy.states.copy()
+    published[300:, 1], states[350:, 2] = np.nan, np.nan
+    outcome = checked(noisy, tmp_path / "noisy", published=published, states=states)
+    assert (outcome.difference, outcome.missing) == (None, 101 + 51)
 
 
-def test_another_seed_differs_at_once(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
+def test_another_seed_differs_at_once(twin: Trajectory, tmp_path: Path) -> None:
     other = simulate(twin.record.experiment.with_run(seed=6))
-    assert str(check(stored(other.states)).difference).startswith("agent 1 at step 0")
+    assert checked(twin, tmp_path, states=other.states).difference.startswith("agent 1 at step 0")
+
+
+def test_published(noisy: Trajectory, tmp_path: Path) -> None:
+    published = noisy.published.copy()
+    published[30, 1, 1] = np.nextafter(published[30, 1, 1], 9.0)
+    published[31, 0] += 1.0
+    assert checked(noisy, tmp_path, published=published).difference == (
+        f"agent 2 at step 30, replica 2: published {float(published[30, 1, 1])!r}, "
+        f"the law gives {float(noisy.published[30, 1, 1])!r}"
+    )
+
+
+def test_losses(noisy: Trajectory, tmp_path: Path) -> None:
+    """Step 50 leads to x(51). Agent 2 hears agents 1 and 3 in both graphs."""
+    lost, states = noisy.lost.copy(), noisy.states.copy()
+    lost[50, 1, 1] ^= True
+    words = ("heard", "lost") if noisy.lost[50, 1, 1] else ("lost", "heard")
+    states[51, 0, 0] += 1.0
+    assert checked(noisy, tmp_path, lost=lost, states=states).difference == (
+        f"the message of agent 3 to agent 2 in step 50: logged as {words[0]}, the seed gives {words[1]}"
+    )
+    states[50, 0, 0] += 1.0
+    assert checked(noisy, tmp_path / "earlier", lost=lost, states=states).difference.startswith("agent 1 at step 50")

@@ -1,23 +1,19 @@
 """The twin with all that can happen to messages, in both paces: against loops over numbers, from the definitions."""
 
-from __future__ import annotations
-
+import dataclasses
 import functools
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from links_by_hand import assert_by_hand
 
-from msg_analysis.arithmetic import update_law
-from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
-from msg_analysis.experiment.experiment import ValidExperiment
+from experiments import Trajectory, ValidExperiment, check, claimed, predict, simulate, stored
 from msg_analysis.model.agent_law import agent_law
+from msg_analysis.model.phases import phases
 from msg_analysis.model.reception import LOST
-from msg_analysis.model.run import Trajectory
-from msg_analysis.twin.check import check
-from msg_analysis.twin.simulate import simulate
+from msg_analysis.report.documents import describe_transient
 
 BY_LINK = {"default": 0.1, "edges": [[2, 3, 0.6]], "arcs": [[1, 2, 0.0], [2, 1, 0.8]]}
 AIRS: dict[str, dict[str, Any]] = {
@@ -40,7 +36,18 @@ LAWS: dict[str, dict[str, Any]] = {
     "correlated": {"process": {"a": CORRELATED, "b": [0.5, 0.1, 0.0, 1.0]}},
     "tracking": {"problem": "tracking", "leaders": {"agents": [2], "gain": 0.7, "reference": 2.5}},
     "grounded": {"problem": "tracking", "leaders": {"agents": [3], "gain": "inf", "reference": -1.0}},
+    "noise of grounded leaders by graph": {
+        "problem": "tracking",
+        "leaders": {"agents": [1], "gain": "inf", "reference": -1.0},
+        "process": {"a": 0.3, "b": CORRELATED},
+    },
     "discrete": {"time": "discrete"},
+    "leaders of discrete time alone heard": {
+        "time": "discrete",
+        "problem": "tracking",
+        "leaders": {"agents": [1], "gain": "inf"},
+        "graphs": {"a": {"star": {"center": 1}}, "b": {"star": {"center": 1}}},
+    },
     "metropolis": {"protocol": {"name": "metropolis", "laziness": 0.2}},
     "saturated": {"protocol": {"name": "saturated"}},
     "integral_action": {"protocol": {"name": "integral_action"}},
@@ -76,11 +83,11 @@ def test_equals_loops_over_numbers_to_the_last_bit(pace: str, law: str, air: str
     assert_by_hand(run(law, air, pace))
 
 
-@pytest.mark.parametrize("air", ["all", "late and lost", "bursts, hold"])
-@pytest.mark.parametrize("pace", PACES)
-def test_so_does_numpy(pace: str, air: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(update_law, "COMPILED", False)
-    assert_by_hand(simulate(experiment("consensus", air, pace)))
+@pytest.mark.parametrize("replicas", [1, 3])
+@pytest.mark.parametrize("law", ["correlated", "grounded"])
+def test_so_do_other_numbers_of_replicas(law: str, replicas: int) -> None:
+    assert_by_hand(simulate(experiment(law, "plain", replicas=replicas)))
+    assert_by_hand(simulate(experiment(law, "by link", replicas=replicas)))
 
 
 @pytest.mark.parametrize("pace", PACES)
@@ -92,9 +99,12 @@ def test_a_past_ends_where_the_run_begins(pace: str) -> None:
     assert not np.array_equal(trajectory.states[0], run("consensus", "plain", pace).states[0])
 
 
-@pytest.mark.parametrize("law", ["consensus", "integral_action"])
-@pytest.mark.parametrize("air", ["all", "late and lost", "bursts", "hold"])
 @pytest.mark.parametrize("resumed", [0, 1, 255, 256, 300])
+@pytest.mark.parametrize(
+    ("law", "air"),
+    [(law, "plain") for law in LAWS]
+    + [(law, air) for law in ("consensus", "integral_action") for air in ("all", "late and lost", "bursts", "hold")],
+)
 def test_agents_alone_equal_the_whole(law: str, air: str, resumed: int) -> None:
     """Also those that go on from some step, and know nothing of what was before."""
     trajectory = run(law, air)
@@ -107,14 +117,13 @@ def test_agents_alone_equal_the_whole(law: str, air: str, resumed: int) -> None:
         for k, g in list(enumerate(trajectory.modes.tolist()))[resumed:]:
             assert agent.published(k, agent.state) == published[k, i].tobytes()
             senders = agent.neighbours(g)
-            assert agent.air is not None
-            heard = [published[agent.air.needed(j, k), j].tobytes() for j in senders]
+            heard = [published[agent.air.needed(j, k) if agent.air else k, j].tobytes() for j in senders]
             assert agent.advance(g, heard) == trajectory.states[k + 1, i].tobytes()
             newest = max(0, k - delay)
-            used = (
-                [newest] * len(senders) if trajectory.used is None else trajectory.used[k, i, : len(senders)].tolist()
-            )
-            if trajectory.lost is not None and trajectory.used is None:
+            used = [newest] * len(senders)
+            if trajectory.used is not None:
+                used = trajectory.used[k, i, : len(senders)].tolist()
+            elif trajectory.lost is not None:
                 used = [-1 if gone else newest for gone in trajectory.lost[k, i, : len(senders)]]
             expected = tuple(LOST if step < 0 else step for step in used)
             assert agent.heard == (() if set(used) <= {newest} else expected)
@@ -123,29 +132,24 @@ def test_agents_alone_equal_the_whole(law: str, air: str, resumed: int) -> None:
 @pytest.mark.parametrize("air", AIRS)
 @pytest.mark.parametrize("law", ["consensus", "integral_action"])
 @pytest.mark.parametrize("pace", PACES)
-def test_bags_keep_all_of_it(pace: str, law: str, air: str, tmp_path: Any) -> None:
+def test_bags_keep_all_of_it(pace: str, law: str, air: str, tmp_path: Path) -> None:
     """Written, read and checked."""
     twin = run(law, air, pace)
-    write_trajectory(twin, tmp_path / "bag")
-    read = read_bag(tmp_path / "bag")
+    read = stored(twin, tmp_path)
     outcome = check(read)
     assert (outcome.difference, outcome.missing, outcome.compared) == (None, 0, twin.completeness.expected)
+    in_lockstep = np.concatenate([np.full((1, 4), -1), np.repeat(twin.modes[:, None], 4, axis=1)])
+    twin = dataclasses.replace(twin, agent_modes=in_lockstep) if twin.agent_modes is None else twin
     for key in ("states", "published", "lost", "used", "made", "agent_modes"):
-        one, other = getattr(twin, key), getattr(read, key)
-        if key != "agent_modes" or one is not None:
-            assert (one is None) == (other is None), key
-        if one is not None:
-            np.testing.assert_array_equal(one, other, err_msg=key)
+        np.testing.assert_array_equal(getattr(twin, key), getattr(read, key), err_msg=key)
 
 
-def test_another_value_than_the_last_one_heard_is_found(tmp_path: Any) -> None:
+def test_another_value_than_the_last_one_heard_is_found(tmp_path: Path) -> None:
     twin = simulate(experiment("consensus", "hold"))
-    assert twin.used is not None
     place = tuple(int(i) for i in np.argwhere(twin.used > 3)[40])
     step, agent, which = place
     twin.used[place] -= 1
-    write_trajectory(twin, tmp_path / "bag")
-    difference = check(read_bag(tmp_path / "bag")).difference
+    difference = check(stored(twin, tmp_path)).difference
     sender = int(twin.record.model.neighbours(int(twin.modes[step]), agent)[which]) + 1
     assert difference == (
         f"the value of agent {sender} that agent {agent + 1} used in step {step}: logged as that of step "
@@ -153,13 +157,40 @@ def test_another_value_than_the_last_one_heard_is_found(tmp_path: Any) -> None:
     ) or (difference or "").startswith(f"the message of agent {sender} to agent {agent + 1} in step {step}")
 
 
-def test_a_lost_message_that_was_used_in_real_time_is_found(tmp_path: Any) -> None:
-    twin = simulate(experiment("consensus", "own", "realtime"))
-    assert twin.used is not None
-    step, agent, which = (int(i) for i in np.argwhere((twin.used[1:] < 0) & (twin.used[:-1] >= 0))[0] + [1, 0, 0])
-    model = twin.record.model
-    if which < len(model.neighbours(int(twin.modes[step]), agent)):
-        twin.used[step, agent, which] = step
-        difference = check(twin).difference
-        assert difference is not None
-        assert "which the seed loses" in difference or "the law gives" in difference
+def test_lost_messages_that_were_used_in_real_time_are_found() -> None:
+    plain, lossy = (experiment("consensus", air, "realtime") for air in ("plain", "own"))
+    assert "which the seed loses" in check(claimed(simulate(plain), lossy)).difference
+
+
+@pytest.mark.parametrize("law", ["consensus", "correlated", "tracking"])
+@pytest.mark.parametrize("seed", [8, 9, 10])
+def test_agents_one_after_the_other(law: str, seed: int) -> None:
+    """In real time, in the order of their phases, with what the others have just made."""
+    what = experiment(law, "plain", "realtime", seed=seed)
+    trajectory, offsets = simulate(what), phases(what)
+    laws = [agent_law(trajectory.record, trajectory.record.model, i) for i in range(4)]
+    newest, step_of = [state.tobytes() for state in trajectory.record.start], [0] * 4
+    for k, mode in enumerate(trajectory.modes.tolist()):
+        for i in np.argsort(offsets).tolist():
+            neighbours, used = laws[i].neighbours(mode), trajectory.used[k, i].tolist()
+            assert used == [step_of[j] for j in neighbours] + [-1] * (len(used) - len(neighbours))
+            newest[i] = laws[i].advance(mode, [newest[j] for j in neighbours])
+            step_of[i] = k + 1
+            assert newest[i] == trajectory.states[k + 1, i].tobytes()
+            assert trajectory.made[k + 1, i] == pytest.approx((k + offsets[i]) * 5e7, abs=1)
+    assert (trajectory.agent_modes[1:] == trajectory.modes[:, None]).all()
+    assert (trajectory.made[0] == 0).all()
+    assert trajectory.completeness.complete
+
+
+def test_phases_are_spread_over_the_period() -> None:
+    found = {tuple(phases(experiment("consensus", "plain", "realtime", seed=seed))) for seed in range(200)}
+    assert len(found) == 24  # all orders of four agents
+    assert {tuple(sorted(phase)) for phase in found} == {(0.125, 0.375, 0.625, 0.875)}
+
+
+def test_transients_are_those_of_the_sequential_law() -> None:
+    what = experiment("consensus", "plain", "realtime", start="zero")
+    document, steady = describe_transient(what, np.array([0.0, 1.0, 400.0])), predict(what).emulated.system_error
+    assert document["steady_system_error"] == pytest.approx(steady)
+    assert document["system_error"][2] == pytest.approx(steady)

@@ -1,7 +1,5 @@
 """Long runs: in files, and block after block, with memory for one block."""
 
-from __future__ import annotations
-
 import dataclasses
 import tracemalloc
 from collections.abc import Callable
@@ -12,16 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from experiments import Observation, ValidExperiment, check, compare, flipped, line_ring, new_record, simulate, stored
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import in_file
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.inference.verdict import compare
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.reception import MessagesUsed
-from msg_analysis.twin.check import check
-from msg_analysis.twin.simulate import new_record, simulate
 
 RUNS: dict[str, dict[str, Any]] = {
     "lost": {"noise": {"loss": 0.3}},
@@ -44,13 +37,8 @@ RUNS: dict[str, dict[str, Any]] = {
 
 def experiment(case: str, steps: int, replicas: int = 2) -> ValidExperiment:
     changes = RUNS[case]
-    document: dict[str, Any] = {
-        "name": "long",
-        "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
-        "switching": {"generator": [[-1, 1], [1, -1]]},
-    }
-    run = {"dt": 0.05, "duration": 0.05 * steps, "replicas": replicas, "seed": 5} | changes.get("run", {})
-    return ValidExperiment.parse(document | changes | {"run": run})
+    run = {"duration": 0.05 * steps, "replicas": replicas, "seed": 5} | changes.get("run", {})
+    return line_ring(5, **changes | {"run": run})
 
 
 @pytest.mark.parametrize("case", RUNS)
@@ -62,18 +50,11 @@ def test_the_same_in_files(case: str, tmp_path: Path, monkeypatch: pytest.Monkey
     again = simulate(what, record=twin.record)
     for name in ("states", "published", "lost", "used", "made", "agent_modes"):
         one, other = getattr(twin, name), getattr(again, name)
-        assert (one is None) == (other is None), name
-        if one is not None:
-            assert in_file(other)
-            assert not in_file(one)
-            assert np.array_equal(one, other), name
-    write_trajectory(again, tmp_path / "bag")
-    assert check(read_bag(tmp_path / "bag")).difference is None
-    changed = twin.states.copy()
-    changed.view(np.uint64)[551, 3, 1] ^= np.uint64(1)
-    write_trajectory(dataclasses.replace(twin, states=changed), tmp_path / "changed")
-    outcome = check(read_bag(tmp_path / "changed"))
-    assert outcome.difference is not None
+        np.testing.assert_array_equal(one, other, name)
+        assert one is None or in_file(other) > in_file(one), name
+    assert check(stored(again, tmp_path)).difference is None
+    changed = dataclasses.replace(twin, states=flipped(twin.states, 551, 3, 1))
+    outcome = check(stored(changed, tmp_path / "changed"))
     assert outcome.difference.startswith("agent 4 at step 551, replica 2: ")
 
 
@@ -90,10 +71,9 @@ def test_check_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPat
 def test_comparison_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice the steps need at most some numbers more for each; its states alone have 320 bytes."""
     monkeypatch.setattr(arrays, "LARGE", 1)
-    for place in ("observed.observation.BLOCK_NUMBERS", "observed.measurement.BLOCK_NUMBERS"):
-        monkeypatch.setattr(f"msg_analysis.inference.{place}", 4_000)
-    monkeypatch.setattr("msg_analysis.inference.given_path.SMALL_BLOCK", 4_000)
-    monkeypatch.setattr("msg_analysis.inference.pattern_events.CACHED_NUMBERS", 4_000)
+    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 4_000)
+    whole = Observation.of
+    monkeypatch.setattr(Observation, "of", lambda *of: dataclasses.replace(whole(*of), block_numbers=400))
     runs = [simulate(experiment(case, steps, replicas=8)) for steps in (200, 400)]
     for run in runs:  # what is kept for comparisons to come
         compare(run)

@@ -1,7 +1,5 @@
 """The same file and seed give the same run on any processor; what one wrote, another checks."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -14,57 +12,41 @@ import pytest
 import yaml
 from processors import another_processor
 
-from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+import experiments
+from experiments import RunRecord, ValidExperiment, new_record, read_bag, simulate, write_trajectory
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin import simulate as twin_start
-from msg_analysis.twin.simulate import new_record, simulate
 
 PATH_AND_STAR = {"path": {"path": [1, 2, 3, 4, 5, 6]}, "star": {"star": {"center": 2}}}
 SWITCHING = {"generator": [[-1, 1], [2, -2]]}
 CORRELATED = [[1.0 if i == j else 0.3 / (1 + i + 2 * j) for j in range(6)] for i in range(6)]
+DISCRETE = {
+    "time": "discrete",
+    "switching": {"transition": [[0.9, 0.1], [0.4, 0.6]]},
+    "run": {"dt": 1, "duration": 300},
+}
 CASES: dict[str, dict[str, Any]] = {
     "consensus": {"noise": {"process": CORRELATED}},
     "tracking": {"problem": "tracking", "leaders": {"agents": [3], "gain": 1.0, "reference": 2.0}},
     "grounded": {"problem": "tracking", "leaders": {"agents": [3], "gain": "inf", "reference": 2.0}},
     "on air": {"noise": {"process": 1.0, "broadcast": 0.3, "link": 0.2, "loss": 0.1}},
     "real time": {"run": {"pace": "realtime"}},
-    "discrete": {
-        "time": "discrete",
-        "switching": {"transition": [[0.9, 0.1], [0.4, 0.6]]},
-        "run": {"dt": 1, "duration": 300},
-    },
-    "discrete tracking": {
-        "time": "discrete",
-        "problem": "tracking",
-        "leaders": {"agents": [3], "gain": 2.0, "reference": 1.0},
-        "switching": {"transition": [[0.9, 0.1], [0.4, 0.6]]},
-        "run": {"dt": 1, "duration": 300},
-    },
-    "a protocol": {
-        "time": "discrete",
-        "protocol": {"name": "metropolis"},
-        "switching": {"transition": [[0.9, 0.1], [0.4, 0.6]]},
-        "run": {"dt": 1, "duration": 300},
-    },
+    "discrete": DISCRETE,
+    "discrete tracking": {"problem": "tracking", "leaders": {"agents": [3], "gain": 2.0, "reference": 1.0}, **DISCRETE},
+    "a protocol": {"protocol": {"name": "metropolis"}, **DISCRETE},
 }
 WRITE = """
 import sys
 from pathlib import Path
-from msg_analysis.bags.run_writer import write_trajectory
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.twin.simulate import simulate
+from experiments import ValidExperiment, simulate, write_trajectory
 for file in map(Path, sys.argv[1:]):
     write_trajectory(simulate(ValidExperiment.load(file)), file.with_suffix(""))
 """
 
 
 def document(changes: dict[str, Any]) -> dict[str, Any]:
-    run = {"dt": 0.05, "duration": 15, "replicas": 2, "seed": 7} | changes.get("run", {})
-    base = {"name": "net", "problem": "consensus", "time": "continuous", "graphs": PATH_AND_STAR}
-    return {**base, "switching": SWITCHING, **changes, "run": run}
+    run = {"duration": 15, "seed": 7} | changes.get("run", {})
+    return experiments.document(**{"graphs": PATH_AND_STAR, "switching": SWITCHING} | changes | {"run": run})
 
 
 def test_a_run_is_the_same_on_another_processor(tmp_path: Path) -> None:
@@ -101,8 +83,6 @@ def test_the_record_carries_the_matrices(case: str, tmp_path: Path) -> None:
     record = new_record(ValidExperiment.parse(document(CASES[case])))
     write_trajectory(simulate(record.experiment, record=record), tmp_path / "bag")
     again = read_bag(tmp_path / "bag").record
-    assert record.matrices is not None
-    assert again.matrices is not None
     assert np.array_equal(again.matrices.weights, record.matrices.weights)
     assert np.array_equal(again.matrices.noise_gain, record.matrices.noise_gain)
     assert np.array_equal(again.step_model.nominal, record.step_model.nominal)

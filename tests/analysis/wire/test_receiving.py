@@ -1,7 +1,5 @@
 """Which bytes on the topics of a run are taken, and why others are refused."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import uuid
@@ -11,25 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from experiments import RunRecord, line_ring, new_record
 from msg_analysis.messages.acceptance import Refusal, RunRules, decode_of_run, sign, state_frame, state_receiver
 from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, encode_string
 from msg_analysis.messages.topics import END, PROGRESS, RESEND
 from msg_analysis.model.graph_path import Sojourn, sojourns
-from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import first_graph
-from msg_analysis.twin.simulate import new_record
 
-RECORD = new_record(
-    ValidExperiment.parse(
-        {
-            "name": "pair",
-            "graphs": {"line": {"path": [1, 2]}},
-            "run": {"dt": 0.1, "duration": 1, "start": "zero", "replicas": 2},
-        }
-    ),
-    uuid.UUID(int=4),
-)
+PAIR = {"graphs": {"line": {"path": [1, 2]}}, "switching": {}, "run": {"dt": 0.1, "duration": 1, "start": "zero"}}
+RECORD = new_record(line_ring(**PAIR), uuid.UUID(int=4))
 RUN, OTHER = RECORD.run.bytes, uuid.UUID(int=5).bytes
 
 
@@ -88,16 +76,7 @@ def test_longest_message(changes: dict[str, Any], listed: int) -> None:
     assert state_frame(record, whole=True).size == len(state()) + 8 * listed
 
 
-SWITCHING = new_record(
-    ValidExperiment.parse(
-        {
-            "name": "net",
-            "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
-            "switching": {"generator": [[-1, 1], [1, -1]]},
-            "run": {"dt": 0.05, "duration": 50, "start": "zero"},
-        }
-    )
-)
+SWITCHING = new_record(line_ring(run={"duration": 50, "start": "zero", "replicas": 1}))
 PATH = list(sojourns(SWITCHING.experiment, first_graph(SWITCHING.experiment)))
 
 
@@ -163,7 +142,6 @@ def test_the_record_is_compared() -> None:
 def test_what_steers_a_run_is_signed() -> None:
     """The signature is HMAC-SHA256 (RFC 2104) of topic and message, as hashlib has it."""
     rules, message = RunRules(RECORD), Progress(7, RUN, 2, 3)
-    assert RECORD.key is not None
     assert rules.progress(message.encode(), PROGRESS) == Refusal.NOT_SIGNED
     signed = sign(message, PROGRESS, RECORD.key)
     block = RECORD.key.ljust(64, b"\0")

@@ -1,24 +1,23 @@
-"""The page of the runs in a browser: at a desk and on a phone, light and dark, with keys alone."""
-
-from __future__ import annotations
+"""The pages of runs and of sweeps in a browser: at a desk and on a phone, light and dark, with keys alone."""
 
 import math
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from browser import FAINT, Log, Tab
+import yaml
+from browser import CUT, FAINT, Log, Tab
 
 from msg_analysis import Experiment
-from msg_analysis.report.list_pages import write_runs_page
+from msg_analysis.report.figures import shifted
+from msg_analysis.report.list_pages import write_runs_page, write_sweep_page
 from msg_analysis.runs import RunEntry
+from msg_analysis.sweep.grid import axis_name, column_words, load_sweep
 
-DOCUMENT = {
-    "name": "line",
-    "graphs": {"line": {"path": [1, 2, 3]}},
-}
-CUT = """() => [...document.querySelectorAll("body *")].filter((one) => {
+DOCUMENT = {"name": "line", "graphs": {"line": {"path": [1, 2, 3]}}}
+CUT_OFF = """() => [...document.querySelectorAll("body *")].filter((one) => {
     const {left, right} = one.getBoundingClientRect();
     return one.checkVisibility() && !one.closest("thead, svg") && (right > window.innerWidth + 0.5 || left < -0.5);
 }).length"""
@@ -74,7 +73,7 @@ def test_nothing_is_cut_or_pale(tab: Tab, file: Path, width: int, scheme: str) -
     page.focus("#plot")
     page.keyboard.press("End")
     assert page.evaluate("document.documentElement.scrollWidth") <= width
-    assert page.evaluate(CUT) == 0
+    assert page.evaluate(CUT_OFF) == 0
     assert page.evaluate(FAINT) == []
     dark = page.evaluate("getComputedStyle(document.body).backgroundColor") != "rgb(255, 255, 255)"
     assert dark == (scheme == "dark")
@@ -145,3 +144,97 @@ def test_keys_reach_everything(tab: Tab, file: Path) -> None:
     ]
     assert page.evaluate("getComputedStyle(plot).outlineStyle") == "solid"
     assert log.complaints == []
+
+
+EXPERIMENT = {
+    "name": "made_up",
+    "graphs": {"<b>$$x$$": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
+    "switching": {"rates": {"<b>$$x$$": {"ring": 1}, "ring": {"<b>$$x$$": 1}}},
+}
+
+
+def page_of(directory: Path, over: dict[str, list[Any]], fails: Any = None) -> Path:
+    """A page with made-up results; none where the last key has the value ``fails``."""
+    file = directory / "made_up.yaml"
+    file.write_text(yaml.safe_dump({"experiment": EXPERIMENT, "kind": "simulate", "over": over}, sort_keys=False))
+    sweep = load_sweep(file)
+    rows = []
+    for number, point in enumerate(sweep.points, start=1):
+        row = {"point": number, **point.values, "reason": None}
+        if list(point.values.values())[-1] == fails:
+            row["reason"] = "<i>broke</i>"
+        else:
+            measured = {"measured": float(number), "predicted": number + 0.25, "standard_error": 0.5}
+            row |= {f"system_error.{key}": value for key, value in measured.items()}
+        rows.append(row)
+    return write_sweep_page(sweep, rows, None, "made up", "agrees", directory)
+
+
+KEYS = {"switching.rates.<b>$$x$$.ring": [0.1, 1, 10], "noise.loss": [0, 0.5, 0.9], "run.dt": [0.05, 0.1]}
+
+
+def with_arrow(page: Any) -> None:
+    """The first value of the first line, by the keyboard."""
+    page.wait_for_selector("body[data-ready=yes]")
+    page.focus("[data-name=lines_0_0]")
+    page.keyboard.press("ArrowRight")
+    said = page.inner_text("#point-lines_0_0")
+    assert said.startswith("switching rate from <b>$$x$$ to ring = 0.1")
+    assert "1 ± 0.98 (95 %), predicted 1.25" in said
+    page.keyboard.press("Escape")
+    assert page.inner_text("#point-lines_0_0") == ""
+
+
+def test_one_key(tab: Tab, tmp_path: Path) -> None:
+    path = page_of(tmp_path, dict(list(KEYS.items())[:1]))
+    page, log = tab.open(path.as_uri(), width=390, height=800, scheme="light")
+    with_arrow(page)
+    assert page.locator("[data-name^=map_], #along input").count() == 0
+    assert (log.complaints, log.requests) == ([], [path.as_uri()])
+
+
+def test_three_keys_and_the_pointer(tab: Tab, tmp_path: Path) -> None:
+    """Lines over each key; a heat map over two; beside each other for the values of a third."""
+    path = page_of(tmp_path, KEYS, fails=0.1)
+    page, log = tab.open(path.as_uri(), width=390, height=800, scheme="dark")
+    with_arrow(page)
+    assert (page.locator("[data-name^=map_]").count(), page.locator("#along input").count()) == (2, 3)
+    page.check("#along input >> nth=1")
+    page.wait_for_selector("[data-name=lines_1_0]")
+    assert not page.is_visible("[data-name=lines_0_0]")
+    for width in (390, 1280):
+        page.set_viewport_size({"width": width, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)
+            assert page.evaluate(CUT) == []
+            assert page.evaluate(FAINT) == []
+    page.locator("[data-name=map_0_0]").scroll_into_view_if_needed()
+    page.locator("[data-name=map_0_0] .figure:not(:empty)").wait_for()
+    page.wait_for_selector("body[data-ready=yes]")
+    box = page.locator("[data-name=map_0_0]").bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.locator(".bk-Tooltip", has_text="loss of messages").first.wait_for()
+    assert "<i>broke</i>" in page.inner_text(".verdict")
+    assert (log.complaints, log.requests) == ([], [path.as_uri()])
+
+
+def test_names_of_keys_and_columns() -> None:
+    assert axis_name("run.dt") == "step length dt [run.dt]"
+    assert axis_name("noise.process[3]") == "process noise of agent 3 [noise.process[3]]"
+    assert axis_name("graphs.a.path") == "graphs.a.path"
+    assert column_words("node_errors[3]") == "error of agent 3"
+    assert column_words("emulated.system_error") == "system error, with steps"
+    assert column_words("node_errors") == "node_errors"
+
+
+@pytest.mark.parametrize("logarithmic", [False, True])
+def test_points_of_series_side_by_side(logarithmic: bool) -> None:
+    """No two at the same place, none past the middle between two values."""
+    values = np.array([1.0, 2.0, 4.0])
+    drawn = np.array([shifted(values, values, i, 8, logarithmic=logarithmic) for i in range(8)])
+    assert (np.diff(drawn, axis=0) > 0).all()
+    middles = np.sqrt(values[1:] * values[:-1]) if logarithmic else (values[1:] + values[:-1]) / 2
+    assert (drawn[:, :-1] < middles).all()
+    assert (drawn[:, 1:] > middles).all()
+    np.testing.assert_array_equal(shifted(values, values, 0, 1, logarithmic=logarithmic), values)

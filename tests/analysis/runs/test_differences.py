@@ -1,6 +1,4 @@
-"""What differs between two bags, against changes made by hand."""
-
-from __future__ import annotations
+"""What differs between two bags, against changes made by hand; and between two experiments."""
 
 import dataclasses
 import json
@@ -11,18 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from experiments import document
 from msg_analysis import Experiment, Run
 from msg_analysis.common.text import json_text
-from msg_analysis.report import differences
-from msg_analysis.report.differences import bag_difference, graph_difference, measured, relative
+from msg_analysis.report.differences import bag_difference, experiment_difference, graph_difference, measured, relative
 from msg_analysis.report.differences import state_difference as of_states
+from msg_analysis.report.documents import describe_transient
 
-DOCUMENT = {
-    "name": "four",
-    "graphs": {"line": {"path": [1, 2, 3, 4]}, "ring": {"cycle": [1, 2, 3, 4]}},
-    "switching": {"generator": [[-1, 1], [1, -1]]},
-    "run": {"dt": 0.1, "duration": 20, "replicas": 3, "seed": 7, "start": "zero"},
-}
+DOCUMENT = document(4, name="four", run={"dt": 0.1, "replicas": 3, "seed": 7, "start": "zero"})
 
 
 @pytest.fixture(scope="module")
@@ -35,21 +29,18 @@ def changed(run: Run, **changes: Any) -> Run:
     return dataclasses.replace(run, **(copies | changes))
 
 
-@pytest.fixture(params=[None, 60, 1])
-def blocks(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """However few steps are looked at together, the answers are the same."""
-    if request.param:
-        monkeypatch.setattr(differences, "BLOCK_NUMBERS", request.param)
+BLOCKS = pytest.mark.parametrize("block", [10**6, 60, 1])
+"""However few steps are looked at together, the answers are the same."""
 
 
-@pytest.mark.usefixtures("blocks")
-def test_states_that_differ(run: Run) -> None:
+@BLOCKS
+def test_states_that_differ(run: Run, block: int) -> None:
     other = changed(run)
     other.states[50, 2, 1] = np.nextafter(run.states[50, 2, 1], np.inf)
     other.states[50, 3, 0] += 0.25
     other.states[120, 0, 2] -= 8.0
     other.states[200, 1, 1] += 0.5
-    found = of_states(run, other)
+    found = of_states(run, other, block_numbers=block)
     assert found == {
         "compared": 200,
         "why": None,
@@ -64,30 +55,27 @@ def test_states_that_differ(run: Run) -> None:
     }
 
 
-@pytest.mark.usefixtures("blocks")
-def test_equal_missing_and_shorter(run: Run) -> None:
-    same = of_states(run, changed(run))
+@BLOCKS
+def test_equal_missing_and_shorter(run: Run, block: int) -> None:
+    same = of_states(run, changed(run), block_numbers=block)
     assert (same["equal"], same["first"], same["last"]) == (True, None, {"step": 200, "difference": 0.0})
     other = changed(run)
     other.states[3, 1] = np.nan
     other.states[200, 0] = np.nan
-    found = of_states(run, other)
+    found = of_states(run, other, block_numbers=block)
     assert (found["equal"], found["first"], found["only_a"], found["only_b"]) == (False, None, 2, 0)
     assert found["last"] == {"step": 199, "difference": 0.0}
-    assert of_states(other, run)["only_b"] == 2
-    assert of_states(other, changed(other))["equal"]
-    short = of_states(run, changed(run, states=run.states[:100]))
+    assert of_states(other, run, block_numbers=block)["only_b"] == 2
+    assert of_states(other, changed(other), block_numbers=block)["equal"]
+    short = of_states(run, changed(run, states=run.states[:100]), block_numbers=block)
     assert (short["equal"], short["first"], short["compared"]) == (False, None, 99)
 
 
-def test_the_sign_of_zero_is_a_bit(run: Run) -> None:
+def test_the_sign_of_zero_is_a_bit_and_other_networks_are_not_compared(run: Run) -> None:
     other = changed(run)
     other.states[0] = -0.0
     found = of_states(changed(run), other)
     assert found["first"] == {"step": 0, "time": 0.0, "agents": [1, 2, 3, 4], "difference": 0.0}
-
-
-def test_other_networks_are_not_compared(run: Run) -> None:
     found = of_states(run, changed(run, states=run.states[:, :3]))
     assert (found["compared"], found["equal"]) == (None, None)
     assert found["why"] == "4 agents with 3 numbers each and 3 agents with 3 numbers each"
@@ -124,10 +112,7 @@ def test_two_bags(run: Run, tmp_path: Path) -> None:
     other.record.versions["numpy"] = "1.0"
     paths = [run.save(tmp_path / "a"), other.save(tmp_path / "b")]
     found = bag_difference(*paths)
-    assert found["keys"] == [
-        {"key": "run.duration", "a": 20.0, "b": 40.0},
-        {"key": "run.seed", "a": 7, "b": 8},
-    ]
+    assert found["keys"] == [{"key": "run.duration", "a": 20.0, "b": 40.0}, {"key": "run.seed", "a": 7, "b": 8}]
     assert found["versions"] == [{"key": "numpy", "a": run.record.versions["numpy"], "b": "1.0"}]
     assert found["states"]["compared"] == 200
     assert found["states"]["first"]["step"] == 1  # both start at zero
@@ -154,3 +139,70 @@ def test_two_bags(run: Run, tmp_path: Path) -> None:
     (paths[0] / "result.json").write_text(json_text(document | {"verdict": "disagrees", "run": "of another"}))
     assert bag_difference(*paths)["a"]["verdict"] == "agrees"
     json.dumps(again, allow_nan=False)
+
+
+def four(rate: float = 1.0, **changes: Any) -> Experiment:
+    graphs = {"line": {"path": [1, 2, 3, 4]}, "star": {"star": {"center": 2}}}
+    return Experiment.parse(document(4, rate, **{"graphs": graphs, "run": {"dt": 0.1}} | changes))
+
+
+def test_predictions_rates_and_leaders() -> None:
+    a, b = four(), four(5.0)
+    found = experiment_difference(a, b)
+    assert [entry["key"] for entry in found["keys"]] == ["switching.generator"]
+    for law in ("continuous", "emulated", "static"):
+        errors = [getattr(each.predict(), law).system_error for each in (a, b)]
+        pair = found["predictions"][law]["system_error"]
+        assert (pair["a"], pair["b"]) == tuple(errors)
+        assert pair["relative"] == pytest.approx(errors[1] / errors[0] - 1)
+    assert len(found["predictions"]["emulated"]["node_errors"]) == 4
+    rates = [describe_transient(each, np.array([0.0]))["rates"] for each in (a, b)]
+    for key, pair in found["rates"].items():
+        assert (pair["a"], pair["b"]) == (rates[0][key], rates[1][key])
+    assert found["rates"]["graph"]["relative"] == pytest.approx(4.0)
+    for side, each in (("a", a), ("b", b)):
+        error, agents = each.select_leaders(1).sets[0]
+        best = found["leaders"][side]["best"]
+        assert (best["agents"], best["system_error"], best["gain"]) == ([agents[0] + 1], error, "inf")
+        assert found["leaders"][side]["agents"] is None
+    json.dumps(found, allow_nan=False)
+
+
+def test_one_with_leaders_and_one_without() -> None:
+    """The best set of the other is as large, and has the same gain."""
+    led = four(problem="tracking", leaders={"agents": [1, 4], "gain": 2.0})
+    found = experiment_difference(four(), led)["leaders"]
+    assert found["b"]["agents"] == [1, 4]
+    assert found["b"]["system_error"] == led.select_leaders().present[0]  # type: ignore[index]
+    assert [len(found[side]["best"]["agents"]) for side in "ab"] == [2, 2]
+    assert [found[side]["best"]["gain"] for side in "ab"] == [2.0, 2.0]
+
+
+def test_other_sizes_and_laws() -> None:
+    """What only one has stands alone."""
+    small = four(
+        time="discrete", graphs={"line": {"path": [1, 2, 3]}}, switching={"transition": [[1.0]]}, run={"duration": 20}
+    )
+    found = experiment_difference(four(), small)
+    assert set(found["predictions"]) == {"continuous", "emulated", "discrete", "static"}
+    assert found["predictions"]["discrete"]["system_error"]["a"] is None
+    assert found["predictions"]["static"]["node_errors"] == []
+    assert found["rates"]["graph"]["b"] is None
+
+
+def test_one_without_a_prediction() -> None:
+    """It has a reason, and the other its numbers."""
+    saturated = four(protocol={"name": "saturated"}, run={"dt": 0.1, "duration": 20, "start": "zero"})  # not linear
+    found = experiment_difference(saturated, four())
+    assert found["a"]["unpredicted"]
+    assert found["leaders"]["a"]["note"] == "no prediction"
+    assert found["predictions"]["emulated"]["system_error"]["a"] is None
+    assert found["predictions"]["emulated"]["system_error"]["b"] > 0
+
+
+def test_many_sets_of_leaders_are_not_searched() -> None:
+    ring = {"graphs": {"ring": {"cycle": list(range(1, 31))}}, "switching": {}}
+    led = four(problem="tracking", leaders={"agents": [1, 2, 3], "gain": 2.0}, **ring)
+    found = experiment_difference(led, led)
+    assert found["keys"] == []
+    assert "msg-analysis leaders" in found["leaders"]["a"]["note"]
