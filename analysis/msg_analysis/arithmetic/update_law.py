@@ -49,6 +49,46 @@ def step(weights: Sequence[float | FloatArray], values: Sequence[FloatArray], dr
     return total
 
 
+_DOUBLE = np.dtype("<f8")
+
+
+def to_payload(state: FloatArray) -> bytes:
+    """Bytes of a state (replicas,) of float64."""
+    return state.astype(_DOUBLE, copy=False).tobytes()
+
+
+def from_payload(payload: bytes) -> FloatArray:
+    """State (replicas,) of a payload of 8 bytes for each number; read-only."""
+    return np.frombuffer(payload, _DOUBLE)
+
+
+def combine_with_numpy(weights: Sequence[float], payloads: Sequence[bytes], drive: bytes) -> bytes:
+    """``law.step`` on payloads of equal size: sum_j weights[j] payloads[j], term after term, plus the drive.
+
+    The kernel accepts only a tuple of weights (at least one) and a list of payloads.
+    """
+    return to_payload(step(weights, [from_payload(payload) for payload in payloads], from_payload(drive)))
+
+
+def all_finite_with_numpy(payload: bytes) -> bool:
+    """Whether all numbers of a payload are finite."""
+    return bool(np.isfinite(from_payload(payload)).all())
+
+
+combine: Callable[[Sequence[float], Sequence[bytes], bytes], bytes]
+"""The update law on payloads: the kernel's, or ``combine_with_numpy``."""
+
+all_finite: Callable[[bytes], bool]
+"""Whether all numbers of a payload are finite: the kernel's, or ``all_finite_with_numpy``."""
+
+try:
+    from msg_analysis.arithmetic import _kernel
+except ImportError:  # there was no compiler when this was installed
+    COMPILED, combine, all_finite = False, combine_with_numpy, all_finite_with_numpy
+else:
+    COMPILED, combine, all_finite = True, _kernel.combine, _kernel.all_finite
+
+
 @dataclass(frozen=True, slots=True)
 class Round:
     """Agents that can step at once, under one graph, because none uses what another of them makes."""
@@ -162,43 +202,3 @@ class ManySteps:
                     reception.hold(k, states, agents)
                     values = reception.heard(k, states, agents, rows % m)
                 both[m + agents] = step(weights, values, drives[k, agents])
-
-
-_DOUBLE = np.dtype("<f8")
-
-
-def to_payload(state: FloatArray) -> bytes:
-    """Bytes of a state (replicas,) of float64."""
-    return state.astype(_DOUBLE, copy=False).tobytes()
-
-
-def from_payload(payload: bytes) -> FloatArray:
-    """State (replicas,) of a payload of 8 bytes for each number; read-only."""
-    return np.frombuffer(payload, _DOUBLE)
-
-
-def combine_with_numpy(weights: Sequence[float], payloads: Sequence[bytes], drive: bytes) -> bytes:
-    """``law.step`` on payloads of equal size: sum_j weights[j] payloads[j], term after term, plus the drive.
-
-    The kernel accepts only a tuple of weights (at least one) and a list of payloads.
-    """
-    return to_payload(step(weights, [from_payload(payload) for payload in payloads], from_payload(drive)))
-
-
-def all_finite_with_numpy(payload: bytes) -> bool:
-    """Whether all numbers of a payload are finite."""
-    return bool(np.isfinite(from_payload(payload)).all())
-
-
-combine: Callable[[Sequence[float], Sequence[bytes], bytes], bytes]
-"""The update law on payloads: the kernel's, or ``combine_with_numpy``."""
-
-all_finite: Callable[[bytes], bool]
-"""Whether all numbers of a payload are finite: the kernel's, or ``all_finite_with_numpy``."""
-
-try:
-    from msg_analysis.arithmetic import _kernel
-except ImportError:  # there was no compiler when this was installed
-    COMPILED, combine, all_finite = False, combine_with_numpy, all_finite_with_numpy
-else:
-    COMPILED, combine, all_finite = True, _kernel.combine, _kernel.all_finite

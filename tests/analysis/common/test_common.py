@@ -18,12 +18,12 @@ import scipy.linalg  # its library of linear algebra is another one than that of
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from msg_analysis.common.forked_processes import LONGEST, MOST_DESCRIPTORS, _messages
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from experiments import compare, line_ring, read_bag, simulate, write_trajectory
 from msg_analysis.cli.console import SweepProgress, WorkProgress
 from msg_analysis.common.files import DEEPEST, MOST_REPEATED, load_yaml, read_text, write_whole
-from msg_analysis.common.forked_processes import LONGEST, MOST_DESCRIPTORS, _messages
 from msg_analysis.common.resources import LARGE, few_blas_threads, tell, watched
 from msg_analysis.common.text import duration_text
 

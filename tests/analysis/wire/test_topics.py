@@ -25,7 +25,7 @@ from msg_analysis.messages.schemas import (
     STRING,
     MessageType,
 )
-from msg_analysis.messages.topics import CLOCK, DIAGNOSTICS, STATE, TOPICS, TRUTH, network_topics
+from msg_analysis.messages.topics import STATE, TOPICS, TRUTH, network_topics
 
 DOCS = Path(__file__).parents[3] / "docs"
 
