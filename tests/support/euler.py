@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.protocol import Heard, LinearProtocol, Protocol
 
 DIRECTED = {"a": {"arcs": [[1, 2], [2, 3], [3, 4], [4, 5], [5, 1]]}, "b": {"path": [1, 2, 3, 4, 5]}}
@@ -26,8 +26,8 @@ def document(protocol: dict[str, Any] | None, **changes: Any) -> dict[str, Any]:
     }
 
 
-def experiment(protocol: dict[str, Any] | None, **changes: Any) -> ValidExperiment:
-    return ValidExperiment.parse(document(protocol, **changes))
+def experiment(protocol: dict[str, Any] | None, **changes: Any) -> Experiment:
+    return Experiment.parse(document(protocol, **changes))
 
 
 class Euler(LinearProtocol):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 
-def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> ValidExperiment:
+def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> Experiment:
     """Of one replica; ``run`` is merged, other keys are replaced."""
     run = {"dt": 0.05, "duration": duration, "replicas": 1, "seed": seed} | changes.pop("run", {})
-    return ValidExperiment.parse(
+    return Experiment.parse(
         {
             "name": "net",
             "problem": "consensus",

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory.moments import MomentSolver
 
 LINE_RING = {
@@ -40,7 +40,7 @@ def network(seed, m, n, *, time="continuous", problem="consensus", directed=True
     }
     if problem == "tracking":
         document["leaders"] = {"agents": [1], "gain": 0.8, "reference": 2.0}
-    return ValidExperiment.parse(document)
+    return Experiment.parse(document)
 
 
 def steady_of(system):

@@ -16,7 +16,7 @@ from msg_analysis.arithmetic.step_clock import StepClock
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray, pieces
 from msg_analysis.common.text import agent_text, counted
 from msg_analysis.model.phases import phases
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.report.figures import shorten
 from msg_analysis.report.plot_style import (
     BLACK,
@@ -51,7 +51,7 @@ class Event:
     words: str
 
 
-def run_events(trajectory: Trajectory, reported: Sequence[Mapping[str, Any]] = ()) -> tuple[list[Event], int]:
+def run_events(trajectory: Run, reported: Sequence[Mapping[str, Any]] = ()) -> tuple[list[Event], int]:
     """The events in order of time, and how many more there are; ``reported``: by the network."""
     events = [
         Event(str(one["kind"]), int(one["step"]), int(one["step"]), str(one["words"]))
@@ -77,7 +77,7 @@ def run_events(trajectory: Trajectory, reported: Sequence[Mapping[str, Any]] = (
     return sorted(kept, key=lambda event: (event.first, KINDS.index(event.kind))), more
 
 
-def _late(trajectory: Trajectory) -> Iterable[tuple[int, BoolArray]]:
+def _late(trajectory: Run) -> Iterable[tuple[int, BoolArray]]:
     """Pieces (first step, (steps, m)): which states were made more than a period after they were due."""
     if trajectory.made is None:
         return
@@ -89,7 +89,7 @@ def _late(trajectory: Trajectory) -> Iterable[tuple[int, BoolArray]]:
         yield first, made[first:last] - due > experiment.step_length * 1e9
 
 
-def _missing(trajectory: Trajectory) -> Iterable[tuple[int, BoolArray]]:
+def _missing(trajectory: Run) -> Iterable[tuple[int, BoolArray]]:
     """Pieces (first step, (steps, m)): which states are missing."""
     if not trajectory.completeness.missing:
         return
@@ -193,7 +193,7 @@ class Drawn:
 
 
 def trajectory_plots(
-    trajectory: Trajectory, predicted: float | None, events: Sequence[Event] = ()
+    trajectory: Run, predicted: float | None, events: Sequence[Event] = ()
 ) -> tuple[dict[str, UIElement], Drawn]:
     """The figures by name, empty for a run without states, and what is in them."""
     experiment = trajectory.record.experiment

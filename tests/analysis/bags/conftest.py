@@ -11,8 +11,8 @@ import pytest
 from rosbags.highlevel import anyreader
 from rosbags.rosbag2 import storage_mcap
 
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 
 _QOS = functools.cache(storage_mcap.get_qos)
@@ -27,12 +27,12 @@ def _parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def make_run() -> Callable[..., Trajectory]:
+def make_run() -> Callable[..., Run]:
     """A trajectory with random states; no theory in it."""
 
-    def make(agents: int = 3, steps: int = 40, replicas: int = 2, seed: int = 0, name: str = "small") -> Trajectory:
+    def make(agents: int = 3, steps: int = 40, replicas: int = 2, seed: int = 0, name: str = "small") -> Run:
         everybody = list(range(1, agents + 1))
-        experiment = ValidExperiment.parse(
+        experiment = Experiment.parse(
             {
                 "name": name,
                 "problem": "consensus",
@@ -48,6 +48,6 @@ def make_run() -> Callable[..., Trajectory]:
         modes = np.repeat(rng.integers(0, 2, steps // 4 + 1), 4)[:steps]
         record = RunRecord(uuid.UUID(int=rng.integers(1, 2**62).item()), experiment, states[0])
         expected = (steps + 1) * agents
-        return Trajectory(record, states, modes, Completeness(expected, expected, 0))
+        return Run(record, states, modes, Completeness(expected, expected, 0))
 
     return make

@@ -20,9 +20,9 @@ from msg_analysis.bags.reading import read_bag, read_record
 from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import BagError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.report.documents import describe_bag
 from msg_analysis.twin.simulate import simulate
 
@@ -32,7 +32,7 @@ Record = Callable[..., Path]
 
 
 @pytest.fixture(scope="module")
-def run() -> Trajectory:
+def run() -> Run:
     """Long enough for numbers; published with noise, so that there are two topics of states."""
     experiment = {
         "name": "lab",
@@ -41,11 +41,11 @@ def run() -> Trajectory:
         "noise": {"broadcast": 0.3},
         "run": {"dt": 0.05, "duration": 15, "replicas": 2, "seed": 5},
     }
-    return simulate(ValidExperiment.parse(experiment))
+    return simulate(Experiment.parse(experiment))
 
 
 @pytest.fixture
-def record(run: Trajectory, tmp_path: Path, typestore: Any) -> Record:
+def record(run: Run, tmp_path: Path, typestore: Any) -> Record:
     """Record the run again, with rosbags, as of the wall clock: what ``select`` makes of its messages."""
     write_trajectory(run, tmp_path / "ours")
     with AnyReader([tmp_path / "ours"]) as reader:
@@ -75,7 +75,7 @@ def _shuffled(messages: list[Message]) -> list[Message]:
     return random.Random(1).sample(messages, len(messages))
 
 
-def _same(found: Trajectory, run: Trajectory) -> None:
+def _same(found: Run, run: Run) -> None:
     assert found.completeness.complete
     assert np.array_equal(found.states, run.states)
     assert found.published is not None
@@ -85,7 +85,7 @@ def _same(found: Trajectory, run: Trajectory) -> None:
 
 
 @pytest.mark.parametrize("compression", [CompressionMode.NONE, CompressionMode.STORAGE, CompressionMode.FILE])
-def test_in_any_order_by_the_wall_clock(run: Trajectory, record: Record, compression: CompressionMode) -> None:
+def test_in_any_order_by_the_wall_clock(run: Run, record: Record, compression: CompressionMode) -> None:
     """Log times and arrival say nothing: the verdict is that of our own bag."""
     found = read_bag(record(_shuffled, compression=compression))
     _same(found, run)
@@ -95,7 +95,7 @@ def test_in_any_order_by_the_wall_clock(run: Trajectory, record: Record, compres
     assert theirs == ours
 
 
-def test_extra_topics_in_a_namespace(run: Trajectory, record: Record) -> None:
+def test_extra_topics_in_a_namespace(run: Run, record: Record) -> None:
     """As `ros2 bag record -a` gives them: /rosout, another program's /experiment, a state that is none."""
     string = "std_msgs/msg/String"
 
@@ -111,7 +111,7 @@ def test_extra_topics_in_a_namespace(run: Trajectory, record: Record) -> None:
     assert topics["/lab/agent_2/truth"] == 301
 
 
-def test_a_missing_beginning(run: Trajectory, record: Record) -> None:
+def test_a_missing_beginning(run: Run, record: Record) -> None:
     """No numbers without x(0), but what there is is said. Latched topics are there: they come to who is late."""
 
     def late(messages: list[Message]) -> list[Message]:
@@ -131,7 +131,7 @@ def test_a_missing_beginning(run: Trajectory, record: Record) -> None:
     assert describe_bag(bag)["completeness"]["stretch"] == (120, 300)
 
 
-def test_a_missing_end(run: Trajectory, record: Record) -> None:
+def test_a_missing_end(run: Run, record: Record) -> None:
     """The numbers are those of the complete beginning."""
     bag = record(lambda messages: [m for m in messages if m[0] in ("/experiment", "/graph")] + messages[: 6 * 220])
     comparison = compare(read_bag(bag))
@@ -175,7 +175,7 @@ STORAGES = [StoragePlugin.MCAP, StoragePlugin.SQLITE3]
 @pytest.mark.parametrize("compression", [CompressionMode.NONE, CompressionMode.MESSAGE, CompressionMode.FILE])
 @pytest.mark.parametrize("storage", STORAGES)
 def test_every_storage_and_compression(
-    run: Trajectory, record: Record, compression: CompressionMode, storage: StoragePlugin
+    run: Run, record: Record, compression: CompressionMode, storage: StoragePlugin
 ) -> None:
     """With metadata.yaml and without, from the directory and from the file; compared as ours is."""
     bag = record(_shuffled, compression=compression, storage=storage)
@@ -193,7 +193,7 @@ def test_every_storage_and_compression(
 
 @pytest.mark.parametrize("storage", STORAGES)
 def test_a_message_that_cannot_be_unpacked(
-    run: Trajectory, record: Record, storage: StoragePlugin, typestore: Any, tmp_path: Path
+    run: Run, record: Record, storage: StoragePlugin, typestore: Any, tmp_path: Path
 ) -> None:
     """It is refused, and all others are read."""
 
@@ -229,7 +229,7 @@ def test_another_compression_or_storage(record: Record) -> None:
             read_bag(bag)
 
 
-def test_split_without_metadata_and_with_a_lost_file(run: Trajectory, record: Record, tmp_path: Path) -> None:
+def test_split_without_metadata_and_with_a_lost_file(run: Run, record: Record, tmp_path: Path) -> None:
     """Files of one recording, the one in the middle lost, one that was just begun when the machine went off."""
     whole = tmp_path / "split"
     whole.mkdir()
@@ -252,9 +252,7 @@ def test_split_without_metadata_and_with_a_lost_file(run: Trajectory, record: Re
     assert again.completeness.received == found.completeness.received
 
 
-def test_torn_file_that_is_compressed_as_a_whole(
-    run: Trajectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_torn_file_that_is_compressed_as_a_whole(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut or flipped: what could be unpacked up to there counts."""
     monkeypatch.setattr("msg_analysis.bags.writing.CHUNK_SIZE", 3000)
     write_trajectory(run, tmp_path / "bag", Storage("none"))

@@ -18,8 +18,8 @@ from msg_analysis.bags.mcap_chunks import COMPRESSIONS, Compression, Storage
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.model.run import Trajectory
+from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.run import Run
 from msg_analysis.twin.simulate import simulate
 
 AGENTS, STEPS, REPLICAS = 3, 120, 4
@@ -32,7 +32,7 @@ NOISE: dict[str, dict[str, float]] = {
 
 
 @pytest.fixture(scope="module", params=NOISE)
-def run(request: pytest.FixtureRequest) -> Trajectory:
+def run(request: pytest.FixtureRequest) -> Run:
     """A run of the twin, with a second topic of states where they are published with noise."""
     experiment = {
         "name": "peers",
@@ -41,13 +41,13 @@ def run(request: pytest.FixtureRequest) -> Trajectory:
         "noise": NOISE[request.param],
         "run": {"dt": 0.05, "duration": STEPS * 0.05, "replicas": REPLICAS, "seed": 5, "start": "zero"},
     }
-    return simulate(ValidExperiment.parse(experiment))
+    return simulate(Experiment.parse(experiment))
 
 
 @pytest.mark.parametrize("split", [None, 3])
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_every_peer_reads_every_bag(
-    run: Trajectory, compression: Compression, split: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Run, compression: Compression, split: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every message, in the order of time, with the right counts and values, in one file or in several."""
     monkeypatch.setattr("msg_analysis.bags.writing.CHUNK_SIZE", 3000)
@@ -68,7 +68,7 @@ def test_every_peer_reads_every_bag(
     assert found.lost is None or np.array_equal(found.lost, run.lost)
 
 
-def _values(run: Trajectory, bag: Path) -> Counter[str]:
+def _values(run: Run, bag: Path) -> Counter[str]:
     """All messages by rosbags, with the definitions in the bag: right values; their numbers by topic."""
     expected = {"state": run.states if run.published is None else run.published, "truth": run.states}
     found = {kind: np.full_like(states, np.nan) for kind, states in expected.items()}

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 
 from msg_analysis.bags import run_writer
 from msg_analysis.bags.run_writer import write_trajectory
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import simulate
 
 
@@ -25,7 +25,7 @@ def test_the_order_of_messages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
         "noise": {"broadcast": 0.1},
         "run": {"dt": 0.1, "duration": 12, "replicas": 2, "pace": pace},
     }
-    run = simulate(ValidExperiment.parse(document))
+    run = simulate(Experiment.parse(document))
     if run.made is not None:
         random = np.random.default_rng(2)
         late = random.exponential(4e8, (121, 3)) * (random.random((121, 3)) < 0.2)

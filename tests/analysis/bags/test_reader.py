@@ -22,21 +22,21 @@ from msg_analysis.errors import BagError, InputError
 from msg_analysis.inference.verdict import compare
 from msg_analysis.messages.messages import ActiveGraph, AgentState, encode_string
 from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.step_model import build_model
 from msg_analysis.twin.check import check
 
 Message = tuple[str, str, bytes, int]  # topic, type, data, time
-MakeRun = Callable[..., Trajectory]
+MakeRun = Callable[..., Run]
 
 
-def _state(run: Trajectory, k: int, i: int, /, **changes: Any) -> AgentState:
+def _state(run: Run, k: int, i: int, /, **changes: Any) -> AgentState:
     mode = 0 if k == 0 else int(run.modes[k - 1]) + 1
     fields = {"stamp": k * 50_000_000, "run": run.record.run.bytes, "agent": i + 1, "step": k, "mode": mode}
     return AgentState(**(fields | {"state": run.states[k, i]} | changes))
 
 
-def _messages(run: Trajectory, namespace: str = "") -> list[Message]:
+def _messages(run: Run, namespace: str = "") -> list[Message]:
     """What a faithful recorder would have: the experiment, a sojourn every four steps, the states."""
     steps, agents, _ = run.states.shape
     out: list[Message] = [(f"{namespace}/experiment", "std_msgs/msg/String", encode_string(run.record.to_json()), 0)]
@@ -74,7 +74,7 @@ def _mcap(path: Path, messages: Iterable[Message], **options: Any) -> Path:
     return path
 
 
-def _same(found: Trajectory, run: Trajectory) -> None:
+def _same(found: Run, run: Run) -> None:
     assert found.record.run == run.record.run
     assert np.array_equal(found.states, run.states)
     assert np.array_equal(found.modes, run.modes)

@@ -13,10 +13,10 @@ from mcap.writer import Writer
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.bags.salvage import salvage
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.messages import ActiveGraph, AgentState, encode_string
 from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING, MessageType
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.simulate import simulate
 
@@ -26,10 +26,10 @@ Message = tuple[str, MessageType, bytes]
 
 
 @pytest.fixture(scope="module")
-def run() -> Trajectory:
+def run() -> Run:
     """A run of the twin; its states, losses and modes are replaced by what the tests write."""
     return simulate(
-        ValidExperiment.parse(
+        Experiment.parse(
             {
                 "name": "air",
                 "graphs": {"line": {"path": [1, 2, 3]}, "star": {"star": {"center": 1}}},
@@ -41,7 +41,7 @@ def run() -> Trajectory:
     )
 
 
-def heard(run: Trajectory, k: int, agent: int) -> list[int]:
+def heard(run: Run, k: int, agent: int) -> list[int]:
     """As the definition of the message says, at random written out in full where nothing was lost."""
     if k == 0:
         return []
@@ -53,7 +53,7 @@ def heard(run: Trajectory, k: int, agent: int) -> list[int]:
     return [LOST if lost else k - 1 for lost in gone[:number]]
 
 
-def messages(run: Trajectory, change: Callable[..., AgentState] | None = None) -> list[Message]:
+def messages(run: Run, change: Callable[..., AgentState] | None = None) -> list[Message]:
     """What a faithful recorder would have; ``change(state, kind)`` may change states."""
     record: RunRecord = run.record
     out: list[Message] = [("/experiment", STRING, encode_string(record.to_json()))]
@@ -86,20 +86,20 @@ def bag(path: Path, contents: Iterable[Message]) -> Path:
     return path
 
 
-def same(found: Trajectory, run: Trajectory) -> None:
+def same(found: Run, run: Run) -> None:
     for name in ("states", "published", "lost", "modes"):
         assert np.array_equal(getattr(found, name), getattr(run, name)), name
     assert found.completeness == run.completeness
     assert found.completeness.expected == 2 * 3 * (STEPS + 1)
 
 
-def test_faithful(tmp_path: Path, run: Trajectory) -> None:
+def test_faithful(tmp_path: Path, run: Run) -> None:
     assert run.lost is not None
     assert 0 < run.lost.sum() < 100
     same(read_bag(bag(tmp_path / "x.mcap", messages(run))), run)
 
 
-def test_written_and_salvaged(tmp_path: Path, run: Trajectory) -> None:
+def test_written_and_salvaged(tmp_path: Path, run: Run) -> None:
     write_trajectory(run, tmp_path / "bag")
     same(read_bag(tmp_path / "bag"), run)
     salvage(tmp_path / "bag", tmp_path / "again")
@@ -107,7 +107,7 @@ def test_written_and_salvaged(tmp_path: Path, run: Trajectory) -> None:
 
 
 @pytest.mark.parametrize("kind", ["truth", "state"])
-def test_what_is_missing_on_one_topic_is_missing(tmp_path: Path, run: Trajectory, kind: str) -> None:
+def test_what_is_missing_on_one_topic_is_missing(tmp_path: Path, run: Run, kind: str) -> None:
     contents = [m for m in messages(run) if m[0] != f"/agent_2/{kind}"]
     found = read_bag(bag(tmp_path / "x.mcap", contents))
     assert found.completeness.missing == STEPS + 1
@@ -117,7 +117,7 @@ def test_what_is_missing_on_one_topic_is_missing(tmp_path: Path, run: Trajectory
 
 
 @pytest.mark.parametrize("wrong", [[-1, -1, -1], [None] * 1000, [-2, None], [0, None], [10**12, None]])
-def test_what_cannot_have_been_heard_is_refused(tmp_path: Path, run: Trajectory, wrong: list[int | None]) -> None:
+def test_what_cannot_have_been_heard_is_refused(tmp_path: Path, run: Run, wrong: list[int | None]) -> None:
     """By agent 2, who has two neighbours, at a step k that the line led to: steps relative to k, None for a loss."""
     k = int(np.flatnonzero(run.modes == 0)[5]) + 1
     steps = np.array([LOST if step is None else k + step for step in wrong], np.uint64)
@@ -132,7 +132,7 @@ def test_what_cannot_have_been_heard_is_refused(tmp_path: Path, run: Trajectory,
     assert found.prefix == k - 1
 
 
-def test_copies_that_heard_something_else_contradict(tmp_path: Path, run: Trajectory) -> None:
+def test_copies_that_heard_something_else_contradict(tmp_path: Path, run: Run) -> None:
     k = int(np.flatnonzero(run.modes == 0)[5]) + 1
     state = AgentState(0, run.record.run.bytes, 2, k, 1, run.states[k, 1], np.array([LOST, LOST], np.uint64))
     found = read_bag(bag(tmp_path / "x.mcap", [*messages(run), ("/agent_2/truth", AGENT_STATE, state.encode())]))

@@ -15,14 +15,14 @@ from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, encode_string
 from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, PROGRESS, STRING
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import Until
 
-MakeRun = Callable[..., Trajectory]
+MakeRun = Callable[..., Run]
 STEP = 50_000_000  # ns
 
 
-def bag(path: Path, run: Trajectory, ends: Sequence[int], last: Sequence[int]) -> Path:
+def bag(path: Path, run: Run, ends: Sequence[int], last: Sequence[int]) -> Path:
     """The states of every agent up to its ``last`` step, sojourns of four steps, and messages of these early ends."""
     record = run.record
     messages = [("/experiment", STRING, encode_string(record.to_json()), 0)]
@@ -57,14 +57,14 @@ def bag(path: Path, run: Trajectory, ends: Sequence[int], last: Sequence[int]) -
 
 
 @pytest.fixture
-def run(make_run: MakeRun) -> Trajectory:
+def run(make_run: MakeRun) -> Run:
     """Of 40 steps, which may end early."""
     whole = make_run()
     return dataclasses.replace(whole, record=dataclasses.replace(whole.record, until=Until(0.01)))
 
 
 @pytest.mark.parametrize("end", [1, 22, 24, 39])
-def test_what_comes_after_the_end_does_not_count(tmp_path: Path, run: Trajectory, end: int) -> None:
+def test_what_comes_after_the_end_does_not_count(tmp_path: Path, run: Run, end: int) -> None:
     found = read_bag(bag(tmp_path / "x.mcap", run, [end, end], [end, 40, end + 1]))
     assert found.record.experiment.steps == end
     assert (found.record.planned_steps, found.record.until) == (40, Until(0.01))
@@ -79,7 +79,7 @@ def test_what_comes_after_the_end_does_not_count(tmp_path: Path, run: Trajectory
     assert np.array_equal(again.states, found.states)
 
 
-def test_missing_states_before_the_end(tmp_path: Path, run: Trajectory) -> None:
+def test_missing_states_before_the_end(tmp_path: Path, run: Run) -> None:
     found = read_bag(bag(tmp_path / "x.mcap", run, [22], [22, 20, 30]))
     assert (found.completeness.missing, found.completeness.expected) == (2, 69)
 
@@ -87,7 +87,7 @@ def test_missing_states_before_the_end(tmp_path: Path, run: Trajectory) -> None:
 @pytest.mark.parametrize(
     ("ends", "reason"), [([20, 21], Refusal.CONTRADICTION), ([40], Refusal.OUT_OF_RANGE), ([0], Refusal.OUT_OF_RANGE)]
 )
-def test_impossible_ends(tmp_path: Path, run: Trajectory, ends: list[int], reason: str) -> None:
+def test_impossible_ends(tmp_path: Path, run: Run, ends: list[int], reason: str) -> None:
     """They do not count: the run has its planned length."""
     found = read_bag(bag(tmp_path / "x.mcap", run, ends, [40, 40, 40]))
     assert found.record.planned is None

@@ -14,10 +14,10 @@ from mcap.writer import Writer
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.bags.salvage import salvage
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.messages import ActiveGraph, AgentState, encode_string
 from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING, MessageType
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 
 STEPS, LOST = 40, 2**64 - 1
@@ -26,9 +26,9 @@ Message = tuple[str, MessageType, bytes]
 
 
 @pytest.fixture(scope="module")
-def run() -> Trajectory:
+def run() -> Run:
     """Random states of random age, late by up to four steps; agents notice a new graph late; no theory in it."""
-    experiment = ValidExperiment.parse(
+    experiment = Experiment.parse(
         {
             "name": "real",
             "graphs": {"line": {"path": [1, 2, 3]}, "star": {"star": {"center": 1}}},
@@ -50,10 +50,10 @@ def run() -> Trajectory:
             used[k, i, :number] = np.maximum(-1, np.minimum(STEPS, k + rng.integers(-3, 2, number)))
     record = RunRecord(uuid.UUID(int=5), experiment, states[0])
     count = Completeness(3 * (STEPS + 1), 3 * (STEPS + 1), 0)
-    return Trajectory(record, states, modes, count, agent_modes, used=used, made=made)
+    return Run(record, states, modes, count, agent_modes, used=used, made=made)
 
 
-def messages(run: Trajectory, change: Callable[[AgentState], AgentState] | None = None) -> list[Message]:
+def messages(run: Run, change: Callable[[AgentState], AgentState] | None = None) -> list[Message]:
     """What a faithful recorder would have; ``change`` may change states."""
     assert run.used is not None
     assert run.made is not None
@@ -87,7 +87,7 @@ def bag(path: Path, contents: Iterable[Message]) -> Path:
     return path
 
 
-def same(found: Trajectory, run: Trajectory) -> None:
+def same(found: Run, run: Run) -> None:
     for name in ("states", "agent_modes", "modes", "used", "made"):
         assert np.array_equal(getattr(found, name), getattr(run, name)), name
     assert found.completeness == run.completeness
@@ -95,11 +95,11 @@ def same(found: Trajectory, run: Trajectory) -> None:
     assert found.published is None
 
 
-def test_faithful(tmp_path: Path, run: Trajectory) -> None:
+def test_faithful(tmp_path: Path, run: Run) -> None:
     same(read_bag(bag(tmp_path / "x.mcap", messages(run))), run)
 
 
-def test_written_and_salvaged(tmp_path: Path, run: Trajectory) -> None:
+def test_written_and_salvaged(tmp_path: Path, run: Run) -> None:
     write_trajectory(run, tmp_path / "bag")
     same(read_bag(tmp_path / "bag"), run)
     salvage(tmp_path / "bag", tmp_path / "again")
@@ -107,7 +107,7 @@ def test_written_and_salvaged(tmp_path: Path, run: Trajectory) -> None:
 
 
 @pytest.mark.parametrize("heard", [[], [3], [3, 3, 3], [3, STEPS + 1], [LOST - 1, 3]])
-def test_what_cannot_have_been_heard_is_refused(tmp_path: Path, run: Trajectory, heard: list[int]) -> None:
+def test_what_cannot_have_been_heard_is_refused(tmp_path: Path, run: Run, heard: list[int]) -> None:
     """By agent 2 in a step with the line, where it has two neighbours: in real time both are always listed."""
     assert run.agent_modes is not None
     k = int(np.flatnonzero(run.agent_modes[:, 1] == 0)[5])
@@ -125,7 +125,7 @@ def test_what_cannot_have_been_heard_is_refused(tmp_path: Path, run: Trajectory,
     assert (found.used[k - 1, 1] == -1).all()
 
 
-def test_stamps(tmp_path: Path, run: Trajectory) -> None:
+def test_stamps(tmp_path: Path, run: Run) -> None:
     """None is before the start; of two copies with different ones none is taken."""
 
     def change(state: AgentState) -> AgentState:

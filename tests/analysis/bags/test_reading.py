@@ -29,11 +29,11 @@ from msg_analysis.bags import mcap_chunks
 from msg_analysis.bags.mcap_chunks import DamageError, locate, unpack
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.cdr import CdrError
 from msg_analysis.messages.messages import ActiveGraph, AgentState, encode_string
 from msg_analysis.messages.schemas import AGENT_STATE, STRING
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 
 STEPS, AGENTS, WIDTH, LOST = 5, 3, 2, 2**64 - 1
@@ -58,7 +58,7 @@ def _record(kind: str) -> RunRecord:
         document["noise"] = {"loss": 0.3, "delay": int(kind == "late"), "on_loss": "hold" if kind == "hold" else "own"}
     if kind == "realtime":
         document["run"]["pace"] = "realtime"
-    return RunRecord(uuid.UUID(int=7), ValidExperiment.parse(document), np.zeros((AGENTS, WIDTH)))
+    return RunRecord(uuid.UUID(int=7), Experiment.parse(document), np.zeros((AGENTS, WIDTH)))
 
 
 RECORDS = {kind: _record(kind) for kind in KINDS}
@@ -221,7 +221,7 @@ def test_random_bags(tmp_path: Path, typestore: Any, data: st.DataObject) -> Non
     assert count.refused == expected["refused"]
 
 
-def test_memory_is_that_of_the_result(tmp_path: Path, make_run: Callable[..., Trajectory]) -> None:
+def test_memory_is_that_of_the_result(tmp_path: Path, make_run: Callable[..., Run]) -> None:
     """20 MB of states: nothing beside the result grows with their length, and little with their number."""
     run = make_run(steps=10_000, replicas=64)
     write_trajectory(run, tmp_path / "bag")

@@ -11,7 +11,6 @@ from click.testing import CliRunner
 
 from msg_analysis import Experiment, Run, read_bag
 from msg_analysis.cli import main as cli
-from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.theory.prediction import predict
 
 GOLDEN = Path(__file__).parents[2] / "data/golden"
@@ -37,7 +36,7 @@ def from_zero(tmp_path):
 
 
 def test_transient_tends_to_the_prediction(from_zero):
-    prediction = predict(ValidExperiment.load(from_zero))
+    prediction = predict(Experiment.load(from_zero))
     for law, moments in {"emulated": prediction.emulated, "continuous": prediction.continuous_moments}.items():
         document = document_of("transient", from_zero, "--times", "0:50:0.5", "--law", law)
         assert document["law"] == law
@@ -134,7 +133,7 @@ def test_facts(name):
     document = document_of("facts", GOLDEN / f"{name}.yaml")
     assert all(fact["holds"] for fact in document["facts"])
     assert set(document) == {"names", "modes", "facts", "bounds", "graphs", "two_topology", "notes"}
-    prediction = predict(ValidExperiment.load(GOLDEN / f"{name}.yaml"))
+    prediction = predict(Experiment.load(GOLDEN / f"{name}.yaml"))
     if name in ("line_ring", "discrete"):
         law = "emulated" if name == "line_ring" else "discrete"
         form = document["two_topology"][law]

@@ -16,7 +16,7 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import LARGE, LargeRows, in_file, large_zeros, release
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
 from msg_analysis.twin.simulate import simulate
 
@@ -87,9 +87,9 @@ array[:] = 1.0
 def test_a_run_that_is_read_into_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]
 ) -> None:
-    """Trajectory and comparison are the same as in memory, also of an incomplete bag."""
+    """Run and comparison are the same as in memory, also of an incomplete bag."""
     run = simulate(
-        ValidExperiment.parse(
+        Experiment.parse(
             {
                 "name": "net",
                 "graphs": {"line": {"path": [1, 2, 3]}, "star": {"star": {"center": 1}}},

@@ -11,7 +11,7 @@ from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.cli.console import SweepProgress, WorkProgress
 from msg_analysis.common.resources import tell, watched
 from msg_analysis.common.text import duration_text
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
 from msg_analysis.twin.simulate import simulate
 
@@ -19,7 +19,7 @@ from msg_analysis.twin.simulate import simulate
 def test_what_is_told(tmp_path: Path) -> None:
     """Every stage from 0 on, never beyond its end; nobody is told outside."""
     run = simulate(
-        ValidExperiment.parse(
+        Experiment.parse(
             {
                 "name": "net",
                 "graphs": {"line": {"path": [1, 2, 3]}, "star": {"star": {"center": 1}}},

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.experiment.examples import KINDS, Choices, experiment_name, experiment_text
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 GRAPHS = {
     "line": nx.path_graph,
@@ -46,7 +46,7 @@ def test_every_choice_gives_a_valid_file(chosen: Choices, tmp_path: Path) -> Non
     file = tmp_path / "network.yaml"
     file.write_text(experiment_text("network", chosen))
     assert max(map(len, file.read_text().splitlines())) <= 120
-    experiment = ValidExperiment.load(file)
+    experiment = Experiment.load(file)
     experiment.require_available()
     assert (experiment.agents, experiment.time, experiment.steps) == (chosen.agents, chosen.time, 4000)
     assert experiment.run.seed == chosen.seed
@@ -91,4 +91,4 @@ def test_the_file_as_it_is() -> None:
 )
 def test_the_name_of_the_file_becomes_that_of_the_experiment(stem: str, name: str) -> None:
     assert experiment_name(stem) == name
-    ValidExperiment.parse(yaml.safe_load(experiment_text(name, Choices())))
+    Experiment.parse(yaml.safe_load(experiment_text(name, Choices())))

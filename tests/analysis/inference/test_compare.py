@@ -12,9 +12,9 @@ import scipy.linalg
 from scipy import stats
 from tests.support.p_values import kolmogorov_smirnov
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
@@ -24,11 +24,11 @@ SEEDS = range(100, 140)
 
 
 def golden(name, **run):
-    return ValidExperiment.load(GOLDEN / f"{name}.yaml").with_run(**run)
+    return Experiment.load(GOLDEN / f"{name}.yaml").with_run(**run)
 
 
 def changed(experiment, **changes):
-    return ValidExperiment.parse(experiment.to_document() | changes)
+    return Experiment.parse(experiment.to_document() | changes)
 
 
 def claimed(trajectory, experiment):
@@ -96,7 +96,7 @@ HARD = {
 def hard(case):
     options = {"rate": 0.5, "duration": 10.0, "start": "stationary", "noise": {"process": 1.0}} | HARD[case]
     rate = options["rate"]
-    return ValidExperiment.parse(
+    return Experiment.parse(
         {
             "name": "hard",
             "agents": 4,
@@ -166,7 +166,7 @@ def simulate_air(experiment, seed):
     record = RunRecord(uuid.UUID(int=seed), experiment, states[0])
     count = 2 * states[:, :, 0].size
     complete = Completeness(count, count, 0)
-    return Trajectory(record, states, np.array(modes), complete, None, published, lost if noise.loss.any else None)
+    return Run(record, states, np.array(modes), complete, None, published, lost if noise.loss.any else None)
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.3])
@@ -373,7 +373,7 @@ def test_noise_that_is_common_to_all():
     verdicts = []
     for seed in range(40):
         document["run"]["seed"] = seed
-        result = compare(simulate(ValidExperiment.parse(document)))
+        result = compare(simulate(Experiment.parse(document)))
         assert result.system_error.measured == result.system_error.predicted == 0.0
         assert result.system_error.z is None
         assert [node.measured for node in result.node_errors] == [0.0] * 3

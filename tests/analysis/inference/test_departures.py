@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 from tests.support.switching_systems import LINE_RING
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.dependence import LongLags, StandingStill
 from msg_analysis.inference.diagnostics import Departure, Law
 from msg_analysis.inference.e_values import Looks, WindowEvidence, Windows, variance_evidence
@@ -34,7 +34,7 @@ AIR = {"process": 1.0, "loss": 0.3, "link": 0.2, "broadcast": 0.1}
 
 def observed(seed: int = 1, duration: float = 20.0, replicas: int = 2, **changes: Any) -> Observation:
     run = {"dt": 0.05, "duration": duration, "replicas": replicas, "seed": seed} | changes.pop("run", {})
-    law = ValidExperiment.parse(LINE_RING | changes | {"run": run})
+    law = Experiment.parse(LINE_RING | changes | {"run": run})
     return Observation.of(simulate(law), predict(law))
 
 
@@ -132,7 +132,7 @@ def sojourns(transition: list[list[float]], steps: int) -> Sojourns:
 @functools.cache
 def law_of(transition: str, steps: int) -> Law:
     graphs = {"a": {"path": [1, 2, 3]}, "b": {"complete": True}, "c": {"star": {"center": 1}}}
-    law = ValidExperiment.parse(
+    law = Experiment.parse(
         {
             "name": "chain",
             "time": "discrete",
@@ -316,7 +316,7 @@ def test_the_largest_innovation() -> None:
 
 def test_a_network_that_never_moves() -> None:
     """All innovations are 0: lags say nothing, and the verdict says what is wrong."""
-    law = ValidExperiment.parse(LINE_RING | {"run": {"dt": 0.05, "duration": 20.0, "replicas": 2, "start": "zero"}})
+    law = Experiment.parse(LINE_RING | {"run": {"dt": 0.05, "duration": 20.0, "replicas": 2, "start": "zero"}})
     run = simulate(law)
     still = dataclasses.replace(run, states=np.zeros_like(run.states))
     finding = summed(Observation.of(still, predict(law)), LongLags).finding()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tests.support.line_and_ring import experiment
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.evidence import Evidence, usual_looks
 from msg_analysis.inference.observation import Observation, spaced_steps
 from msg_analysis.inference.pool import compare_pooled
@@ -21,7 +21,7 @@ from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
 
-def observed(truth: ValidExperiment, law: ValidExperiment | None = None) -> Observation:
+def observed(truth: Experiment, law: Experiment | None = None) -> Observation:
     """A run of ``truth`` next to the prediction of ``law``."""
     trajectory = simulate(truth)
     return Observation.of(trajectory, predict(law or truth))
@@ -29,7 +29,7 @@ def observed(truth: ValidExperiment, law: ValidExperiment | None = None) -> Obse
 
 def test_the_error_martingale_is_fair() -> None:
     """Over the next graph and the next state, by Gauss-Hermite quadrature, the factor of every rate has mean 1."""
-    law = ValidExperiment.parse(
+    law = Experiment.parse(
         {
             "name": "two",
             "problem": "consensus",

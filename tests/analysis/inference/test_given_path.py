@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import given_path as module
 from msg_analysis.inference.estimates import covariance_test, estimates
 from msg_analysis.inference.given_path import GivenPath, means_given_path
@@ -31,7 +31,7 @@ CASES = {
 
 
 def observe(document):
-    trajectory = simulate(ValidExperiment.parse(document))
+    trajectory = simulate(Experiment.parse(document))
     return Observation.of(trajectory, predict(trajectory.record.experiment))
 
 

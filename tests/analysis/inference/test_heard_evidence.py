@@ -12,7 +12,7 @@ from tests.support import line_and_ring
 from tests.support.watched_run import messages_of, watch, watched, whole_sums
 
 from msg_analysis.bags.run_writer import write_trajectory
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import online_errors, online_evidence
 from msg_analysis.inference.online_errors import LiveEstimate
 from msg_analysis.inference.online_evidence import NetworkPath
@@ -46,7 +46,7 @@ LAWS: dict[str, dict[str, Any]] = {
 }
 
 
-def law(duration: float = 40.0, seed: int = 1, **changes: Any) -> ValidExperiment:
+def law(duration: float = 40.0, seed: int = 1, **changes: Any) -> Experiment:
     """Of two replicas."""
     return line_and_ring.experiment(seed, duration, **{**changes, "run": {"replicas": 2} | changes.get("run", {})})
 

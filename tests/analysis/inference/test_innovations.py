@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import residuals as module
 from msg_analysis.inference.gains import regressors
 from msg_analysis.inference.observation import Observation
@@ -25,7 +25,7 @@ def observe(**changes):
         "leaders": {"agents": [1], "gain": 1.5, "reference": 2.0},
         "run": {"dt": 0.1, "duration": 6.0, "replicas": 3, "seed": 5},
     }
-    trajectory = simulate(ValidExperiment.parse(document | changes))
+    trajectory = simulate(Experiment.parse(document | changes))
     return Observation.of(trajectory, predict(trajectory.record.experiment))
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import in_file
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import realtime_laws as module
 from msg_analysis.inference.estimates import covariance_test, estimates
 from msg_analysis.inference.event_order import EventOrder, newest_steps, order_events, sampled
@@ -28,7 +28,7 @@ def experiment(run=None, **changes):
         "switching": {"generator": [[-3.0, 3.0], [2.0, -2.0]]},
         "run": {"dt": 0.1, "duration": STEPS / 10, "replicas": 2, "seed": 3, "pace": "realtime"} | (run or {}),
     }
-    return ValidExperiment.parse(document | changes)
+    return Experiment.parse(document | changes)
 
 
 TRACKING = {"problem": "tracking", "leaders": {"agents": [1], "gain": 0.7, "reference": 2.0}}

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 from tests.support.p_values import kolmogorov_smirnov
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.gains import HeardRegression
 from msg_analysis.inference.messages import loss_test
 from msg_analysis.inference.observation import Observation
@@ -33,7 +33,7 @@ def experiment(noise=AIR, **changes):
         "noise": noise,
         "run": run,
     }
-    return ValidExperiment.parse(document | changes)
+    return Experiment.parse(document | changes)
 
 
 TRACKING = {"problem": "tracking", "leaders": {"agents": [1], "gain": 0.7, "reference": 2.0}}

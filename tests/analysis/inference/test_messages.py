@@ -15,7 +15,7 @@ from tests.support.switching_systems import LINE_RING
 
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import in_file
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import pattern_events
 from msg_analysis.inference.event_order import newest_steps, order_events
 from msg_analysis.inference.messages import LossTally, loss_test
@@ -46,7 +46,7 @@ CASES = {
 def experiment(noise, more=None, **run):
     pace = run.pop("pace", "lockstep")
     run = {"dt": 0.2, "duration": 4, "start": [1.0, -2.0, 0.5, 0.0, 1.0], "pace": pace, "seed": 4} | run
-    return ValidExperiment.parse(LINE_RING | {"noise": {"process": 1.0, **noise}, "run": run} | (more or {}))
+    return Experiment.parse(LINE_RING | {"noise": {"process": 1.0, **noise}, "run": run} | (more or {}))
 
 
 def observed(case, seed=1, **run):

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from tests.support.p_values import kolmogorov_smirnov
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
 from msg_analysis.twin.simulate import simulate
 
@@ -19,7 +19,7 @@ SHARED = [[1.0, 0.5, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 0.0]]
 
 
 def experiment(line, ring, **run):
-    return ValidExperiment.parse(
+    return Experiment.parse(
         {
             "name": "loud",
             "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},

@@ -9,7 +9,7 @@ from scipy import stats
 from tests.support.p_values import kolmogorov_smirnov
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.pool import compare_pooled
@@ -35,7 +35,7 @@ AIR = DOCUMENT | {"noise": {"process": 1.0, "broadcast": 0.3, "link": 0.2, "loss
 
 
 def runs(document=DOCUMENT, durations=(30.0, 60.0, 20.0), first_seed=1):
-    experiment = ValidExperiment.parse(document)
+    experiment = Experiment.parse(document)
     return [
         (f"bag_{seed}", simulate(experiment.with_run(seed=seed, duration=duration)))
         for seed, duration in enumerate(durations, start=first_seed)
@@ -121,7 +121,7 @@ def test_calibration(document):
 def test_a_fault_that_one_run_does_not_show():
     """10 % more noise variance: seen in twelve runs together."""
     louder = DOCUMENT | {"noise": {"process": [1.05**0.5, 0.5 * 1.05**0.5, 2.0 * 1.05**0.5]}}
-    claimed = ValidExperiment.parse(DOCUMENT)
+    claimed = Experiment.parse(DOCUMENT)
     found = []
     for name, run in runs(louder, (60.0,) * 12):
         experiment = claimed.with_run(seed=run.record.experiment.run.seed, duration=60.0)
@@ -165,7 +165,7 @@ def test_what_is_not_one_experiment_is_refused(three):
     twin = simulate(run.record.experiment)
     with pytest.raises(InputError, match=r"twin: run\.seed: 1 as in bag_1"):
         compare_pooled([(first, run), ("twin", twin)])
-    wrong = ValidExperiment.parse(DOCUMENT | {"noise": {"process": [1.0, 0.6, 2.0]}}).with_run(seed=9)
+    wrong = Experiment.parse(DOCUMENT | {"noise": {"process": [1.0, 0.6, 2.0]}}).with_run(seed=9)
     with pytest.raises(InputError, match=r"wrong: noise\.process: \[1\.0, 0\.6, 2\.0\], but \[1"):
         compare_pooled([(first, run), ("wrong", simulate(wrong))])
     fewer = simulate(other.record.experiment.with_run(replicas=1))

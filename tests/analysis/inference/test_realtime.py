@@ -11,7 +11,7 @@ from tests.support.p_values import kolmogorov_smirnov
 from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
 from msg_analysis.common.text import percent
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.event_order import order_events
 from msg_analysis.inference.gains import HeardRegression
 from msg_analysis.inference.observation import Observation
@@ -34,7 +34,7 @@ def experiment(run=None, **changes):
         "switching": {"generator": [[-1.0, 1.0], [2.0, -2.0]]},
         "run": {"dt": 0.1, "duration": 40, "replicas": 2, "seed": 3, "pace": "realtime"} | (run or {}),
     }
-    return ValidExperiment.parse(document | changes)
+    return Experiment.parse(document | changes)
 
 
 TRACKING = {"problem": "tracking", "leaders": {"agents": [1], "gain": 0.7, "reference": 2.0}}

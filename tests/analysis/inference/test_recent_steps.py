@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.online_steps import WINDOW, Lateness, RecentSteps
 from msg_analysis.model.phases import phases
 
@@ -34,7 +34,7 @@ def test_nothing_is_kept_before_the_first_step() -> None:
 
 def test_lateness_is_that_of_the_newest_steps_in_wall_time() -> None:
     """Agent i makes x(k) at (k - 1 + phi_i) dt of simulated time, of which there are four units in a second."""
-    experiment = ValidExperiment.parse(
+    experiment = Experiment.parse(
         {
             "name": "late",
             "graphs": {"line": {"path": [1, 2, 3]}},

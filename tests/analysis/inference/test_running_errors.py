@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 
 from msg_analysis.arithmetic.update_law import to_payload
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.estimates import Estimate, estimates
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.online_errors import LiveEstimate, RunningErrors
 from msg_analysis.inference.online_steps import StepCollector
 from msg_analysis.inference.time_means import time_means
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
 GRAPHS = {"a": {"path": [1, 2, 3, 4]}, "b": {"cycle": [1, 2, 3, 4]}}
 
 
-def experiment(**changes: Any) -> ValidExperiment:
+def experiment(**changes: Any) -> Experiment:
     run = {"dt": 0.1, "duration": 30, "replicas": 2, "seed": 5} | changes.pop("run", {})
     document = {
         "name": "small",
@@ -34,10 +34,10 @@ def experiment(**changes: Any) -> ValidExperiment:
         **changes,
         "run": run,
     }
-    return ValidExperiment.parse(document)
+    return Experiment.parse(document)
 
 
-def messages(trajectory: Trajectory) -> list[tuple[int, int, int, bytes]]:
+def messages(trajectory: Run) -> list[tuple[int, int, int, bytes]]:
     """(agent, step, mode from 1, payload) of every state, in the order of steps."""
     modes = [0, *(trajectory.modes + 1).tolist()]
     return [
@@ -47,7 +47,7 @@ def messages(trajectory: Trajectory) -> list[tuple[int, int, int, bytes]]:
     ]
 
 
-def errors_from_zero(experiment: ValidExperiment, steps: int) -> list[float]:
+def errors_from_zero(experiment: Experiment, steps: int) -> list[float]:
     """Expected system error of every step, by the recursion of the second moments of the states themselves."""
     step = predict(experiment).step
     centre = np.eye(step.agents) - 1.0 / step.agents

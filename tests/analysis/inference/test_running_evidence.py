@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tests.support import line_and_ring
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import online_errors, online_evidence
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.observation import Observation
@@ -23,7 +23,7 @@ from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
 
-def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> ValidExperiment:
+def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> Experiment:
     """Of two replicas."""
     return line_and_ring.experiment(seed, duration, run={"replicas": 2} | changes.pop("run", {}), **changes)
 
@@ -105,7 +105,7 @@ def test_a_fault_is_found_and_named() -> None:
     assert found.to_json()["disagrees"]
 
 
-def record_of(law: ValidExperiment, until: Until | None) -> tuple[RunRecord, Any]:
+def record_of(law: Experiment, until: Until | None) -> tuple[RunRecord, Any]:
     run = simulate(law)
     return RunRecord(run.record.run, law, run.record.start, until=until), run
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.time_means import expected_mean, time_means
 from msg_analysis.theory.prediction import predict
@@ -14,7 +14,7 @@ from msg_analysis.twin.simulate import simulate
 
 
 def experiment(start="stationary", **run):
-    return ValidExperiment.parse(
+    return Experiment.parse(
         {
             "name": "tiny",
             "problem": "tracking",

@@ -6,7 +6,7 @@
 import pytest
 from tests.analysis.theory.tails.test_fourth_moments import HEAVY, LOSSY
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.online_errors import LiveEstimate
 from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.inference.verdict import compare
@@ -26,7 +26,7 @@ LINE_RING = {
 
 
 def compared(document, **changes):
-    return compare(simulate(ValidExperiment.parse(document | changes)))
+    return compare(simulate(Experiment.parse(document | changes)))
 
 
 @pytest.mark.parametrize("document", [HEAVY, LOSSY], ids=["switching", "losses"])
@@ -53,7 +53,7 @@ def test_heavy_tails(document):
 
 def test_heavy_tails_of_several_runs():
     runs = [
-        (str(seed), simulate(ValidExperiment.parse(HEAVY | {"run": {"dt": 0.6, "duration": 240.0, "seed": seed}})))
+        (str(seed), simulate(Experiment.parse(HEAVY | {"run": {"dt": 0.6, "duration": 240.0, "seed": seed}})))
         for seed in (1, 2)
     ]
     found = compare_pooled(runs)
@@ -63,7 +63,7 @@ def test_heavy_tails_of_several_runs():
 
 
 def test_heavy_tails_live():
-    live = LiveEstimate(new_record(ValidExperiment.parse(HEAVY)))
+    live = LiveEstimate(new_record(Experiment.parse(HEAVY)))
     assert "infinite" in live.report().note
 
 

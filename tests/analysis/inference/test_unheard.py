@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.messages import unheard_messages
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.timing import measure_timing
@@ -15,7 +15,7 @@ from msg_analysis.twin.simulate import simulate
 
 
 def experiment(duration=400, **noise):
-    return ValidExperiment.parse(
+    return Experiment.parse(
         {
             "name": "unheard",
             "graphs": {"a": {"path": [1, 2, 3]}, "b": {"arcs": [[1, 2], [2, 3, 2.0], [3, 1], [1, 3]]}},

@@ -10,16 +10,16 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.experiment.experiment import Experiment, ExperimentError
 from msg_analysis.model.reception import NOTHING, Air, Losses, loss_probabilities
 
 BLOCK = 256
 
 
-def experiment(noise: dict[str, Any], **changes: Any) -> ValidExperiment:
+def experiment(noise: dict[str, Any], **changes: Any) -> Experiment:
     document = {"name": "lossy", "graphs": {"a": {"path": [1, 2, 3]}, "b": {"arcs": [[3, 1]]}}, "noise": noise}
     document |= {"switching": {"generator": [[-1, 1], [1, -1]]}}
-    return ValidExperiment.parse(document | changes)
+    return Experiment.parse(document | changes)
 
 
 # The section
@@ -42,8 +42,8 @@ def test_by_link() -> None:
     document = what.to_document()
     assert document["noise"] | loss == document["noise"] | document["noise"]["loss"]
     assert (document["noise"]["on_loss"], document["noise"]["burst"]) == ("hold", 4.0)
-    assert ValidExperiment.parse(document) == what
-    assert ValidExperiment.parse(document).to_document() == document
+    assert Experiment.parse(document) == what
+    assert Experiment.parse(document).to_document() == document
     assert experiment({"loss": {"arcs": [[1, 2, 0]]}}).noise.loss.any is False
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from msg_analysis.experiment import loading
-from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.experiment.experiment import Experiment, ExperimentError
 
 GOOD: dict[str, Any] = {
     "name": "good",
@@ -42,7 +42,7 @@ def changed(changes: dict[str, Any]) -> dict[str, Any]:
 
 def problems_of(changes: dict[str, Any]) -> list[str]:
     with pytest.raises(ExperimentError) as caught:
-        ValidExperiment.parse(changed(changes))
+        Experiment.parse(changed(changes))
     return caught.value.problems
 
 
@@ -329,7 +329,7 @@ def test_mistake(changes: dict[str, Any], fragments: list[str]) -> None:
 
 
 def test_the_good_document_is_good() -> None:
-    assert ValidExperiment.parse(GOOD).agents == 5
+    assert Experiment.parse(GOOD).agents == 5
 
 
 def test_a_chain_of_three_has_its_period_named() -> None:
@@ -364,23 +364,23 @@ def test_all_mistakes_come_together() -> None:
 
 def test_text_names_the_source_and_lists_the_problems() -> None:
     with pytest.raises(ExperimentError) as caught:
-        ValidExperiment.parse(changed({"foo": 1, "bar": 2}), source="file.yaml")
+        Experiment.parse(changed({"foo": 1, "bar": 2}), source="file.yaml")
     lines = str(caught.value).splitlines()
     assert lines[0] == "file.yaml: 2 problems"
     assert [line.split(":")[0] for line in lines[1:]] == ["  foo", "  bar"]
     with pytest.raises(ExperimentError, match=r"^file\.yaml: foo: unknown key"):
-        ValidExperiment.parse(changed({"foo": 1}), source="file.yaml")
+        Experiment.parse(changed({"foo": 1}), source="file.yaml")
 
 
 def test_keys_that_are_no_text() -> None:
     with pytest.raises(ExperimentError, match="experiment: key 1: expected a text"):
-        ValidExperiment.parse({**GOOD, 1: 2})
+        Experiment.parse({**GOOD, 1: 2})
 
 
 def test_memory_is_compared_with_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
     needed = sum(loading.memory_needed(agents=5, modes=2, steps=8000, replicas=1))
     monkeypatch.setattr(loading, "available_memory", lambda: needed)
-    ValidExperiment.parse(GOOD)
+    Experiment.parse(GOOD)
     monkeypatch.setattr(loading, "available_memory", lambda: needed - 1)
     assert "need 320 kB: expected at most 323 kB, the memory available" in problems_of({})[0]
 

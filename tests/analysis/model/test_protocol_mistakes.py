@@ -18,7 +18,7 @@ from msg_analysis.cli.main import main
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import protocols
-from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.experiment.experiment import Experiment, ExperimentError
 from msg_analysis.protocol import Heard, LinearProtocol, Parameters, Protocol
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
@@ -77,7 +77,7 @@ MISTAKES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
 @pytest.mark.parametrize(("protocol", "changes", "expected"), MISTAKES, ids=str)
 def test_mistakes_in_the_file(protocol: Any, changes: dict[str, Any], expected: list[str]) -> None:
     with pytest.raises(ExperimentError) as caught:
-        ValidExperiment.parse(document(protocol, **changes))
+        Experiment.parse(document(protocol, **changes))
     assert len(caught.value.problems) == len(expected)
     for text in expected:
         assert any(text in line for line in caught.value.problems), caught.value.problems
@@ -218,7 +218,7 @@ def test_no_prediction_is_refused_clearly(command: list[str], tmp_path: Path) ->
     assert outcome.stderr.startswith(f'error: {file}: protocol.name: "saturated": expected a linear protocol, but')
     assert "without a prediction: use `simulate` or `msg-agents run`" in outcome.stderr
     with pytest.raises(InputError, match="is not linear"):
-        predict(ValidExperiment.load(file))
+        predict(Experiment.load(file))
 
 
 def test_processes_that_a_protocol_forks_end_as_ever() -> None:

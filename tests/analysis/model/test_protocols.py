@@ -19,7 +19,7 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.observation import transient_length
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.agent_law import agent_law
@@ -353,7 +353,7 @@ def test_the_examples_of_the_documentation(offer: Callable[..., None]) -> None:
         exec(block, scope)
     offer(("median", scope["Median"]), ("half", scope["Half"]))
     (example,) = (block for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL) if "median" in block)
-    assert compare(simulate(ValidExperiment.parse(yaml.safe_load(example)))).verdict == "unpredicted"
+    assert compare(simulate(Experiment.parse(yaml.safe_load(example)))).verdict == "unpredicted"
     half = experiment({"name": "half"}, graphs=DIRECTED, run={"start": "stationary"})
     step = build_step_model(half)
     assert step.weights[0, 1].tolist() == [0.5, 0.5, 0, 0, 0]

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.twin.simulate import new_record, simulate
 
 
-def experiment() -> ValidExperiment:
-    return ValidExperiment.parse(
+def experiment() -> Experiment:
+    return Experiment.parse(
         {
             "name": "net",
             "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},

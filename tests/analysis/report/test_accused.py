@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.verdict import compare
 from msg_analysis.report.drawings import chain_drawing, graph_drawings, interval_bars, plus_minus
@@ -53,7 +53,7 @@ def test_who_is_named() -> None:
 
 
 def test_drawings() -> None:
-    experiment = ValidExperiment.parse(DOCUMENT)
+    experiment = Experiment.parse(DOCUMENT)
     marked = Accused(agents=(2,), links=((1, 3, None),), jumps=(("line", "ring"),))
     line, ring = graph_drawings(experiment, marked)
     assert line.count('class="accused"') == 1  # the agent; it has no link 1-3
@@ -80,8 +80,8 @@ def test_frames_in_the_covariance() -> None:
 @pytest.fixture(scope="module")
 def louder() -> Comparison:
     """Agent 2 has twice the noise that the record says."""
-    said = ValidExperiment.parse(DOCUMENT)
-    did = simulate(ValidExperiment.parse(DOCUMENT | {"noise": {"process": [1, 2, 1]}}))
+    said = Experiment.parse(DOCUMENT)
+    did = simulate(Experiment.parse(DOCUMENT | {"noise": {"process": [1, 2, 1]}}))
     return compare(dataclasses.replace(did, record=dataclasses.replace(did.record, experiment=said)))
 
 

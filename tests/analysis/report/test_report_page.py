@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.comparison import Test as FamilyTest
 from msg_analysis.inference.estimates import CovarianceTest, Estimate
 from msg_analysis.inference.residuals import InnovationTests
 from msg_analysis.inference.switching import SwitchingTest
 from msg_analysis.inference.verdict import compare
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.report import page as report_page
 from msg_analysis.report.page import render, write_report
@@ -63,9 +63,9 @@ class Page(HTMLParser):
             self.text += data
 
 
-def _trajectory(agents: int, steps: int, **names: str) -> Trajectory:
+def _trajectory(agents: int, steps: int, **names: str) -> Run:
     everybody = list(range(1, agents + 1))
-    experiment = ValidExperiment.parse(
+    experiment = Experiment.parse(
         {
             "name": "small",
             "problem": "consensus",
@@ -86,10 +86,10 @@ def _trajectory(agents: int, steps: int, **names: str) -> Trajectory:
     record = RunRecord(uuid.UUID(int=5), experiment, states[0])
     modes = np.repeat(rng.integers(0, 2, steps // 4 + 1), 4)[:steps]
     expected = (steps + 1) * agents
-    return Trajectory(record, states, modes, Completeness(expected, expected, 0))
+    return Run(record, states, modes, Completeness(expected, expected, 0))
 
 
-def _comparison(trajectory: Trajectory) -> Comparison:
+def _comparison(trajectory: Run) -> Comparison:
     """Made-up numbers, all of them there."""
     agents = trajectory.states.shape[1]
     rng = np.random.default_rng(1)
@@ -226,7 +226,7 @@ def in_real_time(late: int) -> Comparison:
         "switching": {"generator": [[-1, 1], [1, -1]]},
         "run": {"dt": 0.1, "duration": 20, "replicas": 2, "pace": "realtime", "speed": 10},
     }
-    trajectory = simulate(ValidExperiment.parse(document))
+    trajectory = simulate(Experiment.parse(document))
     assert trajectory.made is not None
     made = trajectory.made.copy()
     made[1:] += late

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from msg_analysis.common import arrays
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.report import run_plots as events_module
 from msg_analysis.report.run_plots import run_events, trajectory_plots
 from msg_analysis.twin.simulate import simulate
@@ -17,13 +17,13 @@ from msg_analysis.twin.simulate import simulate
 PERIOD = 50_000_000  # ns of simulated time
 
 
-def _run(**run: object) -> Trajectory:
+def _run(**run: object) -> Run:
     document = {
         "name": "timed",
         "graphs": {"line": {"path": [1, 2, 3]}},
         "run": {"dt": 0.05, "duration": 10, "replicas": 2, "start": "zero"} | run,
     }
-    return simulate(ValidExperiment.parse(document))
+    return simulate(Experiment.parse(document))
 
 
 @pytest.mark.parametrize("block", [6, 10**6])  # numbers that are looked at together

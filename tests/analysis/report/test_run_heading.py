@@ -8,10 +8,10 @@ import datetime
 import pytest
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.inference.verdict import compare
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.report.page import page_title, run_facts
 from msg_analysis.twin.simulate import new_record, simulate
@@ -24,8 +24,8 @@ DOCUMENT = {
 NOON = datetime.datetime(2026, 11, 25, 12, 0, 59, tzinfo=datetime.UTC)
 
 
-def run(started: datetime.datetime = NOON, **changes: object) -> Trajectory:
-    experiment = ValidExperiment.parse(DOCUMENT | {"run": DOCUMENT["run"] | changes})  # type: ignore[operator]
+def run(started: datetime.datetime = NOON, **changes: object) -> Run:
+    experiment = Experiment.parse(DOCUMENT | {"run": DOCUMENT["run"] | changes})  # type: ignore[operator]
     found = simulate(experiment)
     return dataclasses.replace(found, record=dataclasses.replace(found.record, started=started))
 
@@ -58,7 +58,7 @@ def test_several_runs() -> None:
 
 
 def test_the_record_keeps_its_date() -> None:
-    record = new_record(ValidExperiment.parse(DOCUMENT))
+    record = new_record(Experiment.parse(DOCUMENT))
     again = RunRecord.from_json(record.to_json(), "here")
     assert again.started == record.started
     assert again.to_json() == record.to_json()

@@ -87,11 +87,11 @@ def test_predictions_are_those_of_the_paper() -> None:
 
 def test_simulated_runs_are_those_of_the_twin() -> None:
     """Mean square of the disagreement, by numpy."""
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
 
     what = document(seed=5)
     outcome = evaluate(Job.of("simulate", what))
-    states = simulate(ValidExperiment.parse(what)).values[:-1]
+    states = simulate(Experiment.parse(what)).values[:-1]
     deviations = states - states.mean(axis=1, keepdims=True)
     assert outcome.result["system_error"]["measured"] == pytest.approx(float((deviations**2).sum(axis=1).mean()))
     assert outcome.result["steps"] == 1000

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.step_model import build_step_model
 from msg_analysis.theory.jump_system import emulated, held
 from msg_analysis.theory.moments import MomentSolver, transient_mean
@@ -190,7 +190,7 @@ def steady_by_stepping(given):
 @given(seeds)
 def test_steps_with_everything_are_those_of_brute_force(seed):
     given = document(seed)
-    prediction = predict(ValidExperiment.parse(given))
+    prediction = predict(Experiment.parse(given))
     expected = steady_by_stepping(given)
     scale = np.abs(expected).max()
     np.testing.assert_allclose(prediction.emulated.by_mode, expected, rtol=1e-7, atol=1e-8 * scale)
@@ -204,7 +204,7 @@ def test_steps_with_everything_are_those_of_brute_force(seed):
 def test_transient_with_everything_is_that_of_brute_force(seed):
     """From a known start, which a delay takes to have been the same before."""
     given = document(seed)
-    experiment = ValidExperiment.parse(given)
+    experiment = Experiment.parse(given)
     _, law = transition_and_law(given)
     blocks = given["noise"]["delay"] + 1
     x = np.random.default_rng(seed).standard_normal(given["agents"])
@@ -245,7 +245,7 @@ def test_continuous_time_with_noise_by_graph_is_the_papers_equation(seed):
     right = np.concatenate([share * a.ravel() for share, a in zip(law, q, strict=True)])
     solution = (np.linalg.pinv(matrix, rcond=1e-11) @ right).reshape(n, len(eye), len(eye))
     expected = keep @ solution @ keep.T
-    measured = predict(ValidExperiment.parse(given)).continuous.by_mode
+    measured = predict(Experiment.parse(given)).continuous.by_mode
     np.testing.assert_allclose(measured, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
 
 
@@ -261,21 +261,21 @@ def line_ring(**noise):
 
 def test_the_same_noise_for_every_graph_by_name_is_the_same_noise():
     gains = [1.0, 2.0, 0.0, 1.0, 1.0]
-    one = predict(ValidExperiment.parse(line_ring(process=gains)))
-    by_name = predict(ValidExperiment.parse(line_ring(process={"ring": gains, "line": gains})))
+    one = predict(Experiment.parse(line_ring(process=gains)))
+    by_name = predict(Experiment.parse(line_ring(process={"ring": gains, "line": gains})))
     assert one.to_json() == by_name.to_json()
 
 
 def test_static_baseline_with_noise_by_graph():
     """Each graph held for ever, with its own noise: resistances, times the variance (F = s I)."""
-    prediction = predict(ValidExperiment.parse(line_ring(process={"line": 2.0, "ring": 0.5})))
+    prediction = predict(Experiment.parse(line_ring(process={"line": 2.0, "ring": 0.5})))
     assert prediction.static.system_error == pytest.approx(5 / 7 * 4.0 * 2.0 + 2 / 7 * 0.25 * 1.0, rel=1e-12)
 
 
 def test_no_delay_is_delay_zero():
     assert (
-        predict(ValidExperiment.parse(line_ring(loss=0.2, delay=0))).to_json()
-        == predict(ValidExperiment.parse(line_ring(loss=0.2))).to_json()
+        predict(Experiment.parse(line_ring(loss=0.2, delay=0))).to_json()
+        == predict(Experiment.parse(line_ring(loss=0.2))).to_json()
     )
 
 
@@ -290,7 +290,7 @@ def test_one_integrator_that_hears_the_reference_late(delay):
         "noise": {"delay": delay},
         "run": {"dt": 0.2, "duration": 10},
     }
-    assert predict(ValidExperiment.parse(given)).emulated.node_errors[1] == pytest.approx(0.2 / (1 - 0.8**2), rel=1e-12)
+    assert predict(Experiment.parse(given)).emulated.node_errors[1] == pytest.approx(0.2 / (1 - 0.8**2), rel=1e-12)
 
 
 @pytest.mark.parametrize("delay", [1, 2, 5])
@@ -304,7 +304,7 @@ def test_two_agents_late(delay):
     entering = np.zeros_like(companion)
     entering[0, 0] = 2.0 * dt  # variance of the noise of x_1 - x_2
     difference = scipy.linalg.solve_discrete_lyapunov(companion, entering)[0, 0]
-    prediction = predict(ValidExperiment.parse(given))
+    prediction = predict(Experiment.parse(given))
     assert prediction.emulated.system_error == pytest.approx(difference / 2, rel=1e-11)
     assert prediction.continuous_moments is None
     assert prediction.static_moments is None
@@ -312,22 +312,22 @@ def test_two_agents_late(delay):
 
 def test_what_belongs_to_steps_has_no_other_law():
     for noise in ({"delay": 1}, {"loss": 0.1}, {"link": 0.1}, {"broadcast": 0.1}):
-        document = predict(ValidExperiment.parse(line_ring(**noise))).to_json()
+        document = predict(Experiment.parse(line_ring(**noise))).to_json()
         assert document["continuous"] is None
         assert document["static"] is None
 
 
 def test_held_keeps_the_delay():
-    experiment = ValidExperiment.parse(line_ring(delay=2, process={"line": 1.0, "ring": 3.0}))
+    experiment = Experiment.parse(line_ring(delay=2, process={"line": 1.0, "ring": 3.0}))
     alone = held(emulated(build_step_model(experiment), "consensus"), 1)
     single = line_ring(delay=2, process=3.0)
     del single["graphs"]["line"], single["switching"]
-    expected = predict(ValidExperiment.parse(single)).emulated.covariance
+    expected = predict(Experiment.parse(single)).emulated.covariance
     np.testing.assert_allclose(alone.lifted(MomentSolver(alone).steady()[0]), expected, rtol=1e-12)
 
 
 def test_reduced_coordinates_with_delay_see_no_common_value():
-    system = emulated(build_step_model(ValidExperiment.parse(line_ring(delay=3))), "consensus")
+    system = emulated(build_step_model(Experiment.parse(line_ring(delay=3))), "consensus")
     np.testing.assert_allclose(system.reduced(np.full(5, 7.0)), 0.0, atol=1e-12)
     x = np.random.default_rng(1).standard_normal(5)
     np.testing.assert_allclose(system.output @ system.reduced(x), x - x.mean(), atol=1e-12)
@@ -345,20 +345,20 @@ def complete(dt, **noise):
 
 
 def test_steps_that_delay_makes_unstable_are_refused():
-    assert predict(ValidExperiment.parse(complete(0.4))).emulated.system_error > 0.0
-    assert predict(ValidExperiment.parse(complete(0.33, delay=1))).emulated.system_error > 0.0
+    assert predict(Experiment.parse(complete(0.4))).emulated.system_error > 0.0
+    assert predict(Experiment.parse(complete(0.33, delay=1))).emulated.system_error > 0.0
     with pytest.raises(InputError, match=r"grow without bound.* every dt below 0\.3333 is stable"):
-        predict(ValidExperiment.parse(complete(0.4, delay=1)))
+        predict(Experiment.parse(complete(0.4, delay=1)))
 
 
 @pytest.mark.parametrize("process", [0.0, [[1.0] * 4] * 4])
 def test_noise_that_does_not_show_instability_hides_nothing(process):
     """Without noise, or with the same noise for everybody, nothing grows from agreement; from elsewhere it does."""
-    stable = predict(ValidExperiment.parse(complete(0.4, process=process))).to_json()["emulated"]
+    stable = predict(Experiment.parse(complete(0.4, process=process))).to_json()["emulated"]
     assert stable["system_error"] == 0.0
     assert stable["system_certainty"] is None
     with pytest.raises(InputError, match="without bound"):
-        predict(ValidExperiment.parse(complete(0.4, process=process, delay=1)))
+        predict(Experiment.parse(complete(0.4, process=process, delay=1)))
 
 
 def test_agents_without_errors_have_no_certainty():
@@ -371,7 +371,7 @@ def test_agents_without_errors_have_no_certainty():
         "leaders": {"agents": [1]},
         "noise": {"process": [0.0, 0.0, 1.0], "delay": 2},
     }
-    law = predict(ValidExperiment.parse(given)).to_json()["emulated"]
+    law = predict(Experiment.parse(given)).to_json()["emulated"]
     assert law["node_errors"][:2] == [0.0, 0.0]
     assert law["node_certainty"][:2] == [None, None]
     assert law["node_certainty"][2] > 0.0
@@ -390,6 +390,6 @@ def test_bursts_without_memory_are_independent_losses(links):
     channel = rate * np.array([[-loss, loss], [1 - loss, loss - 1]])
     generator = channel if links == 1 else np.kron(channel, np.eye(2)) + np.kron(np.eye(2), channel)
     base = {"name": "channels", "agents": 2, "run": {"dt": 0.3, "duration": 3}}
-    bursts = predict(ValidExperiment.parse(base | {"graphs": graphs, "switching": {"generator": generator.tolist()}}))
-    lost = predict(ValidExperiment.parse(base | {"graphs": {"all": {"arcs": arcs}}, "noise": {"loss": loss}}))
+    bursts = predict(Experiment.parse(base | {"graphs": graphs, "switching": {"generator": generator.tolist()}}))
+    lost = predict(Experiment.parse(base | {"graphs": {"all": {"arcs": arcs}}, "noise": {"loss": loss}}))
     np.testing.assert_allclose(bursts.emulated.covariance, lost.emulated.covariance, rtol=1e-9)

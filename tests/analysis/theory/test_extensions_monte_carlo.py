@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory.prediction import predict
 
 NETWORKS = 6000
@@ -61,7 +61,7 @@ def parse(case):
         given |= {"time": "discrete", "switching": {"transition": [[0.8, 0.2], [0.4, 0.6]]}, "run": {"duration": 5}}
     else:
         given |= {"switching": {"generator": [[-2.0, 2.0], [3.0, -3.0]]}, "run": {"dt": DT, "duration": 3}}
-    return ValidExperiment.parse(given)
+    return Experiment.parse(given)
 
 
 def jumped(random, modes, transition):
@@ -147,7 +147,7 @@ def test_noise_by_graph_enters_before_the_jump():
         "noise": {"process": {"loud": 1.0, "smooth": 0.1}},
         "run": {"duration": 5},
     }
-    experiment = ValidExperiment.parse(given)
+    experiment = Experiment.parse(given)
     prediction = predict(experiment)
     step = prediction.step
     wrong = np.zeros_like(prediction.emulated.by_mode)
@@ -196,4 +196,4 @@ def test_bursts_of_losses_are_graphs():
         x = x + DT * pull + math.sqrt(DT) * random.standard_normal(x.shape)
         draw = random.random(good.shape)
         good = np.where(good, draw >= good_to_bad, draw < bad_to_good)
-    assert_agrees((x - x.mean(axis=1, keepdims=True)) ** 2, predict(ValidExperiment.parse(given)).emulated)
+    assert_agrees((x - x.mean(axis=1, keepdims=True)) ** 2, predict(Experiment.parse(given)).emulated)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory.facts import check_facts
 
 MODELS = settings(max_examples=20, deadline=None, derandomize=True)
@@ -37,7 +37,7 @@ def experiment(graphs, *, agents, time="continuous", leaders=None, seed=0, chain
     }
     if leaders:
         document["leaders"] = leaders
-    return ValidExperiment.parse(document)
+    return Experiment.parse(document)
 
 
 def by_name(facts):

@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 
 from msg_analysis.errors import NotAvailableError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory.prediction import predict, stationary_start_factor
 
 GOLDEN = Path(__file__).parents[2] / "data" / "golden"
@@ -25,7 +25,7 @@ def experiment(**changes):
         "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
         "run": {"dt": 0.05, "duration": 10},
     }
-    return ValidExperiment.parse(document | changes)
+    return Experiment.parse(document | changes)
 
 
 def one_graph(graph, **changes):
@@ -46,19 +46,19 @@ def assert_contains(document, golden, path=""):
 
 @pytest.mark.parametrize("name", ["line_ring", "tracking", "discrete", "air"])
 def test_golden(name):
-    document = predict(ValidExperiment.load(GOLDEN / f"{name}.yaml")).to_json()
+    document = predict(Experiment.load(GOLDEN / f"{name}.yaml")).to_json()
     assert_contains(document, json.loads((GOLDEN / f"{name}.predict.json").read_text()))
     json.dumps(document, allow_nan=False)
 
 
 def test_noise_on_the_air_belongs_to_steps_only():
-    document = predict(ValidExperiment.load(GOLDEN / "air.yaml")).to_json()
+    document = predict(Experiment.load(GOLDEN / "air.yaml")).to_json()
     assert document["continuous"] is None
     assert document["static"] is None
 
 
 def test_discrete_time_has_no_other_laws():
-    document = predict(ValidExperiment.load(GOLDEN / "discrete.yaml")).to_json()
+    document = predict(Experiment.load(GOLDEN / "discrete.yaml")).to_json()
     assert "continuous" not in document
     assert "emulated" not in document
 
@@ -171,7 +171,7 @@ def test_without_noise_certainty_is_undefined():
 
 
 def test_start_factor_is_the_symmetric_root_of_the_conditional_covariance():
-    e = ValidExperiment.load(GOLDEN / "tracking.yaml")
+    e = Experiment.load(GOLDEN / "tracking.yaml")
     golden = json.loads((GOLDEN / "tracking.predict.json").read_text())
     for mode in range(3):
         factor = stationary_start_factor(e, mode)
@@ -203,7 +203,7 @@ def test_a_law_that_does_not_exist_is_an_error_with_the_reason(changes: dict, la
         "switching": {"generator": [[-1, 1], [1, -1]]},
         "run": {"duration": 10} if "time" in changes else {"dt": 0.05, "duration": 10},
     }
-    prediction = predict(ValidExperiment.parse(document | changes))
+    prediction = predict(Experiment.parse(document | changes))
     with pytest.raises(NotAvailableError, match=reason):
         getattr(prediction, law)
     assert prediction.emulated.system_error > 0

@@ -6,7 +6,7 @@ import functools
 import numpy as np
 import pytest
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.graph_path import past_modes
 from msg_analysis.model.phases import phases
 from msg_analysis.model.step_model import build_run_model, build_step_model, ideal_uses, sequential
@@ -25,7 +25,7 @@ def experiment(**changes):
         "switching": {"generator": [[-1.0, 1.0], [2.0, -2.0]]},
         "run": run,
     }
-    return ValidExperiment.parse(document | changes)
+    return Experiment.parse(document | changes)
 
 
 TRACKING = {"problem": "tracking", "leaders": {"agents": [2], "gain": 0.7, "reference": 2.5}}
@@ -103,7 +103,7 @@ def test_line_and_ring():
         "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
         "run": {"dt": 0.1, "duration": 10, "pace": "realtime"},
     }
-    what = ValidExperiment.parse(document)
+    what = Experiment.parse(document)
     errors = [predict(what.with_run(seed=seed)).emulated.system_error for seed in range(8)]
     assert np.mean(errors) == pytest.approx(1.4868, abs=3e-4)
     assert np.ptp(errors) < 1e-3

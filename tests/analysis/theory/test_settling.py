@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 from switching_systems import LINE_RING, network, steady_of
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory import settling, transient
 from msg_analysis.theory.prediction import predict
@@ -18,7 +18,7 @@ from msg_analysis.theory.transient import point_start, start_of
 @pytest.mark.parametrize("law", ["continuous", "steps"])
 @pytest.mark.parametrize("place", [np.zeros(5), np.array([3.0, 0.0, 0.0, 0.0, -3.0]), np.array([0.5, 0, 0, 0, -0.5])])
 def test_settling_time_is_the_last_crossing(law, place, monkeypatch):
-    experiment = ValidExperiment.parse(LINE_RING)
+    experiment = Experiment.parse(LINE_RING)
     system = systems.continuous(experiment) if law == "continuous" else predict(experiment).system
     steady = steady_of(system)
     start = point_start(system, place, np.array([1.0, 0.0]))
@@ -43,7 +43,7 @@ def test_settling_time_is_the_last_crossing(law, place, monkeypatch):
 def test_settling_of_one_pair_in_closed_form():
     """Two agents, one edge: the disagreement has variance (1 - exp(-4 t)) / 4, settled at log(20) / 4."""
     document = LINE_RING | {"graphs": {"pair": {"path": [1, 2]}}, "switching": {}}
-    system = systems.continuous(ValidExperiment.parse(document))
+    system = systems.continuous(Experiment.parse(document))
     steady = steady_of(system)
     assert settling_time(system, steady, point_start(system, np.zeros(2))) == pytest.approx(np.log(20) / 4, rel=1e-9)
     rates = asymptotic_rates(system)
@@ -52,7 +52,7 @@ def test_settling_of_one_pair_in_closed_form():
 
 
 def test_settled_from_the_start_and_slow_graphs():
-    experiment = ValidExperiment.parse(LINE_RING)
+    experiment = Experiment.parse(LINE_RING)
     system = systems.continuous(experiment)
     steady = steady_of(system)
     assert settling_time(system, steady, start_of(experiment, system, steady)) == 0.0

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from switching_systems import LINE_RING, network, steady_of
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory import rational_krylov, transient
 from msg_analysis.theory.prediction import predict
@@ -80,7 +80,7 @@ def test_steps_are_the_plain_recursion(seed, m, n, kind):
     if kind == "loss":
         document = experiment.to_document()
         document["noise"]["loss"] = 0.2
-        experiment = ValidExperiment.parse(document)
+        experiment = Experiment.parse(document)
     prediction = predict(experiment)
     step = prediction.step
     random = np.random.default_rng(seed)
@@ -146,7 +146,7 @@ def test_simulation():
 
 
 def test_stationary_start_stays_and_long_times_are_the_steady_state():
-    experiment = ValidExperiment.parse(LINE_RING)
+    experiment = Experiment.parse(LINE_RING)
     system = systems.continuous(experiment)
     steady = steady_of(system)
     start = start_of(experiment, system, steady)
@@ -170,7 +170,7 @@ def test_stiff_systems(rate, gain):
         "noise": {"process": [1.0, 0.5, 2.0]},
         "run": {"dt": 1e-7, "duration": 1e-5},
     }
-    system = systems.continuous(ValidExperiment.parse(document))
+    system = systems.continuous(Experiment.parse(document))
     eye = np.eye(3)
     n, size = 2, 9
     flow, drift = np.zeros((2, n * size + n, n * size + n))
@@ -220,7 +220,7 @@ def test_sixty_agents_in_continuous_time():
     document = LINE_RING | {
         "graphs": {"line": {"path": list(range(1, m + 1))}, "ring": {"cycle": list(range(1, m + 1))}},
     }
-    experiment = ValidExperiment.parse(document)
+    experiment = Experiment.parse(document)
     system = systems.held(systems.continuous(experiment), 0)
     values = np.linalg.eigvalsh(experiment.graph_list[0].laplacian)[1:]
     times = np.array([0.0, 0.01, 1.0, 30.0, 1e4])
@@ -236,7 +236,7 @@ def test_sixty_agents_in_continuous_time():
 
 
 def test_uniform_grids_of_many_times():
-    system = systems.continuous(ValidExperiment.parse(LINE_RING))
+    system = systems.continuous(Experiment.parse(LINE_RING))
     steady, start = steady_of(system), point_start(system, np.arange(5.0))
     times = 0.1 * np.arange(301)
     found = transient.transient(system, start, times, steady)
@@ -247,7 +247,7 @@ def test_uniform_grids_of_many_times():
 
 @pytest.mark.parametrize("times", [[], [-1.0], [1.0, 0.5], [np.nan]])
 def test_times_that_are_none(times):
-    system = systems.continuous(ValidExperiment.parse(LINE_RING))
+    system = systems.continuous(Experiment.parse(LINE_RING))
     with pytest.raises(InputError, match="ascending"):
         transient.transient(system, point_start(system, np.zeros(5)), np.array(times))
 
@@ -255,7 +255,7 @@ def test_times_that_are_none(times):
 def test_delay_and_loss():
     """The mean after one step is that of W from the start (nobody has older values); the end is the prediction."""
     document = LINE_RING | {"noise": {"process": 1.0, "loss": 0.1, "delay": 2}}
-    experiment = ValidExperiment.parse(document)
+    experiment = Experiment.parse(document)
     prediction = predict(experiment)
     place = np.array([1.0, -2.0, 0.0, 4.0, 0.5])
     start = point_start(prediction.system, place, np.array([1.0, 0.0]))
@@ -268,7 +268,7 @@ def test_delay_and_loss():
 
 
 def test_memory_of_large_systems(monkeypatch):
-    system = systems.continuous(ValidExperiment.parse(LINE_RING))
+    system = systems.continuous(Experiment.parse(LINE_RING))
     monkeypatch.setattr(transient, "MAX_UNKNOWNS", 1)
     monkeypatch.setattr(rational_krylov, "MAX_BYTES", 1.0)
     with pytest.raises(InputError, match="GB in continuous time"):
@@ -276,7 +276,7 @@ def test_memory_of_large_systems(monkeypatch):
 
 
 def test_what_is_refused():
-    prediction = predict(ValidExperiment.parse(LINE_RING))
+    prediction = predict(Experiment.parse(LINE_RING))
     system, start = prediction.system, point_start(prediction.system, np.zeros(5))
     with pytest.raises(InputError, match="whole numbers of steps"):
         transient.transient(system, start, np.array([0.5]), prediction.steady)

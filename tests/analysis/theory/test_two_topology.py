@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict
@@ -52,7 +52,7 @@ def random_experiment(
         document["switching"] = {"transition": [[1 - q12, q12], [q21, 1 - q21]]}
     if problem == "tracking":
         document["leaders"] = {"agents": [1], "gain": gain}
-    return ValidExperiment.parse(document)
+    return Experiment.parse(document)
 
 
 def with_rate(system, rate):
@@ -168,7 +168,7 @@ def test_agreement_at_a_large_rate_with_the_formula_of_the_paper():
     document = experiment.to_document()
     pi = experiment.chain.stationary
     document["switching"] = {"generator": [[-beta * pi[1], beta * pi[1]], [beta * pi[0], -beta * pi[0]]]}
-    _, error = printed_consensus(ValidExperiment.parse(document))
+    _, error = printed_consensus(Experiment.parse(document))
     np.testing.assert_allclose(two_topology(with_rate(system, beta)).node_errors, error, rtol=1e-9)
 
 
@@ -214,7 +214,7 @@ def test_what_is_refused():
     document = random_experiment(1, 3).to_document()
     document["graphs"] = {"first": {"edges": [[1, 2]]}, "second": {"edges": [[2, 3]]}}
     with pytest.raises(InputError, match="graph 1 held fixed has no steady error"):
-        two_topology(systems.continuous(ValidExperiment.parse(document)))
+        two_topology(systems.continuous(Experiment.parse(document)))
     system = systems.continuous(random_experiment(1, 3))
     with pytest.raises(InputError, match="1 graphs, expected 2"):
         two_topology(systems.held(system, 0))

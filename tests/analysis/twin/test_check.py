@@ -13,15 +13,15 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import FloatArray, IntArray, in_file
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.model.run import Trajectory
+from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.run import Run
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
 
 @pytest.fixture(scope="module")
-def twin() -> Trajectory:
-    experiment = ValidExperiment.parse(
+def twin() -> Run:
+    experiment = Experiment.parse(
         {
             "name": "checked",
             "problem": "consensus",
@@ -35,10 +35,10 @@ def twin() -> Trajectory:
 
 
 @pytest.fixture
-def stored(twin: Trajectory, tmp_path: Path) -> Callable[..., Trajectory]:
+def stored(twin: Run, tmp_path: Path) -> Callable[..., Run]:
     """The twin with other states or modes, written to a bag and read again."""
 
-    def store(states: FloatArray | None = None, modes: IntArray | None = None) -> Trajectory:
+    def store(states: FloatArray | None = None, modes: IntArray | None = None) -> Run:
         changed = dataclasses.replace(
             twin,
             states=twin.states if states is None else states,
@@ -58,7 +58,7 @@ def flip(states: FloatArray, *where: int) -> FloatArray:
     return changed
 
 
-def test_a_long_run(stored: Callable[..., Trajectory], twin: Trajectory, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_run(stored: Callable[..., Run], twin: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Logged and computed states are in files and compared in pieces, here of ten steps."""
     monkeypatch.setattr(arrays, "LARGE", 1)
     monkeypatch.setattr(arrays, "BLOCK_NUMBERS", 60)
@@ -75,7 +75,7 @@ def test_a_long_run(stored: Callable[..., Trajectory], twin: Trajectory, monkeyp
     assert outcome.missing == 1
 
 
-def test_equal(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
+def test_equal(twin: Run, stored: Callable[..., Run]) -> None:
     outcome = check(stored())
     assert outcome.difference is None
     assert outcome.compared == twin.states.shape[0] * 3
@@ -83,7 +83,7 @@ def test_equal(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
 
 
 @pytest.mark.parametrize("where", [(0, 0, 0), (17, 2, 1), (400, 1, 0)])
-def test_one_bit(twin: Trajectory, stored: Callable[..., Trajectory], where: tuple[int, int, int]) -> None:
+def test_one_bit(twin: Run, stored: Callable[..., Run], where: tuple[int, int, int]) -> None:
     step, agent, replica = where
     changed = flip(twin.states, *where)
     difference = check(stored(changed)).difference
@@ -93,12 +93,12 @@ def test_one_bit(twin: Trajectory, stored: Callable[..., Trajectory], where: tup
     )
 
 
-def test_the_first_of_several_is_named(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
+def test_the_first_of_several_is_named(twin: Run, stored: Callable[..., Run]) -> None:
     changed = flip(flip(flip(twin.states, 30, 0, 1), 29, 2, 0), 29, 1, 1)
     assert str(check(stored(changed)).difference).startswith("agent 2 at step 29, replica 2:")
 
 
-def test_wrong_graph(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
+def test_wrong_graph(twin: Run, stored: Callable[..., Run]) -> None:
     modes = twin.modes.copy()
     modes[40:50] = 1 - modes[40:50]
     names = ["line", "ring"]
@@ -108,7 +108,7 @@ def test_wrong_graph(twin: Trajectory, stored: Callable[..., Trajectory]) -> Non
 
 @pytest.mark.parametrize(("state_step", "first"), [(40, "agent 1"), (41, "graph")])
 def test_state_or_graph_whichever_came_first(
-    twin: Trajectory, stored: Callable[..., Trajectory], state_step: int, first: str
+    twin: Run, stored: Callable[..., Run], state_step: int, first: str
 ) -> None:
     """x(40) is older than the choice of g(40), x(41) comes out of it."""
     modes = twin.modes.copy()
@@ -117,7 +117,7 @@ def test_state_or_graph_whichever_came_first(
     assert str(outcome.difference).startswith(first)
 
 
-def test_missing_states_are_counted_and_do_not_differ(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
+def test_missing_states_are_counted_and_do_not_differ(twin: Run, stored: Callable[..., Run]) -> None:
     states = twin.states.copy()
     states[100:, 1] = np.nan
     outcome = check(stored(states))
@@ -126,6 +126,6 @@ def test_missing_states_are_counted_and_do_not_differ(twin: Trajectory, stored: 
     assert outcome.compared == states.shape[0] * 3 - outcome.missing
 
 
-def test_another_seed_differs_at_once(twin: Trajectory, stored: Callable[..., Trajectory]) -> None:
+def test_another_seed_differs_at_once(twin: Run, stored: Callable[..., Run]) -> None:
     other = simulate(twin.record.experiment.with_run(seed=6))
     assert str(check(stored(other.states)).difference).startswith("agent 1 at step 0")

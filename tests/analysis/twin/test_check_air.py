@@ -10,16 +10,16 @@ import pytest
 
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.model.run import Trajectory
+from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.run import Run
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
 
 @pytest.fixture(scope="module")
-def twin() -> Trajectory:
+def twin() -> Run:
     return simulate(
-        ValidExperiment.parse(
+        Experiment.parse(
             {
                 "name": "checked",
                 "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
@@ -31,17 +31,17 @@ def twin() -> Trajectory:
     )
 
 
-def stored(trajectory: Trajectory, directory: Path) -> Trajectory:
+def stored(trajectory: Run, directory: Path) -> Run:
     write_trajectory(trajectory, directory / "bag")
     return read_bag(directory / "bag")
 
 
-def test_equal(twin: Trajectory, tmp_path: Path) -> None:
+def test_equal(twin: Run, tmp_path: Path) -> None:
     outcome = check(stored(twin, tmp_path))
     assert (outcome.difference, outcome.missing, outcome.compared) == (None, 0, 2 * 3 * 401)
 
 
-def test_published(twin: Trajectory, tmp_path: Path) -> None:
+def test_published(twin: Run, tmp_path: Path) -> None:
     assert twin.published is not None
     published = twin.published.copy()
     published[30, 1, 1] = np.nextafter(published[30, 1, 1], 9.0)
@@ -53,7 +53,7 @@ def test_published(twin: Trajectory, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("changed_state", "first"), [(50, "agent 1 at step 50"), (51, "the message")])
-def test_losses(twin: Trajectory, tmp_path: Path, changed_state: int, first: str) -> None:
+def test_losses(twin: Run, tmp_path: Path, changed_state: int, first: str) -> None:
     """Step 50 leads to x(51). Agent 2 hears agents 1 and 3 in both graphs."""
     assert twin.lost is not None
     lost, states = twin.lost.copy(), twin.states.copy()
@@ -69,7 +69,7 @@ def test_losses(twin: Trajectory, tmp_path: Path, changed_state: int, first: str
         )
 
 
-def test_missing_truth_or_publication_is_counted(twin: Trajectory, tmp_path: Path) -> None:
+def test_missing_truth_or_publication_is_counted(twin: Run, tmp_path: Path) -> None:
     assert twin.published is not None
     published, states = twin.published.copy(), twin.states.copy()
     published[300:, 1] = np.nan

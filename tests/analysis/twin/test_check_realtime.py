@@ -15,12 +15,12 @@ from msg_analysis.arithmetic.update_law import from_payload, to_payload
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.agent_law import agent_law
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.phases import phases
 from msg_analysis.model.process_noise import ProcessNoise
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.step_model import build_step_model
 from msg_analysis.twin.check import check
 from msg_analysis.twin.log_replay import replay
@@ -39,7 +39,7 @@ DOCUMENT: dict[str, Any] = {
 }
 
 
-def emulate(experiment: ValidExperiment, seed: int) -> Trajectory:
+def emulate(experiment: Experiment, seed: int) -> Run:
     """Agents step late by chance, hear late by chance, learn of the graph late by chance."""
     record, model = new_record(experiment), build_step_model(experiment)
     modes = mode_path(experiment, model.initial)
@@ -77,20 +77,20 @@ def emulate(experiment: ValidExperiment, seed: int) -> Trajectory:
         drive = noise.block(i, k // STEPS_PER_BLOCK)[mode][k % STEPS_PER_BLOCK] + model.offsets[mode, i]
         states[k + 1, i] = total + drive
     count = (steps + 1) * agents
-    return Trajectory(record, states, modes, Completeness(count, count, 0), agent_modes, used=used, made=made)
+    return Run(record, states, modes, Completeness(count, count, 0), agent_modes, used=used, made=made)
 
 
 @pytest.fixture(scope="module")
-def run() -> Trajectory:
-    return emulate(ValidExperiment.parse(DOCUMENT), 1)
+def run() -> Run:
+    return emulate(Experiment.parse(DOCUMENT), 1)
 
 
-def stored(trajectory: Trajectory, directory: Path) -> Trajectory:
+def stored(trajectory: Run, directory: Path) -> Run:
     write_trajectory(trajectory, directory / "bag")
     return read_bag(directory / "bag")
 
 
-def test_equal(run: Trajectory, tmp_path: Path) -> None:
+def test_equal(run: Run, tmp_path: Path) -> None:
     assert run.agent_modes is not None
     assert (run.agent_modes[1:] != run.modes[:, None]).any()
     outcome = check(stored(run, tmp_path))
@@ -104,7 +104,7 @@ def flipped(states: FloatArray, *where: int) -> FloatArray:
 
 
 @pytest.mark.parametrize("step", [0, 1, 300, 400])
-def test_the_last_bit(run: Trajectory, tmp_path: Path, step: int) -> None:
+def test_the_last_bit(run: Run, tmp_path: Path, step: int) -> None:
     states = flipped(run.states, step, 2, 1)
     difference = check(stored(dataclasses.replace(run, states=states), tmp_path)).difference
     assert difference == (
@@ -113,7 +113,7 @@ def test_the_last_bit(run: Trajectory, tmp_path: Path, step: int) -> None:
     )
 
 
-def test_something_else_used(run: Trajectory, tmp_path: Path) -> None:
+def test_something_else_used(run: Run, tmp_path: Path) -> None:
     assert run.used is not None
     used = run.used.copy()
     used[200, 1, 0] -= 1
@@ -122,7 +122,7 @@ def test_something_else_used(run: Trajectory, tmp_path: Path) -> None:
     assert difference.startswith("agent 2 at step 201, replica 1: logged")
 
 
-def test_used_before_it_was_made(run: Trajectory, tmp_path: Path) -> None:
+def test_used_before_it_was_made(run: Run, tmp_path: Path) -> None:
     """By agent 2, who hears agent 1 in both graphs, at least."""
     assert run.used is not None
     assert run.made is not None
@@ -138,7 +138,7 @@ def test_used_before_it_was_made(run: Trajectory, tmp_path: Path) -> None:
     )
 
 
-def test_another_graph(run: Trajectory, tmp_path: Path) -> None:
+def test_another_graph(run: Run, tmp_path: Path) -> None:
     modes = run.modes.copy()
     modes[100:] = 1 - modes[100:]
     difference = check(stored(dataclasses.replace(run, modes=modes), tmp_path)).difference
@@ -146,7 +146,7 @@ def test_another_graph(run: Trajectory, tmp_path: Path) -> None:
     assert difference.startswith("graph of step 100: logged ")
 
 
-def test_gaps(run: Trajectory, tmp_path: Path) -> None:
+def test_gaps(run: Run, tmp_path: Path) -> None:
     """What cannot be computed for want of something is missing, not different; what comes after it is checked."""
     states = run.states.copy()
     states[50, 1] = np.nan
@@ -159,10 +159,10 @@ def test_gaps(run: Trajectory, tmp_path: Path) -> None:
     assert difference.startswith("agent 4 at step 390, replica 1")
 
 
-def test_each_step_is_that_of_the_agent(run: Trajectory) -> None:
+def test_each_step_is_that_of_the_agent(run: Run) -> None:
     """Whatever was logged: any states, graphs and values used, old or lost, some missing, with noise on the air."""
     noise = {"process": 1.0, "broadcast": 0.2, "link": 0.3, "loss": 0.2}
-    record = new_record(ValidExperiment.parse(DOCUMENT | {"noise": noise}))
+    record = new_record(Experiment.parse(DOCUMENT | {"noise": noise}))
     random, (count, m, replicas) = np.random.default_rng(7), run.states.shape
     states, published = random.normal(size=(2, count, m, replicas))
     states[random.random((count, m)) < 0.05] = np.nan

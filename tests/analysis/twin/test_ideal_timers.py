@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from msg_analysis.arithmetic.update_law import from_payload, to_payload
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.agent_law import agent_law
 from msg_analysis.model.phases import phases
 from msg_analysis.model.step_model import build_step_model
@@ -27,7 +27,7 @@ def experiment(run=None, **changes):
         "switching": {"generator": [[-2.0, 2.0], [3.0, -3.0]]},
         "run": {"dt": 0.1, "duration": 60, "replicas": 3, "seed": 8, "pace": "realtime"} | (run or {}),
     }
-    return ValidExperiment.parse(document | changes)
+    return Experiment.parse(document | changes)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -12,10 +12,10 @@ from links_by_hand import assert_by_hand
 from msg_analysis.arithmetic import update_law
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.agent_law import agent_law
 from msg_analysis.model.reception import LOST
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
@@ -48,7 +48,7 @@ LAWS: dict[str, dict[str, Any]] = {
 PACES = ("lockstep", "realtime")
 
 
-def experiment(law: str, air: str, pace: str = "lockstep", **run: Any) -> ValidExperiment:
+def experiment(law: str, air: str, pace: str = "lockstep", **run: Any) -> Experiment:
     document: dict[str, Any] = {
         "name": "links",
         "agents": 4,
@@ -60,11 +60,11 @@ def experiment(law: str, air: str, pace: str = "lockstep", **run: Any) -> ValidE
     dt = 1.0 if discrete else 0.05
     times = {"dt": dt, "duration": 340 * dt, "replicas": 2, "seed": 5, "pace": pace, "start": [1.0, -2.0, 0.5, 3.0]}
     noise = {"process": document.pop("process", 0.5), **AIRS[air]}
-    return ValidExperiment.parse(document | {"switching": chain, "noise": noise, "run": times | run})
+    return Experiment.parse(document | {"switching": chain, "noise": noise, "run": times | run})
 
 
 @functools.cache
-def run(law: str, air: str, pace: str = "lockstep") -> Trajectory:
+def run(law: str, air: str, pace: str = "lockstep") -> Run:
     """Of the twin; made once for all tests that only look at it."""
     return simulate(experiment(law, air, pace))
 

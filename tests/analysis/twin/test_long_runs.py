@@ -16,7 +16,7 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import in_file
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.reception import MessagesUsed
@@ -42,7 +42,7 @@ RUNS: dict[str, dict[str, Any]] = {
 }
 
 
-def experiment(case: str, steps: int, replicas: int = 2) -> ValidExperiment:
+def experiment(case: str, steps: int, replicas: int = 2) -> Experiment:
     changes = RUNS[case]
     document: dict[str, Any] = {
         "name": "long",
@@ -50,7 +50,7 @@ def experiment(case: str, steps: int, replicas: int = 2) -> ValidExperiment:
         "switching": {"generator": [[-1, 1], [1, -1]]},
     }
     run = {"dt": 0.05, "duration": 0.05 * steps, "replicas": replicas, "seed": 5} | changes.get("run", {})
-    return ValidExperiment.parse(document | changes | {"run": run})
+    return Experiment.parse(document | changes | {"run": run})
 
 
 @pytest.mark.parametrize("case", RUNS)

@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 
 from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, generator
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.agent_law import agent_law
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.step_model import build_step_model
@@ -50,14 +50,14 @@ CASES = {
 }
 
 
-def experiment(case: str, **run: object) -> ValidExperiment:
+def experiment(case: str, **run: object) -> Experiment:
     document: dict = {"name": "case"} | CASES[case]
     discrete = document.get("time") == "discrete"
     document["switching"] = (
         {"transition": [[0.9, 0.1], [0.3, 0.7]]} if discrete else {"generator": [[-1.0, 1.0], [2.0, -2.0]]}
     )
     document["run"] = {"dt": 1.0 if discrete else 0.1, "duration": 600 if discrete else 60, "seed": 5} | run
-    return ValidExperiment.parse(document)
+    return Experiment.parse(document)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -164,8 +164,8 @@ def test_another_agent_changes_nobody_elses_noise() -> None:
         "name": "large",
         "graphs": {"a": {"arcs": [[1, 2], [2, 1], [2, 3]]}, "b": {"arcs": [[1, 2], [2, 1], [3, 4]]}},
     }
-    two = simulate(ValidExperiment.parse(small | {"run": run}))
-    four = simulate(ValidExperiment.parse(large | {"run": run | {"start": [1.0, 2.0, 0.0, 0.0]}}))
+    two = simulate(Experiment.parse(small | {"run": run}))
+    four = simulate(Experiment.parse(large | {"run": run | {"start": [1.0, 2.0, 0.0, 0.0]}}))
     assert np.array_equal(two.states, four.states[:, :2])
 
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.agent_law import agent_law
 from msg_analysis.model.reception import LOST
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.step_model import build_step_model
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
@@ -47,15 +47,13 @@ LAWS: dict[str, dict[str, Any]] = {
 }
 
 
-def experiment(law: str, air: str, **run: Any) -> ValidExperiment:
+def experiment(law: str, air: str, **run: Any) -> Experiment:
     document: dict[str, Any] = {"name": "air", "agents": 4, **LAWS[law]}
     discrete = document.get("time") == "discrete"
     chain = {"transition": [[0.9, 0.1], [0.3, 0.7]]} if discrete else {"generator": [[-1.0, 1.0], [2.0, -2.0]]}
     dt, steps = (1.0, 300) if discrete else (0.1, 300)
     times = {"dt": dt, "duration": steps * dt, "replicas": 2, "seed": SEED}
-    return ValidExperiment.parse(
-        document | {"switching": chain, "noise": {"process": 0.5, **AIRS[air]}, "run": times | run}
-    )
+    return Experiment.parse(document | {"switching": chain, "noise": {"process": 0.5, **AIRS[air]}, "run": times | run})
 
 
 def philox(stream: int, number: int, block: int) -> np.random.Generator:
@@ -142,7 +140,7 @@ def test_agents_alone_equal_the_whole(law: str, resumed: int) -> None:
             assert agent.heard == (tuple(LOST if gone else k for gone in lost) if lost.any() else ())
 
 
-def same_air(one: Trajectory, other: Trajectory, agents: int) -> None:
+def same_air(one: Run, other: Run, agents: int) -> None:
     assert one.published is not None
     assert other.published is not None
     assert one.lost is not None
@@ -156,16 +154,16 @@ def test_the_air_depends_on_nothing_else() -> None:
     base = {"name": "base", "graphs": {"a": {"path": [1, 2, 3]}, "b": {"path": [1, 2, 3]}}}
     base |= {"switching": {"generator": [[-1.0, 1.0], [1.0, -1.0]]}, "noise": AIRS["all"]}
     base["run"] = {"duration": 20, "seed": SEED, "start": "zero"}
-    one = simulate(ValidExperiment.parse(base))
+    one = simulate(Experiment.parse(base))
     heavy = {"a": {"edges": [[1, 2, 2.0], [2, 3]]}, "b": {"edges": [[1, 2], [2, 3, 3.0]]}}
     four = {"a": {"path": [1, 2, 3, 4]}, "b": {"path": [1, 2, 3, 4]}}
     for changes in ({"graphs": heavy}, {"noise": AIRS["all"] | {"process": 0.1}}, {"graphs": four}):
-        other = simulate(ValidExperiment.parse(base | changes))
+        other = simulate(Experiment.parse(base | changes))
         same_air(one, other, 3)
         assert one.lost is not None
         assert other.lost is not None
         assert np.array_equal(one.lost[:, :2], other.lost[:, :2])
-    many = simulate(ValidExperiment.parse(base | {"run": base["run"] | {"replicas": 7}}))
+    many = simulate(Experiment.parse(base | {"run": base["run"] | {"replicas": 7}}))
     assert many.lost is not None
     assert np.array_equal(one.lost, many.lost)
 

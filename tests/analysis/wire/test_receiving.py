@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.acceptance import Refusal, RunRules, decode_of_run, sign, state_frame, state_receiver
 from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, encode_string
 from msg_analysis.messages.topics import END, PROGRESS, RESEND
@@ -21,7 +21,7 @@ from msg_analysis.model.step_model import first_graph
 from msg_analysis.twin.simulate import new_record
 
 RECORD = new_record(
-    ValidExperiment.parse(
+    Experiment.parse(
         {
             "name": "pair",
             "graphs": {"line": {"path": [1, 2]}},
@@ -89,7 +89,7 @@ def test_longest_message(changes: dict[str, Any], listed: int) -> None:
 
 
 SWITCHING = new_record(
-    ValidExperiment.parse(
+    Experiment.parse(
         {
             "name": "net",
             "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tests.analysis.theory.test_message_steps import Brute, parse
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.step_model import build_run_model
 from msg_analysis.theory.fourth_moments import (
     FourthMoment,
@@ -45,7 +45,7 @@ LOSSY = HEAVY | {
 
 
 def of(document, **noise):
-    experiment = ValidExperiment.parse(document | {"noise": document["noise"] | noise})
+    experiment = Experiment.parse(document | {"noise": document["noise"] | noise})
     prediction = predict(experiment)
     return build_run_model(experiment, prediction.step), prediction
 
