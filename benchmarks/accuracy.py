@@ -22,7 +22,7 @@ import scipy.linalg
 from threadpoolctl import threadpool_limits
 
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory.jump_system import continuous
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import predict
@@ -44,7 +44,7 @@ class Row:
     difference: float
 
 
-def random_experiment(seed: int, agents: int, graphs: int, *, rate: float = 1.0, dt: float = 0.02) -> ValidExperiment:
+def random_experiment(seed: int, agents: int, graphs: int, *, rate: float = 1.0, dt: float = 0.02) -> Experiment:
     """Connected random graphs with random weights, correlated noise, and rates of about the given size."""
     random = np.random.default_rng(seed)
     documents = {}
@@ -62,7 +62,7 @@ def random_experiment(seed: int, agents: int, graphs: int, *, rate: float = 1.0,
         rates = random.uniform(0.2, 2.0, (graphs, graphs)) * rate
         np.fill_diagonal(rates, 0.0)
         switching = {"generator": (rates - np.diag(rates.sum(axis=1))).tolist()}
-    return ValidExperiment.parse(
+    return Experiment.parse(
         {
             "name": "accuracy",
             "graphs": documents,
@@ -73,7 +73,7 @@ def random_experiment(seed: int, agents: int, graphs: int, *, rate: float = 1.0,
     )
 
 
-def kronecker_continuous(experiment: ValidExperiment) -> FloatArray:
+def kronecker_continuous(experiment: Experiment) -> FloatArray:
     """(m, m) covariance by the paper's steady-state formula as printed, its n m^2 matrix inverted by pinv."""
     m, n, chain = experiment.agents, experiment.chain.modes, experiment.chain
     projector, eye = np.eye(m) - 1 / m, np.eye(m)
@@ -87,7 +87,7 @@ def kronecker_continuous(experiment: ValidExperiment) -> FloatArray:
     return np.asarray(solution.reshape(n, m, m).sum(axis=0))
 
 
-def kronecker_emulated(experiment: ValidExperiment) -> FloatArray:
+def kronecker_emulated(experiment: Experiment) -> FloatArray:
     """(m, m) covariance of the run's Euler steps by the unreduced discrete equations."""
     m, n, dt = experiment.agents, experiment.chain.modes, experiment.step_length
     projector = np.eye(m) - 1 / m
@@ -106,7 +106,7 @@ def kronecker_emulated(experiment: ValidExperiment) -> FloatArray:
     return np.asarray(np.linalg.solve(matrix, right.ravel()).reshape(n, m, m).sum(axis=0))
 
 
-def timed(function: Callable[[ValidExperiment], Result], experiment: ValidExperiment) -> tuple[Result, float]:
+def timed(function: Callable[[Experiment], Result], experiment: Experiment) -> tuple[Result, float]:
     """What a function says about an experiment, and the seconds that it took."""
     began = time.perf_counter()
     result = function(experiment)
@@ -143,7 +143,7 @@ def resistances() -> Iterator[Row]:
         ("grid of 5 x 6", nx.convert_node_labels_to_integers(nx.grid_2d_graph(5, 6))),
     ):
         links = [[i + 1, j + 1] for i, j in graph.edges]
-        experiment = ValidExperiment.parse({"name": "one", "graphs": {"g": {"edges": links}}, "run": {"dt": 0.01}})
+        experiment = Experiment.parse({"name": "one", "graphs": {"g": {"edges": links}}, "run": {"dt": 0.01}})
         prediction, seconds = timed(predict, experiment)
         kirchhoff = nx.effective_graph_resistance(graph) / (2 * len(graph))
         error = difference(np.array([prediction.continuous.system_error]), np.array([kirchhoff]))
@@ -154,7 +154,7 @@ PIECES = {"first": {"edges": [[1, 2], [3, 4]]}, "second": {"edges": [[2, 3]]}}
 LINE_RING = {"first": {"path": [1, 2, 3, 4]}, "second": {"cycle": [1, 2, 3, 4]}}
 
 
-def sixty_digits(experiment: ValidExperiment) -> FloatArray:
+def sixty_digits(experiment: Experiment) -> FloatArray:
     """(m, m) covariance in continuous time by the Kronecker form in a Helmert basis, all in 60 digits; F = I."""
     with mpmath.workdps(60):
         m, n = experiment.agents, experiment.chain.modes
@@ -201,7 +201,7 @@ def extremes() -> Iterator[Row]:
 def extreme(case: str, document: dict[str, Any], rate: float) -> Row:
     """One of them."""
     generator = [[-rate, rate], [rate / 1000, -rate / 1000]]
-    experiment = ValidExperiment.parse(
+    experiment = Experiment.parse(
         {"name": "extreme", "agents": 4, "switching": {"generator": generator}, "run": {"dt": 1e-7, "duration": 1e-4}}
         | document
     )
@@ -214,7 +214,7 @@ def extreme(case: str, document: dict[str, Any], rate: float) -> Row:
 def printed() -> Iterator[Row]:
     """Example 1 of the paper: as good as its five digits."""
     for (forth, back), certainty in PAPER.items():
-        experiment = ValidExperiment.parse(
+        experiment = Experiment.parse(
             {
                 "name": "example_1",
                 "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.common.resources import count_cores
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.sequential_sums import WatchedEvidence
 from msg_analysis.theory.prediction import Prediction, predict
@@ -54,7 +54,7 @@ FAULTS: dict[str, dict[str, Any]] = {
 }
 
 
-def experiment(seed: int, duration: float, **changes: Any) -> ValidExperiment:
+def experiment(seed: int, duration: float, **changes: Any) -> Experiment:
     """Line/ring, with some keys replaced."""
     run = {"dt": 0.05, "duration": duration, "replicas": 1, "seed": seed}
     document = {
@@ -64,7 +64,7 @@ def experiment(seed: int, duration: float, **changes: Any) -> ValidExperiment:
         "graphs": {"line": {"arcs": LINE}, "ring": {"arcs": RING}},
         "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
     }
-    return ValidExperiment.parse(document | changes | {"run": run | changes.get("run", {})})
+    return Experiment.parse(document | changes | {"run": run | changes.get("run", {})})
 
 
 @cache

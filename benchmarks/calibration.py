@@ -22,7 +22,7 @@ from calibration_laws import FALSE, LONG, MESSAGES, SHORT, TRUE, line_ring
 from calibration_runs import ROOT, run_all
 from calibration_tables import complaints, message_tables, tables
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.verdict import compare
@@ -33,12 +33,12 @@ PAGE = ROOT / "docs/calibration.md"
 
 
 @functools.cache
-def experiment(case: str) -> tuple[ValidExperiment, ValidExperiment]:
+def experiment(case: str) -> tuple[Experiment, Experiment]:
     """What is run, and what the record claims."""
     if case in TRUE or case in SHORT or case in MESSAGES:
-        true = ValidExperiment.parse((TRUE | SHORT | MESSAGES)[case])
+        true = Experiment.parse((TRUE | SHORT | MESSAGES)[case])
         return true, true
-    return ValidExperiment.parse(FALSE[case][0]), ValidExperiment.parse(line_ring(**LONG))
+    return Experiment.parse(FALSE[case][0]), Experiment.parse(line_ring(**LONG))
 
 
 def one_run(job: tuple[str, int], _stopping: Callable[[], bool]) -> dict[str, Any]:

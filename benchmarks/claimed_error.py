@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.step_model import build_step_model
 from msg_analysis.theory import jump_system
 from msg_analysis.theory.moments import MomentSolver
@@ -25,7 +25,7 @@ DIGITS = 80
 DECADES = (2, 6, 12)
 
 
-def random_experiment(seed: int, decades: float, *, steps: bool) -> ValidExperiment:
+def random_experiment(seed: int, decades: float, *, steps: bool) -> Experiment:
     """3 or 4 agents, 2 or 3 graphs, directed or not; weights and rates are log-uniform over so many decades.
 
     With ``steps``, dt is log-uniform from 1e-4 to 1 times half the length at which an agent overshoots. InputError
@@ -56,15 +56,15 @@ def random_experiment(seed: int, decades: float, *, steps: bool) -> ValidExperim
     if random.random() < 0.4:
         leader = {"agents": [int(random.integers(1, agents + 1))], "gain": size()}
         document |= {"problem": "tracking", "leaders": leader}
-    experiment = ValidExperiment.parse(document)
+    experiment = Experiment.parse(document)
     if not steps:
         return experiment
     pull = max((g.adjacency.sum(axis=1) + experiment.leader_gains).max() for g in experiment.graph_list)
     dt = float(0.5 / pull * 10.0 ** random.uniform(-4.0, 0.0))
-    return ValidExperiment.parse(document | {"run": {"dt": dt, "duration": 1000 * dt}})
+    return Experiment.parse(document | {"run": {"dt": dt, "duration": 1000 * dt}})
 
 
-def exact(experiment: ValidExperiment, *, steps: bool) -> FloatArray:
+def exact(experiment: Experiment, *, steps: bool) -> FloatArray:
     """(m,) node errors of the continuous law, or of the steps, from the weights, rates and noise of the file."""
     with mpmath.workdps(DIGITS):
         m, n = experiment.agents, experiment.chain.modes
@@ -113,7 +113,7 @@ def exact(experiment: ValidExperiment, *, steps: bool) -> FloatArray:
         return np.array([float(x) for x in np.diag(np.array((basis.T * total * basis).tolist()))])
 
 
-def errors(experiment: ValidExperiment, *, steps: bool) -> tuple[float, float]:
+def errors(experiment: Experiment, *, steps: bool) -> tuple[float, float]:
     """(true, claimed) relative error, the true one of the node errors over the largest; InputError: refused."""
     law = jump_system.emulated(build_step_model(experiment), experiment.problem) if steps else None
     system = law or jump_system.continuous(experiment)

@@ -26,7 +26,7 @@ from msg_agents.run.result import RunResult, conclude
 from msg_agents.run.runner import run_network
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.examples import find
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory.prediction import predict
 
 COLUMNS = (
@@ -44,18 +44,18 @@ COLUMNS = (
 BUSY = 0.5  # other processes that want to run, on average
 
 
-def predicted(experiment: ValidExperiment, loss: float) -> float | None:
+def predicted(experiment: Experiment, loss: float) -> float | None:
     """The system error with the last value heard in place of lost ones; None where this version cannot say."""
     document = experiment.to_document()
     if loss:
         document["noise"] |= {"loss": loss, "on_loss": "hold"}
     try:
-        return float(predict(ValidExperiment.parse(document)).emulated.system_error)
+        return float(predict(Experiment.parse(document)).emulated.system_error)
     except InputError:
         return None
 
 
-def measure(experiment: ValidExperiment, loss: float, delay: float, folder: Path) -> RunResult:
+def measure(experiment: Experiment, loss: float, delay: float, folder: Path) -> RunResult:
     """One run, compared."""
     link = {"loss": loss, "delay_ms": delay}
     document = {"seed": experiment.run.seed, "default": link, "recorder": "clean"}
@@ -66,7 +66,7 @@ def measure(experiment: ValidExperiment, loss: float, delay: float, folder: Path
     return result
 
 
-def row(experiment: ValidExperiment, loss: float, delay: float, repetitions: int, folder: Path) -> list[str]:
+def row(experiment: Experiment, loss: float, delay: float, repetitions: int, folder: Path) -> list[str]:
     """Cells of the table: means over the repetitions, each with a seed of its own."""
     documents: list[dict[str, Any]] = []
     packets = 0
@@ -108,7 +108,7 @@ def main() -> None:
     load = os.getloadavg()[0]
     if load > BUSY:
         print(f"this machine is busy (load {load:.1f}): agents will be late for other reasons", file=sys.stderr)
-    experiment = ValidExperiment.load(find("line_ring_realtime"))
+    experiment = Experiment.load(find("line_ring_realtime"))
     losses, delays = ([float(word) for word in words.split(",")] for words in (options.losses, options.delays))
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", flush=True)
     with tempfile.TemporaryDirectory() as folder:

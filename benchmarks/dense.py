@@ -15,16 +15,16 @@ import networkx as nx
 
 from msg_agents.nodes.agent_group import ONLY_TOPICS
 from msg_agents.run.runner import run_network
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 NETWORKS = ((24, 3, 23), (40, 4, 39), (100, 4, 6), (100, 4, 20), (100, 4, 99))  # agents, processes, neighbours
 HOPELESS = (100, 4, 99)  # with topics
 
 
-def experiment(agents: int, processes: int, neighbours: int, steps: int) -> ValidExperiment:
+def experiment(agents: int, processes: int, neighbours: int, steps: int) -> Experiment:
     """A random graph in which everybody has so many neighbours, and a ring."""
     graph = nx.random_regular_graph(neighbours, agents, seed=1)
-    return ValidExperiment.parse(
+    return Experiment.parse(
         {
             "name": "dense",
             "graphs": {
@@ -37,7 +37,7 @@ def experiment(agents: int, processes: int, neighbours: int, steps: int) -> Vali
     )
 
 
-def measure(what: ValidExperiment, environment: dict[str, str]) -> tuple[float, float]:
+def measure(what: Experiment, environment: dict[str, str]) -> tuple[float, float]:
     """Start-up [s] and steps per second."""
     begun, start = time.monotonic(), 0.0
 

@@ -19,7 +19,7 @@ import numpy as np
 from calibration_laws import TRUE, line_ring
 
 from msg_analysis.common.arrays import FloatArray, IntArray
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.step_model import StepModel
@@ -113,7 +113,7 @@ FAULTS: dict[str, tuple[Fault, str]] = {  # and the kind of the cause
 
 def one_run(fault: str | None, replicas: int, seed: int) -> Comparison:
     """Simulate and compare a run."""
-    claimed = ValidExperiment.parse(line_ring(replicas=replicas)).with_run(seed=seed)
+    claimed = Experiment.parse(line_ring(replicas=replicas)).with_run(seed=seed)
     right = simulate(claimed)
     if fault is None:
         return compare(right)
@@ -181,7 +181,7 @@ class Correct:
 
 def correct_run(law: str, seed: int) -> Correct:
     """Simulate and compare a run without a fault."""
-    result = compare(simulate(ValidExperiment.parse(CORRECT[law]).with_run(seed=seed)))
+    result = compare(simulate(Experiment.parse(CORRECT[law]).with_run(seed=seed)))
     assert result.any_time is not None
     p = {test.name: test.p for test in result.tests if " of agent" not in test.name}
     return Correct(result.verdict == "disagrees", result.any_time.disagrees, p)

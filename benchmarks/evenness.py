@@ -17,7 +17,7 @@ import numpy as np
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.run_record import RunRecord
@@ -59,7 +59,7 @@ FALSE = {
 }
 
 
-def comparisons(true: ValidExperiment, claimed: ValidExperiment, runs: int) -> Iterator[Comparison]:
+def comparisons(true: Experiment, claimed: Experiment, runs: int) -> Iterator[Comparison]:
     """Compare runs of one experiment with the prediction of another, or of the same one."""
     for seed in range(runs):
         trajectory = simulate(true.with_run(seed=seed))
@@ -72,7 +72,7 @@ def print_evenness(runs: int) -> None:
     """The p-values of runs with noise and loss on the air: even, if the tests are right."""
     print("\n| noise and loss on the air | p below 5 % | p below 50 % | Kolmogorov-Smirnov p of the p-values |")
     print("|---|---:|---:|---:|")
-    experiment = ValidExperiment.parse(line_ring(air=AIR))
+    experiment = Experiment.parse(line_ring(air=AIR))
     values: dict[str, list[float]] = {}
     for comparison in comparisons(experiment, experiment, runs):
         for test in comparison.tests:
@@ -90,7 +90,7 @@ def print_real_time(runs: int) -> None:
         "slow": late_timers.busy(0.3, 0.7),
         "switch": late_timers.busy(0.5, 1.0),
     }
-    experiment = ValidExperiment.parse(line_ring(pace="realtime", dt=0.1))
+    experiment = Experiment.parse(line_ring(pace="realtime", dt=0.1))
     values: dict[str, dict[str, list[float]]] = {}
     print("\n| real time | false alarms | deadlines missed | sequential law not supported |")
     print("|---|---:|---:|---:|")
@@ -124,11 +124,11 @@ def print_power(runs: int) -> None:
     """Runs that do not."""
     print("\n| what is wrong | found | by (share of the runs) |")
     print("|---|---:|---|")
-    claimed = ValidExperiment.parse(line_ring(**LONG))
+    claimed = Experiment.parse(line_ring(**LONG))
     for name, document in FALSE.items():
         found = 0
         by: Counter[str] = Counter()
-        for comparison in comparisons(ValidExperiment.parse(document), claimed, runs):
+        for comparison in comparisons(Experiment.parse(document), claimed, runs):
             rejected = {test.name.partition(" of agent")[0] for test in comparison.tests if test.rejected}
             found += bool(rejected)
             by.update(rejected)

@@ -32,7 +32,7 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import loading
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
 from msg_analysis.report.documents import describe_bag, describe_experiment
 
@@ -108,11 +108,11 @@ def fuzz_experiment(seed: int, files: list[Path], folder: Path) -> str:
         data += b"\n" + BOMB.encode()
     target.write_bytes(data)
     try:
-        experiment = ValidExperiment.load(target)
+        experiment = Experiment.load(target)
         experiment.unavailable()
         if max(experiment.agents, experiment.chain.modes) <= SMALL:
             describe_experiment(experiment)
-            assert ValidExperiment.parse(experiment.to_document()).to_document() == experiment.to_document()
+            assert Experiment.parse(experiment.to_document()).to_document() == experiment.to_document()
     except InputError as error:
         _check_words(error)
         return "refused"

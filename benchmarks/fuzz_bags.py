@@ -22,7 +22,7 @@ from mcap.writer import CompressionType, Writer
 from msg_analysis.bags.mcap_chunks import COMPRESSIONS, Storage
 from msg_analysis.bags.mcap_reading import MAGIC
 from msg_analysis.bags.run_writer import write_trajectory
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.messages import decode_string, encode_string
 from msg_analysis.twin.simulate import simulate
 
@@ -49,7 +49,7 @@ def make_bags(directory: Path) -> list[Path]:
     }
     bags = []
     for name, document in kinds.items():
-        trajectory = simulate(ValidExperiment.parse(document))
+        trajectory = simulate(Experiment.parse(document))
         for compression in COMPRESSIONS:
             bags.append(directory / f"{name}_{compression}")
             split = 12_000 if compression == "zstd" else None

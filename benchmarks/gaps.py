@@ -11,7 +11,7 @@ import argparse
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.online_errors import RunningErrors
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
@@ -29,7 +29,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=400)
     runs = parser.parse_args().runs
-    experiment = ValidExperiment.parse(EXPERIMENT)
+    experiment = Experiment.parse(EXPERIMENT)
     prediction, steps = predict(experiment), np.arange(experiment.steps)
     chance = np.random.default_rng(1)
     kept = {

@@ -12,11 +12,11 @@ from collections.abc import Callable
 import numpy as np
 
 from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.phases import phases
 from msg_analysis.model.process_noise import ProcessNoise
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.step_model import StepModel, build_step_model
 from msg_analysis.twin.simulate import new_record
 
@@ -34,14 +34,14 @@ def busy(share: float, mean: float) -> Lateness:
 
 
 def run(
-    experiment: ValidExperiment,
+    experiment: Experiment,
     *,
     late: Lateness = never,
     slow: Lateness = never,
     switch: Lateness = never,
     timing_seed: int = 1,
     truth: Callable[[StepModel], StepModel] | None = None,
-) -> Trajectory:
+) -> Run:
     """Run an experiment of pace realtime.
 
     Parameters
@@ -127,4 +127,4 @@ def run(
                 at(max(now, done[i] + phase[i] + late(random)), "timer", i)
     expected = (steps + 1) * m
     whole = Completeness(expected, expected, 0)
-    return Trajectory(record, states, modes, whole, agent_modes, used=used, made=made)
+    return Run(record, states, modes, whole, agent_modes, used=used, made=made)

@@ -15,11 +15,11 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from msg_analysis.cli.console import SolveProgress
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory.leaders import LeaderProblem, select_leaders
 
 
-def random_network(seed: int, agents: int, graphs: int) -> ValidExperiment:
+def random_network(seed: int, agents: int, graphs: int) -> Experiment:
     """Rings in random order, with random chords."""
     random = np.random.default_rng(seed)
     documents = {}
@@ -33,7 +33,7 @@ def random_network(seed: int, agents: int, graphs: int) -> ValidExperiment:
     rates = random.uniform(0.3, 2.0, (graphs, graphs))
     np.fill_diagonal(rates, 0.0)
     generator = (rates - np.diag(rates.sum(axis=1))).tolist()
-    return ValidExperiment.parse({"name": "leaders", "graphs": documents, "switching": {"generator": generator}})
+    return Experiment.parse({"name": "leaders", "graphs": documents, "switching": {"generator": generator}})
 
 
 def speed(quick: bool) -> Iterator[str]:

@@ -35,7 +35,7 @@ from msg_agents.run.runner import run_network
 from msg_agents.stepping.state_receiver import StateReceiver
 from msg_analysis.arithmetic.step_clock import SECOND, StepClock
 from msg_analysis.bags.writing import BagWriter
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.cdr import encode_batch
 from msg_analysis.messages.messages import STATE_HEAD, StateCodec
 from msg_analysis.messages.topics import GRAPH, PROGRESS, STATE, STATES, agent_node_name, network_topics
@@ -92,7 +92,7 @@ def batches(record: RunRecord, steps: int, rounds: int) -> Iterator[bytes]:
 
 def recorder(agents: int, steps: int, rounds: int = 20) -> None:
     """Record so many steps, ``rounds`` of each agent in a batch, and print the memory on the way."""
-    record = new_record(ValidExperiment.parse(ring(agents, steps)))
+    record = new_record(Experiment.parse(ring(agents, steps)))
     keep_freed_memory()  # as the recorder does
     receiver = StateReceiver(record, STATES, STATE, "/")
     shown = []
@@ -127,7 +127,7 @@ def network(steps: int) -> None:
 
     thread = threading.Thread(target=watch)
     thread.start()
-    run_network(ValidExperiment.parse(ring(5, steps, processes=1)), None)
+    run_network(Experiment.parse(ring(5, steps, processes=1)), None)
     done.set()
     thread.join()
     for name, values in found.items():
@@ -167,7 +167,7 @@ class MadeUpAgents(NetworkNode):
 
 def switcher(agents: int, steps: int) -> None:
     """The switcher of so many agents, which take no time."""
-    record = new_record(ValidExperiment.parse(ring(agents, steps)))
+    record = new_record(Experiment.parse(ring(agents, steps)))
     shown: list[str] = []
     with tempfile.TemporaryDirectory() as folder, free_domain() as domain:
         file = Path(folder) / "run.json"

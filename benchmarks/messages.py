@@ -13,7 +13,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.step_model import build_run_model
 from msg_analysis.theory.jump_system import emulated
 from msg_analysis.theory.moments import MomentSolver
@@ -23,10 +23,10 @@ AIR = {"broadcast": 0.2, "link": 0.3}
 HELD = {"loss": 0.3, "on_loss": "hold"}
 
 
-def network(agents: int, noise: Mapping[str, Any], pace: str = "lockstep", dt: float = 0.1) -> ValidExperiment:
+def network(agents: int, noise: Mapping[str, Any], pace: str = "lockstep", dt: float = 0.1) -> Experiment:
     """A path and a ring."""
     everybody = list(range(1, agents + 1))
-    return ValidExperiment.parse(
+    return Experiment.parse(
         {
             "name": "messages",
             "graphs": {"path": {"path": everybody}, "ring": {"cycle": everybody}},
@@ -63,7 +63,7 @@ def channels(counts: Iterable[int]) -> None:
         one(f"{count} | last value held", network(5, noise | {"on_loss": "hold"}))
 
 
-def one(name: str, experiment: ValidExperiment) -> None:
+def one(name: str, experiment: Experiment) -> None:
     """A row."""
     begin = time.process_time()
     system = emulated(build_run_model(experiment), experiment.problem)

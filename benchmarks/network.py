@@ -24,7 +24,7 @@ from pathlib import Path
 import bare_loop
 
 from msg_agents.run.runner import run_network
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"
 LARGE, PROCESSES = 100, 4  # agents, and the processes that they share
@@ -63,11 +63,11 @@ def network(
     steps: int, *, agents: int = 5, processes: int = 5, record: bool = False, executor: str = "events"
 ) -> float:
     """Steps per second of the demo network, of this many agents, in agent processes beside which the switcher runs."""
-    document = ValidExperiment.load(EXPERIMENT).to_document()
+    document = Experiment.load(EXPERIMENT).to_document()
     everybody = list(range(1, agents + 1))
     document |= {"agents": agents, "graphs": {"line": {"path": everybody}, "ring": {"cycle": everybody}}}
     document["run"] |= {"duration": round(steps * document["run"]["dt"], 6), "processes": processes}
-    experiment = ValidExperiment.parse(document)
+    experiment = Experiment.parse(document)
     with tempfile.TemporaryDirectory() as directory:
         out = Path(directory) if record else None
         result = run_network(experiment, out, environment={"MSG_AGENTS_EXECUTOR": executor})

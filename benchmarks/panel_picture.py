@@ -17,7 +17,7 @@ from msg_agents.run.runner import run_network
 from msg_agents.watch.observer import RunObserver
 from msg_agents.watch.panel import View, panel_of
 from msg_agents.watch.snapshot import Snapshot, SnapshotSource
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run_record import RunRecord
 
 ROOT = Path(__file__).parents[1]
@@ -28,7 +28,7 @@ WIDTH, HEIGHT = 80, 24
 class Picture(View):
     """Keeps the snapshot of the first moment at which all agents have reached a step."""
 
-    def __init__(self, experiment: ValidExperiment, step: int) -> None:
+    def __init__(self, experiment: Experiment, step: int) -> None:
         super().__init__(lambda _: None, print)
         self._source, self._step = SnapshotSource(experiment), step
         self._observer: RunObserver | None = None
@@ -59,7 +59,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--step", type=int, default=6000)
     options = parser.parse_args()
-    experiment = ValidExperiment.load(EXPERIMENT)
+    experiment = Experiment.load(EXPERIMENT)
     view = Picture(experiment, options.step)
     with tempfile.TemporaryDirectory() as folder:
         shown = experiment.with_run(duration=(options.step + 200) * experiment.step_length)

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.inference.online_errors import RunningErrors
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.theory.prediction import predict
 
 SHOWN = 30.0  # units of time of which the states are drawn
@@ -36,7 +36,7 @@ def main() -> None:
         picture(read_bag(arguments.bag)).savefig(arguments.out, metadata={"Date": None})
 
 
-def picture(run: Trajectory) -> Figure:
+def picture(run: Run) -> Figure:
     """Graphs on the left; on the right states under the active graph, and the running error with its interval."""
     experiment = run.record.experiment
     graphs = experiment.graph_list
@@ -73,7 +73,7 @@ def draw(axes: mpl.axes.Axes, graph: Graph, colour: str) -> None:
     axes.axis("off")
 
 
-def running(axes: mpl.axes.Axes, run: Trajectory) -> None:
+def running(axes: mpl.axes.Axes, run: Run) -> None:
     """The mean-square error so far with its 95 % interval, beside the prediction."""
     experiment = run.record.experiment
     prediction = predict(experiment)

@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from msg_agents.run.runner import run_network
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
 from msg_analysis.twin.simulate import simulate
 
@@ -27,11 +27,11 @@ MARGIN = 1.1
 """In length. The standard error is an estimate too: in runs of this length it comes out a few per cent up or down."""
 
 
-def with_run(**changes: object) -> ValidExperiment:
+def with_run(**changes: object) -> Experiment:
     """The demo experiment with another ``run`` section."""
-    document = ValidExperiment.load(EXPERIMENT).to_document()
+    document = Experiment.load(EXPERIMENT).to_document()
     document["run"] |= changes
-    return ValidExperiment.parse(document)
+    return Experiment.parse(document)
 
 
 def length_needed(replicas: int) -> float:

@@ -26,7 +26,7 @@ from msg_agents.run.result import RunResult, conclude
 from msg_agents.run.runner import run_network
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.examples import find
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.check import check
 
 COLUMNS = ("loss", "burst", "delay [ms]", "delivery", "verdict", "z of losses", "lockstep", "z of losses", "lost again")
@@ -58,7 +58,7 @@ def losses(channel: Channel, counts: dict[str, Any]) -> tuple[float, bool]:
     return difference / math.sqrt(variance) if variance else 0.0, same
 
 
-def run(experiment: ValidExperiment, document: dict[str, Any], folder: Path) -> tuple[RunResult, float, bool]:
+def run(experiment: Experiment, document: dict[str, Any], folder: Path) -> tuple[RunResult, float, bool]:
     """One run, and its losses."""
     channel = Channel.parse(document, experiment)
     result = run_network(experiment, folder, channel=channel)
@@ -76,7 +76,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=60)
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)
-    realtime, lockstep = (ValidExperiment.load(find(name)) for name in ("line_ring_realtime", "line_ring"))
+    realtime, lockstep = (Experiment.load(find(name)) for name in ("line_ring_realtime", "line_ring"))
     lockstep = lockstep.with_run(duration=options.steps * lockstep.step_length)
     wrong = 0
     print(f"| {' | '.join(COLUMNS)} |\n|{'---|' * len(COLUMNS)}", flush=True)

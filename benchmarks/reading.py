@@ -3,9 +3,9 @@
 The bag is a run of the twin: the five agents of the demo, line and ring, as many steps as make the number of states
 asked for, in chunks as the recorder writes them. Each measurement is a process of its own, the readers take turns, and
 the time counts from the opening of the bag to the last state; importing is not in it. For `read_bag` the last state is
-in its place in the arrays of a Trajectory, for the others it has been deserialised and dropped again. The ratios are
+in its place in the arrays of a Run, for the others it has been deserialised and dropped again. The ratios are
 taken within a round, of the time on the clock and of CPU time, which a busy machine disturbs less; medians count.
-Memory is the peak of the process, and that without the arrays of the Trajectory.
+Memory is the peak of the process, and that without the arrays of the Run.
 
 About four minutes for 2 million states. `--only` leaves the others out, to see the memory that a large bag takes:
 `--states 20000000 --only` needs 0.6 GB of disk and some ten minutes.
@@ -56,13 +56,13 @@ class Stopwatch:
 def make_bag(directory: Path, states: int, replicas: int) -> None:
     """A bag with at least so many states."""
     from msg_analysis.bags.run_writer import write_trajectory
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.twin.simulate import simulate
 
-    document = ValidExperiment.load(EXPERIMENT).to_document()
+    document = Experiment.load(EXPERIMENT).to_document()
     steps = -(-states // len(TOPICS)) - 1
     document["run"] |= {"duration": round(steps * document["run"]["dt"], 6), "replicas": replicas}
-    write_trajectory(simulate(ValidExperiment.parse(document)), directory)
+    write_trajectory(simulate(Experiment.parse(document)), directory)
 
 
 def without_chunks(directory: Path) -> None:

@@ -15,7 +15,7 @@ from msg_agents.nodes.recorder import write_size
 from msg_agents.stepping.state_receiver import StateReceiver
 from msg_analysis.bags.mcap_chunks import COMPRESSIONS, Storage
 from msg_analysis.bags.writing import BagWriter
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.cdr import encode_batch
 from msg_analysis.messages.messages import StateCodec
 from msg_analysis.messages.topics import STATE, STATES, network_topics
@@ -34,7 +34,7 @@ def run_of(replicas: int) -> tuple[RunRecord, list[bytes]]:
         "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
         "run": {"dt": 0.05, "duration": DURATION, "replicas": replicas},
     }
-    run = simulate(ValidExperiment.parse(experiment))
+    run = simulate(Experiment.parse(experiment))
     codecs = [StateCodec(run.record.run.bytes, i + 1, replicas, 0.05) for i in range(5)]
     sent, found, size = [], [], 0
     for k, states in enumerate(run.states):

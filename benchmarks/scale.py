@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from msg_agents.run.runner import run_network
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 AGENTS = (5, 20, 40, 100, 300, 1000)
 PROCESSES = (1, 2, 4, 40)
@@ -51,11 +51,11 @@ class Point:
     rate: float
 
 
-def experiment(agents: int, processes: int, steps: int) -> ValidExperiment:
+def experiment(agents: int, processes: int, steps: int) -> Experiment:
     """A ring, and the same with a chord from every seventh agent."""
     ring = [[i, i % agents + 1] for i in range(1, agents + 1)]
     chords = [[i, (i + agents // 3) % agents + 1] for i in range(1, agents + 1, 7)]
-    return ValidExperiment.parse(
+    return Experiment.parse(
         {
             "name": "scale",
             "problem": "consensus",

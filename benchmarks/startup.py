@@ -22,7 +22,7 @@ import yaml
 from msg_agents import run_network
 from msg_agents.cli.main import main as agents
 from msg_analysis.cli.main import main as analysis
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 ROUNDS = 7
 STARTS = 3  # of each network
@@ -63,7 +63,7 @@ def starts(agents: int) -> tuple[float, float]:
 
 def start_up(agents: int, *, fork: bool) -> float:
     """Seconds until all agents have their x(0), as ``run_network`` reports it."""
-    what = ValidExperiment.parse(network(agents))
+    what = Experiment.parse(network(agents))
     ready: list[float] = []
     begun = time.perf_counter()
     result = run_network(what, None, fork=fork, on_progress=lambda _: ready.append(time.perf_counter()))

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.common.resources import count_cores
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.estimates import estimates
 from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.observation import Observation
@@ -70,7 +70,7 @@ HEAVY = {
 @cache
 def law(kind: str, switches: int | None) -> Prediction:
     """What runs of a kind are compared with."""
-    return predict(ValidExperiment.parse(HEAVY[kind] if switches is None else SLOW[kind](switches)))
+    return predict(Experiment.parse(HEAVY[kind] if switches is None else SLOW[kind](switches)))
 
 
 def examine(kind: str, switches: int | None, seed: int) -> tuple[float, float, float, bool]:

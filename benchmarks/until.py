@@ -12,11 +12,11 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import online_errors
 from msg_analysis.inference import verdict as verdicts
 from msg_analysis.inference.online_errors import LiveEstimate, reached
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import Until
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
@@ -30,7 +30,7 @@ EXPERIMENT = {
 LOOK = 100  # steps between two looks
 
 
-def shorter(run: Trajectory, step: int) -> Trajectory:
+def shorter(run: Run, step: int) -> Run:
     """The run as it would have been recorded if it had ended at this step."""
     if step == len(run.modes):
         return run
@@ -51,7 +51,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=300)
     runs = parser.parse_args().runs
-    experiment = ValidExperiment.parse(EXPERIMENT)
+    experiment = Experiment.parse(EXPERIMENT)
     law = predict(experiment)
     for module in (online_errors, verdicts):  # one prediction for all: they differ in their seeds and lengths only
         module.predict = lambda experiment, *_: replace(law, experiment=experiment)  # type: ignore[attr-defined]

@@ -12,7 +12,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.utils import get_relative_url
 
 from msg_analysis.experiment import examples
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
 from msg_analysis.report.page import render
 from msg_analysis.twin.simulate import simulate
@@ -32,7 +32,7 @@ COMMANDS = (
 
 def on_files(files: Files, /, *, config: MkDocsConfig) -> Files:
     """Simulate the example, compare it with its prediction, and add the report to the site."""
-    run = simulate(ValidExperiment.parse(yaml.safe_load(examples.text_of(EXAMPLE))))
+    run = simulate(Experiment.parse(yaml.safe_load(examples.text_of(EXAMPLE))))
     run.record.versions.pop("host", None)  # the report is published
     html = render(compare(run), run, host="the computer that built this site", command=" && ".join(COMMANDS))
     files.append(File.generated(config, FILE, content=html))

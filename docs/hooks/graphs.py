@@ -15,7 +15,7 @@ from mkdocs.structure.files import File, Files
 
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import examples
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.report.drawings import graph_drawings
 from msg_analysis.report.plot_style import DARK, GRAPHS
 
@@ -54,7 +54,7 @@ def on_page_content(html: str, /, *, page: Page, **_: Any) -> str:
 
     def drawn(match: re.Match[str]) -> str:
         try:
-            experiment = ValidExperiment.parse(yaml.safe_load(examples.text_of(match[1])))
+            experiment = Experiment.parse(yaml.safe_load(examples.text_of(match[1])))
         except InputError as error:
             raise PluginError(f"{page.file.src_uri}: {match[0]}: {error}") from error
         figures = "".join(

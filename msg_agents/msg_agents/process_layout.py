@@ -30,7 +30,7 @@ from msg_analysis.bags.mcap_chunks import DEFAULT_STORAGE, MEGABYTE, Storage
 from msg_analysis.common.arrays import BoolArray
 from msg_analysis.common.resources import count_cores
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import read_yaml
 from msg_analysis.experiment.network_spec import expected
 from msg_analysis.experiment.problems import ExperimentError, problem, show, translate
@@ -77,13 +77,13 @@ class Share:
     patience: float  # s that companions may be gone before a node ends itself
 
 
-def wanted_processes(experiment: ValidExperiment, agents: int) -> int:
+def wanted_processes(experiment: Experiment, agents: int) -> int:
     """Most processes that an experiment may have for so many agents, on a machine of any number of cores."""
     wanted = experiment.run.processes
     return min(agents, wanted) if isinstance(wanted, int) else agents
 
 
-def count_processes(experiment: ValidExperiment, agents: int | None = None, *, most: int = MOST_UNAIDED) -> int:
+def count_processes(experiment: Experiment, agents: int | None = None, *, most: int = MOST_UNAIDED) -> int:
     """Number of processes for ``agents`` agents (None: all) on this machine; InputError: more than ``most``."""
     agents = experiment.agents if agents is None else agents
     wanted, count = experiment.run.processes, wanted_processes(experiment, agents)
@@ -99,7 +99,7 @@ def count_processes(experiment: ValidExperiment, agents: int | None = None, *, m
 
 
 def split_agents(
-    experiment: ValidExperiment, agents: Sequence[int] | None = None, *, most: int = MOST_UNAIDED
+    experiment: Experiment, agents: Sequence[int] | None = None, *, most: int = MOST_UNAIDED
 ) -> list[tuple[int, ...]]:
     """The agents (indices, ascending; None: all) of each process; InputError: more than ``most`` processes."""
     agents = range(experiment.agents) if agents is None else agents
@@ -124,7 +124,7 @@ def discovery_timeout(agents: int, processes: int) -> float:
 
 
 def plan_network(
-    experiment: ValidExperiment,
+    experiment: Experiment,
     run_file: Path,  # run record, read by every node
     bag: Path | None,  # directory to record to; None: no recorder
     checkpoints: Path | None = None,  # directory of the states for a takeover; None: killed processes cannot resume
@@ -278,12 +278,12 @@ class Hosts:
     agents: dict[str, tuple[int, ...]]  # indices from 0, ascending, by host
 
     @classmethod
-    def load(cls, path: Path, experiment: ValidExperiment) -> Hosts:
+    def load(cls, path: Path, experiment: Experiment) -> Hosts:
         """Read a hosts file (YAML); InputError if it cannot be read or does not fit the experiment."""
         return cls.parse(read_yaml(path), experiment, source=str(path))
 
     @classmethod
-    def parse(cls, document: Any, experiment: ValidExperiment, source: str = "hosts") -> Hosts:
+    def parse(cls, document: Any, experiment: Experiment, source: str = "hosts") -> Hosts:
         """Check a document from a YAML reader; the ExperimentError lists the mistakes, with ``source`` as place."""
         if not isinstance(document, dict):
             raise ExperimentError(
@@ -328,17 +328,17 @@ class Hosts:
             raise InputError(f"--name: {name}: has no agents and is not the recorder: there is nothing to run on it")
         return Share(self.agents[name], name == self.recorder, discovery_timeout, patience)
 
-    def participants(self, experiment: ValidExperiment) -> int:
+    def participants(self, experiment: Experiment) -> int:
         """How many participants to look for on each host: more than run on any."""
         most = max(wanted_processes(experiment, len(agents)) for agents in self.agents.values())
         return min(most + 2 + VISITORS, MOST_PARTICIPANTS)
 
-    def profile(self, experiment: ValidExperiment) -> str:
+    def profile(self, experiment: Experiment) -> str:
         """The Fast DDS profile with which the processes of all hosts find each other."""
         addresses = list(dict.fromkeys(("127.0.0.1", *self.addresses.values())))
         return profile_for_hosts(addresses, self.participants(experiment))
 
-    def environment(self, experiment: ValidExperiment, folder: Path) -> dict[str, str]:
+    def environment(self, experiment: Experiment, folder: Path) -> dict[str, str]:
         """Environment of the processes, with the profile written to ``folder``; the user's own profile is kept."""
         profile = folder / "hosts.xml"
         profile.write_text(self.profile(experiment), encoding="utf-8")

@@ -132,11 +132,11 @@ def test_processes_of_a_run_import_little(process: str) -> None:
 def test_parsing_an_experiment_imports_little() -> None:
     code = (
         "import sys\n"
-        "from msg_analysis.experiment.experiment import ValidExperiment\n"
+        "from msg_analysis.experiment.experiment import Experiment\n"
         "from msg_analysis.model.step_model import build_model\n"
         "document = {'name': 'two', 'graphs': {'pair': {'path': [1, 2]}, 'grid': {'grid': [1, 2]}},\n"
         "            'switching': {'generator': [[-1, 1], [1, -1]]}}\n"
-        "build_model(ValidExperiment.parse(document))\n"
+        "build_model(Experiment.parse(document))\n"
         "print([name for name in ('scipy', 'networkx', 'matplotlib', 'rich', 'rosbags') if name in sys.modules])"
     )
     process = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=60)

@@ -11,7 +11,7 @@ import pytest
 
 import msg_analysis
 from msg_analysis import BagError, Experiment, ExperimentError, InputError, Run, compare, read_bag, write_report
-from msg_analysis.experiment.experiment import ValidExperiment as ModelExperiment
+from msg_analysis.experiment.experiment import Experiment as ModelExperiment
 
 ROOT = Path(__file__).parents[2]
 LINE_RING = ROOT / "tests/data/golden/line_ring.yaml"

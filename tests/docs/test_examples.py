@@ -13,7 +13,7 @@ import yaml
 from pages import EXPERIMENTS, ROOT
 from scipy.sparse.linalg import LinearOperator, cg
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory.prediction import predict
 
 SMALL = sorted(EXPERIMENTS.glob("*.yaml"))
@@ -130,7 +130,7 @@ class Example:
 
 @pytest.mark.parametrize("file", SMALL, ids=lambda file: file.stem)
 def test_predictions(file: Path) -> None:
-    example, prediction = Example(file), predict(ValidExperiment.load(file))
+    example, prediction = Example(file), predict(Experiment.load(file))
     assert prediction.emulated is not None
     np.testing.assert_allclose(prediction.emulated.node_errors, example.steps(), rtol=1e-9, atol=1e-15)
     if prediction.continuous_moments is None:
@@ -142,7 +142,7 @@ def test_predictions(file: Path) -> None:
 def test_hundred_agents() -> None:
     """By conjugate gradients on the equations as they are; the graphs are symmetric, and so is their chain."""
     file = EXPERIMENTS / "hundred_agents.yaml"
-    example, prediction = Example(file), predict(ValidExperiment.load(file))
+    example, prediction = Example(file), predict(Experiment.load(file))
     m, chain = example.m, example.chain
     assert chain is not None
     centre = np.eye(m) - 1.0 / m
@@ -166,7 +166,7 @@ def test_formula_of_slow_and_fast_switching(name: str) -> None:
     rate = 0.1 if name == "slow_switching" else 10.0
     ring = nx.cycle_graph(6)
     halved = nx.effective_graph_resistance(ring, weight=None) / (2 * 6) * 2
-    prediction = predict(ValidExperiment.load(file))
+    prediction = predict(Experiment.load(file))
     assert prediction.continuous.system_error == pytest.approx(halved + 8 / (3 * rate), rel=1e-12)
     assert halved == pytest.approx(35 / 12)
 

@@ -18,7 +18,7 @@ from pages import EXPERIMENTS, PAGES, PRINTING, ROOT, Shown, blocks, console, ex
 from msg_agents.cli.main import main as agents
 from msg_analysis.api import Experiment
 from msg_analysis.cli.main import main as analysis
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import simulate
 
 PROGRAMS: dict[str, click.Group] = {"msg-agents": agents, "msg-analysis": analysis}
@@ -33,7 +33,7 @@ def name(page: Path) -> str:
 def test_experiments_are_valid(page: Path) -> None:
     for text in experiments(page).values():
         if "protocol: {name: median" not in text:  # made by its reader; tests/analysis/model/test_protocols.py does so
-            ValidExperiment.parse(yaml.safe_load(text))
+            Experiment.parse(yaml.safe_load(text))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
@@ -119,7 +119,7 @@ def compared(document: str) -> str:
 
     No bag is made on the way: what is read from it is what was written, as tests/analysis/bags says.
     """
-    run = simulate(ValidExperiment.parse(json.loads(document)))
+    run = simulate(Experiment.parse(json.loads(document)))
     Path("twin").mkdir()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("msg_analysis.api.read_trajectory", lambda bag: run)

@@ -36,7 +36,7 @@ from msg_agents.run.runner import run_network
 from msg_agents.run.supervisor import STEPS
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
@@ -185,9 +185,9 @@ class Network:
         return self.start("run", file, "--out", self.directory / "runs", "--no-analyse", *options, **environment)
 
     @staticmethod
-    def experiment(**changes: Any) -> ValidExperiment:
+    def experiment(**changes: Any) -> Experiment:
         """See ``document``."""
-        return ValidExperiment.parse(document(**changes))
+        return Experiment.parse(document(**changes))
 
     def file(self, name: str = "net.yaml", **changes: Any) -> Path:
         """An experiment file."""
@@ -195,7 +195,7 @@ class Network:
         path.write_text(yaml.safe_dump(document(**changes)))
         return path
 
-    def run(self, what: ValidExperiment, out: str = "runs", **options: Any) -> RunResult:
+    def run(self, what: Experiment, out: str = "runs", **options: Any) -> RunResult:
         """A whole run from this process, without comparison and report."""
         return run_network(what, self.directory / out, **options)
 

@@ -23,7 +23,7 @@ from msg_agents.process_layout import plan_network
 from msg_agents.run.fork_server import NodeServer
 from msg_agents.run.supervisor import Supervisor
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record
 
@@ -56,13 +56,13 @@ def came(reader: subprocess.Popen[str]) -> dict[str, list[Any]]:
     return found
 
 
-def equal_to_the_twin(trajectory: Trajectory) -> None:
+def equal_to_the_twin(trajectory: Run) -> None:
     assert trajectory.completeness.complete
     outcome = check(trajectory)
     assert (outcome.difference, outcome.missing) == (None, 0)
 
 
-def states_of(trajectory: Trajectory, agent: int) -> list[list[int]]:
+def states_of(trajectory: Run, agent: int) -> list[list[int]]:
     """Step, mode and checksum of every state, as in the bag."""
     modes = [0, *(int(mode) + 1 for mode in trajectory.modes)]
     values = np.ascontiguousarray(trajectory.values[:, agent])

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.twin.check import check
 
 LOCKSTEP: dict[str, Any] = {"duration": 15, "replicas": 4}  # 300 steps: more than one block of noise
@@ -52,7 +52,7 @@ def changes(law: str, messages: str, run: dict[str, Any]) -> dict[str, Any]:
     return {**LAWS[law], "noise": {"process": 1.0, **MESSAGES[messages]}, "run": {**run, **start}}
 
 
-def assert_equal(trajectory: Trajectory) -> None:
+def assert_equal(trajectory: Run) -> None:
     """Complete, and what the law and the seed give, to the last bit."""
     assert trajectory.completeness.complete
     assert trajectory.completeness.duplicates == 0
@@ -116,7 +116,7 @@ def test_a_protocol_that_is_not_linear_in_real_time(network: Any) -> None:
     assert_equal(result.trajectory)
 
 
-def killed_and_back(network: Any, run: subprocess.Popen[str], victims: Callable[[], list[Any]]) -> Trajectory:
+def killed_and_back(network: Any, run: subprocess.Popen[str], victims: Callable[[], list[Any]]) -> Run:
     """Kill these in the middle of a run, at once; its trajectory."""
     network.wait_for_steps()
     for victim in network.wait_for(victims, 30, "a living agent"):
@@ -186,7 +186,7 @@ def test_any_of_them_with_kills(network: Any, repetition: int, rng: random.Rando
     assert_equal(read_bag(json.loads(stdout)["bag"]))
 
 
-def assert_equal_but_for_restarts(trajectory: Trajectory) -> None:
+def assert_equal_but_for_restarts(trajectory: Run) -> None:
     """As above; in real time a state that was sent again may have come twice."""
     assert trajectory.completeness.complete
     assert check(trajectory).difference is None

@@ -9,8 +9,8 @@ import pytest
 from processors import another_processor
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.model.run import Trajectory
+from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.run import Run
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
@@ -62,7 +62,7 @@ def test_equals_the_twin(network: Any, case: str, processes: Any) -> None:
     equals_the_twin(what, result.trajectory)
 
 
-def equals_the_twin(what: ValidExperiment, trajectory: Trajectory | None) -> None:
+def equals_the_twin(what: Experiment, trajectory: Run | None) -> None:
     """300 steps: more than the window of the lockstep and more than one block of noise."""
     assert trajectory is not None
     assert trajectory.completeness.complete

@@ -15,7 +15,7 @@ import yaml
 
 from msg_agents.run import lifeline
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
@@ -65,7 +65,7 @@ def test_examples(network: Any, name: str, processes: int | str) -> None:
 
     The verdict of a linear one is a test at level 0.01; the seeds of the examples are among the 99 %.
     """
-    what = ValidExperiment.load(EXPERIMENTS / f"{name}.yaml")
+    what = Experiment.load(EXPERIMENTS / f"{name}.yaml")
     result = network.run(what.with_run(duration=600 * what.step_length, processes=processes))
     assert result.failures == []
     trajectory = result.trajectory

@@ -14,7 +14,7 @@ from random_networks import random_document
 from msg_agents.cli.nodes import load_record
 from msg_agents.recovery import Checkpoint, entry_size
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.check import check
 
 KILLED = 3468  # the process of an agent is killed before the first step
@@ -25,7 +25,7 @@ def test_equal(network: Any, repetition: int) -> None:
     seed = KILLED + repetition
     result, met, verdict = run_random_network(seed, network.directory / "runs")
     assert verdict.status in ("equal", "ended"), (seed, verdict, met, result.bag)
-    experiment = ValidExperiment.parse(random_document(seed))
+    experiment = Experiment.parse(random_document(seed))
     assert set(met.faults) <= set(plan_faults(seed, experiment.agents, experiment.steps).faults)
     assert len(result.restarts) <= sum(fault.kills for fault in met.faults)
 
@@ -33,7 +33,7 @@ def test_equal(network: Any, repetition: int) -> None:
 def test_a_kill_before_the_first_step(network: Any) -> None:
     """Nothing is missing."""
     result, met, verdict = run_random_network(KILLED, network.directory / "runs")
-    experiment = ValidExperiment.parse(random_document(KILLED))
+    experiment = Experiment.parse(random_document(KILLED))
     states = experiment.agents * (experiment.steps + 1)
     assert verdict.status == "equal", verdict
     assert verdict.compared in (states, 2 * states)  # also what was published, where that is something else
@@ -42,7 +42,7 @@ def test_a_kill_before_the_first_step(network: Any) -> None:
 
 def test_one_bit(network: Any) -> None:
     """Of a state from which a killed agent goes on: found."""
-    experiment = ValidExperiment.parse(random_document(UNDISTURBED))
+    experiment = Experiment.parse(random_document(UNDISTURBED))
     assert not experiment.noise.on_air
     file = network.directory / "network.yaml"
     file.write_text(yaml.safe_dump(random_document(UNDISTURBED)))

@@ -30,7 +30,7 @@ from msg_agents.run.result import read_steps
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.phases import phases
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.twin.check import check
 
 # 100 steps a second for 4 s, and for 2 s where nobody is killed or stopped in the middle.
@@ -53,7 +53,7 @@ for tick in range(100_000):
 """
 
 
-def assert_possible(trajectory: Trajectory) -> None:
+def assert_possible(trajectory: Run) -> None:
     """Complete, equal to its replay, and stamped as it can be."""
     assert trajectory.completeness.complete
     assert trajectory.completeness.duplicates == 0

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
 from msg_analysis.paper import figures as emulation
 from msg_analysis.twin.simulate import simulate
@@ -188,6 +188,6 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
     rows = (figures / "example_1_emulated.csv").read_text().splitlines()
     assert rows[2].startswith("network,quantity,agent")
     assert len(rows) == 3 + 6
-    measured = compare(simulate(ValidExperiment.parse(json.loads(runs[0].job().document)))).system_error.measured
+    measured = compare(simulate(Experiment.parse(json.loads(runs[0].job().document)))).system_error.measured
     assert measured is not None
     assert float(rows[3].split(",")[6]) == 1.0 / measured

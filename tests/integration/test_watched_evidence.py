@@ -13,7 +13,7 @@ from tests.support.watched_run import whole_sums
 from msg_agents.watch import observer as early_end
 from msg_agents.watch import observer as run_observer
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import Until
 from msg_analysis.theory.prediction import predict
 
@@ -37,7 +37,7 @@ process_noise.ProcessNoise = Noisy
 """
 
 
-def evidence_of(trajectory: Trajectory) -> float:
+def evidence_of(trajectory: Run) -> float:
     """Of the comparison, without departures."""
     return whole_sums(trajectory, predict(trajectory.record.experiment, trajectory.record.step_model)).evidence()
 

@@ -6,7 +6,7 @@ import numpy as np
 
 import experiments
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.protocol import Heard, LinearProtocol, Protocol
 
 DIRECTED = {"a": {"arcs": [[1, 2], [2, 3], [3, 4], [4, 5], [5, 1]]}, "b": {"path": [1, 2, 3, 4, 5]}}
@@ -24,8 +24,8 @@ def document(protocol: dict[str, Any] | None, **changes: Any) -> dict[str, Any]:
     return experiments.document(**default | given | changes, run=run)
 
 
-def experiment(protocol: dict[str, Any] | None, **changes: Any) -> ValidExperiment:
-    return ValidExperiment.parse(document(protocol, **changes))
+def experiment(protocol: dict[str, Any] | None, **changes: Any) -> Experiment:
+    return Experiment.parse(document(protocol, **changes))
 
 
 class Euler(LinearProtocol):

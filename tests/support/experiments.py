@@ -12,9 +12,9 @@ import numpy as np
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.observation import Observation
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.twin.simulate import simulate
@@ -40,24 +40,24 @@ def document(agents: int = 3, rate: float = 1.0, /, **changes: Any) -> dict[str,
     }
 
 
-def line_ring(agents: int = 3, rate: float = 1.0, /, **changes: Any) -> ValidExperiment:
-    return ValidExperiment.parse(document(agents, rate, **changes))
+def line_ring(agents: int = 3, rate: float = 1.0, /, **changes: Any) -> Experiment:
+    return Experiment.parse(document(agents, rate, **changes))
 
 
-def five(seed: int = 1, duration: float = 100.0, **changes: Any) -> ValidExperiment:
+def five(seed: int = 1, duration: float = 100.0, **changes: Any) -> Experiment:
     """Five agents, one replica."""
     run = {"duration": duration, "replicas": 1, "seed": seed} | changes.pop("run", {})
     return line_ring(5, 0.5, **changes, run=run)
 
 
-def directed(**changes: Any) -> ValidExperiment:
+def directed(**changes: Any) -> Experiment:
     """Three agents on a path and on weighted arcs."""
     run = {"dt": 0.1, "duration": 40, "seed": 3} | changes.pop("run", {})
     changes = {"graphs": DIRECTED, "switching": {"generator": [[-1.0, 1.0], [2.0, -2.0]]}} | changes
     return line_ring(run=run, **changes)
 
 
-def pieces(**changes: Any) -> ValidExperiment:
+def pieces(**changes: Any) -> Experiment:
     """Three agents, of which 1 and 3 lead, and one link at a time."""
     run = {"dt": 0.1, "duration": 3, "seed": 3} | changes.pop("run", {})
     fields = {
@@ -70,29 +70,29 @@ def pieces(**changes: Any) -> ValidExperiment:
     return line_ring(**fields | {"agents": 3} | changes, run=run)
 
 
-def golden(name: str, **run: Any) -> ValidExperiment:
+def golden(name: str, **run: Any) -> Experiment:
     """An experiment of tests/data/golden."""
-    return ValidExperiment.load(GOLDEN / f"{name}.yaml").with_run(**run)
+    return Experiment.load(GOLDEN / f"{name}.yaml").with_run(**run)
 
 
-def changed(experiment: ValidExperiment, **changes: Any) -> ValidExperiment:
+def changed(experiment: Experiment, **changes: Any) -> Experiment:
     """The same but for these keys."""
     return experiment.parse(experiment.to_document() | changes)
 
 
-def observed(of: Trajectory | ValidExperiment, law: ValidExperiment | Prediction | None = None) -> Observation:
+def observed(of: Run | Experiment, law: Experiment | Prediction | None = None) -> Observation:
     """A run, or that of the twin, beside the prediction of its own experiment or of another law."""
-    run = of if isinstance(of, Trajectory) else simulate(of)
+    run = of if isinstance(of, Run) else simulate(of)
     law = law or run.record.experiment
     return Observation.of(run, law if isinstance(law, Prediction) else predict(law))
 
 
-def claimed(run: Trajectory, experiment: ValidExperiment) -> Trajectory:
+def claimed(run: Run, experiment: Experiment) -> Run:
     """The same data, recorded as those of another experiment."""
     return dataclasses.replace(run, record=RunRecord(run.record.run, experiment, run.record.start))
 
 
-def cut(run: Trajectory, step: int) -> Trajectory:
+def cut(run: Run, step: int) -> Run:
     """The same run with x(step..) and g(step..) lost."""
     states, modes = run.states.copy(), run.modes.copy()
     states[step:], modes[step:] = np.nan, -1
@@ -101,14 +101,14 @@ def cut(run: Trajectory, step: int) -> Trajectory:
     return dataclasses.replace(run, states=states, modes=modes, completeness=completeness)
 
 
-def late(run: Trajectory, nanoseconds: int) -> Trajectory:
+def late(run: Run, nanoseconds: int) -> Run:
     """Every step of every agent is late by so much simulated time."""
     made = run.made.copy()
     made[1:] += nanoseconds
     return dataclasses.replace(run, made=made)
 
 
-def stored(run: Trajectory, directory: Path) -> Trajectory:
+def stored(run: Run, directory: Path) -> Run:
     """Written to a bag and read again."""
     write_trajectory(run, directory / "bag")
     return read_bag(directory / "bag")

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.phases import phases
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.step_model import StepModel
 
 BLOCK = 256
@@ -20,7 +20,7 @@ FORGOTTEN = 4  # blocks after which no burst of these tests goes on
 class Links:
     """Noise and loss of every message of a run; who hears whom under each graph."""
 
-    def __init__(self, what: ValidExperiment, model: Any) -> None:
+    def __init__(self, what: Experiment, model: Any) -> None:
         self._noise, self._loss, self._replicas = what.noise, what.loss.tolist(), what.run.replicas
         self._key = np.random.SeedSequence(what.run.seed).generate_state(2, np.uint64)
         self.normal, self._uniform, self._chain = cache(self._normals), cache(self._uniforms), cache(self._fates)
@@ -69,7 +69,7 @@ class Links:
         return self.normal(stream, number, k // BLOCK)[k % BLOCK]
 
 
-def choose(what: ValidExperiment, inbox: list[int], lost: Callable[[int], bool]) -> int | None:
+def choose(what: Experiment, inbox: list[int], lost: Callable[[int], bool]) -> int | None:
     """The step of the message that is used, of those that came (ascending); None: the own value."""
     usable = max(0, inbox[-1] - what.noise.delay) if inbox else 0
     for place in reversed(range(bisect_right(inbox, usable))):
@@ -80,7 +80,7 @@ def choose(what: ValidExperiment, inbox: list[int], lost: Callable[[int], bool])
     return None
 
 
-def assert_by_hand(trajectory: Trajectory) -> None:
+def assert_by_hand(trajectory: Run) -> None:
     """Compute a run of the twin again: every state, publication and log entry, to the last bit."""
     what, model = trajectory.record.experiment, trajectory.record.model
     links, m, real_time = Links(what, model), what.agents, what.run.pace == "realtime"
@@ -120,7 +120,7 @@ def assert_by_hand(trajectory: Trajectory) -> None:
     assert (trajectory.used is not None) == bool(real_time or what.noise.delay or what.noise.holds)
 
 
-def _noise(what: ValidExperiment, links: Links, k: int, g: int, i: int) -> list[float]:
+def _noise(what: Experiment, links: Links, k: int, g: int, i: int) -> list[float]:
     """Row i of the noise gain (m, m) times the sources, in ascending order."""
     total = [0.0] * what.run.replicas
     for number, (j, weight) in enumerate(links.sources(g, i)):
@@ -129,7 +129,7 @@ def _noise(what: ValidExperiment, links: Links, k: int, g: int, i: int) -> list[
     return total
 
 
-def _linear(what: ValidExperiment, model: Any, links: Links, k: int, g: int, i: int, x: Any, heard: Any) -> list[float]:
+def _linear(what: Experiment, model: Any, links: Links, k: int, g: int, i: int, x: Any, heard: Any) -> list[float]:
     noise, offset = _noise(what, links, k, g, i), float(model.offsets[g, i])
     following = []
     for r in range(what.run.replicas):
@@ -141,7 +141,7 @@ def _linear(what: ValidExperiment, model: Any, links: Links, k: int, g: int, i: 
     return following
 
 
-def _pull(what: ValidExperiment, g: int, i: int, felt: dict[int, list[float]]) -> list[float]:
+def _pull(what: Experiment, g: int, i: int, felt: dict[int, list[float]]) -> list[float]:
     total = [0.0] * what.run.replicas
     for number, (j, values) in enumerate(sorted(felt.items())):
         weight = float(what.graph_list[g].adjacency[i, j])
@@ -149,16 +149,14 @@ def _pull(what: ValidExperiment, g: int, i: int, felt: dict[int, list[float]]) -
     return total
 
 
-def _saturated(
-    what: ValidExperiment, model: Any, links: Links, k: int, g: int, i: int, x: Any, heard: Any
-) -> list[float]:
+def _saturated(what: Experiment, model: Any, links: Links, k: int, g: int, i: int, x: Any, heard: Any) -> list[float]:
     felt = {j: [min(max(v - o, -1.0), 1.0) for v, o in zip(values, x, strict=True)] for j, values in heard.items()}
     noise, pull = _noise(what, links, k, g, i), _pull(what, g, i, felt)
     return [o + what.step_length * u + n for o, u, n in zip(x, pull, noise, strict=True)]
 
 
 def _integral_action(
-    what: ValidExperiment, model: Any, links: Links, k: int, g: int, i: int, x: Any, heard: Any
+    what: Experiment, model: Any, links: Links, k: int, g: int, i: int, x: Any, heard: Any
 ) -> list[float]:
     replicas, dt = what.run.replicas, what.step_length
     own, integral = x[:replicas], x[replicas:]

@@ -9,9 +9,9 @@ import math
 import numpy as np
 import scipy.linalg
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.phases import phases
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.twin.simulate import new_record
 
 
@@ -27,7 +27,7 @@ def lost_messages(random, probability, burst, count):
     return found
 
 
-def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0, latency=0.0) -> Trajectory:
+def message_run(experiment: Experiment, seed: int, *, actual=None, late=0.0, latency=0.0) -> Run:
     """A run of an experiment, by the law of ``actual`` if that is another one; start zero or given.
 
     ``late`` and ``latency``: mean of exponential times, in steps, by which steps are late and messages under way.
@@ -111,7 +111,7 @@ def message_run(experiment: ValidExperiment, seed: int, *, actual=None, late=0.0
         published[k + 1][i] = following + air[k + 1][i]
     states, published = (np.array(each).reshape(steps + 1, m, replicas) for each in (states, published))
     whole = Completeness(states.shape[0] * m, states.shape[0] * m, 0)
-    return Trajectory(
+    return Run(
         record,
         states,
         modes,

@@ -19,7 +19,7 @@ from msg_agents.run.fork_server import Process
 from msg_agents.run.result import RunResult
 from msg_agents.run.runner import run_network
 from msg_agents.watch.panel import View
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.topics import agent_node_name
 from msg_analysis.twin.check import check
 
@@ -180,7 +180,7 @@ def _unexpected_restart(restarts: Sequence[str], faults: Sequence[Fault]) -> str
 
 def run_random_network(seed: int, out: Path) -> tuple[RunResult, FaultPlan, Verdict]:
     """Run the network of a seed with its faults; the plan has those that met a running process."""
-    experiment = ValidExperiment.parse(random_document(seed))
+    experiment = Experiment.parse(random_document(seed))
     plan = plan_faults(seed, experiment.agents, experiment.steps)
     injection = FaultInjection(plan)
     result = run_network(experiment, out, restarts=plan.restarts, view=injection)

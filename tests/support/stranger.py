@@ -16,7 +16,7 @@ from msg_agents.environment import node_environment
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.messages.cdr import encode_batch
 from msg_analysis.messages.messages import ActiveGraph, AgentState
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 
 STEPS = 300
@@ -89,7 +89,7 @@ def run_beside(
     *,
     of_batches: int = 1,
     endless: bool = False,
-) -> tuple[Trajectory, dict[str, str], Refused]:
+) -> tuple[Run, dict[str, str], Refused]:
     """Run a network of five agents in two processes while a stranger's messages meet every reader before its own.
 
     More are sent ``meanwhile``; with ``endless``, one of each topic of states is then sent again and again, since

@@ -5,7 +5,7 @@ import numpy as np
 import scipy.linalg
 
 from experiments import document
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.markov_chain import stationary_law
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
@@ -39,7 +39,7 @@ def network(seed, m, n, *, time="continuous", problem="consensus", directed=True
     }
     if problem == "tracking":
         document["leaders"] = {"agents": [1], "gain": 0.8, "reference": 2.0}
-    return ValidExperiment.parse(document)
+    return Experiment.parse(document)
 
 
 def steady_of(system):

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import new_record
 
 
@@ -37,7 +37,7 @@ def participants(domain: int) -> int:
 
 def record_of_two(directory: Path) -> Path:
     """File run.json of a run of two agents: one of them waits for the other."""
-    experiment = ValidExperiment.parse(
+    experiment = Experiment.parse(
         {
             "name": "waiting",
             "problem": "consensus",

@@ -8,11 +8,11 @@ from msg_analysis.inference.online_errors import LiveEstimate, LiveReport
 from msg_analysis.inference.sequential_sums import EvidenceSums
 from msg_analysis.messages.acceptance import state_frame
 from msg_analysis.messages.messages import ActiveGraph
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.theory.prediction import Prediction
 
 
-def messages_of(trajectory: Trajectory) -> list[tuple[str, bytes]]:
+def messages_of(trajectory: Run) -> list[tuple[str, bytes]]:
     """(topic, message) in the order of time, as a bag has them (``test_messages_are_those_of_the_bag``)."""
     return [(topic, content) for topic, content, _, _ in run_writer._messages(trajectory)]
 
@@ -43,14 +43,14 @@ def watch(
     return live.report()
 
 
-def watched(trajectory: Trajectory, *, disorder: float = 0.0, every: int = 200) -> LiveEstimate:
+def watched(trajectory: Run, *, disorder: float = 0.0, every: int = 200) -> LiveEstimate:
     """A watcher that has seen a whole run."""
     live = LiveEstimate(trajectory.record)
     watch(live, messages_of(trajectory), disorder=disorder, every=every)
     return live
 
 
-def whole_sums(trajectory: Trajectory, prediction: Prediction) -> EvidenceSums:
+def whole_sums(trajectory: Run, prediction: Prediction) -> EvidenceSums:
     """The sums of a comparison, without departures."""
     observation = Observation.of(trajectory, prediction)
     sums = EvidenceSums(prediction, observation.replicas)

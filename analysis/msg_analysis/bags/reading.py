@@ -37,7 +37,7 @@ from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import CdrError
 from msg_analysis.messages.messages import ActiveGraph, Progress, decode_string
 from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, PROGRESS, STRING
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 
 # Topics are recognised by type and by the end of their name: the network may run in any namespace.
@@ -52,7 +52,7 @@ _TOPICS = {
 MOST_RECORDS = 100  # different run records that a bag may have: reading each takes milliseconds
 
 
-def read_bag(path: str | Path, inventory: Inventory | None = None) -> Trajectory:
+def read_bag(path: str | Path, inventory: Inventory | None = None) -> Run:
     """The run of a bag: of a directory or of one of its files; torn files are read up to the tear.
 
     ``inventory`` is filled with what the files hold, even if no run can be made of it. BagError: no bag, no run record,
@@ -252,7 +252,7 @@ def _choose(contents: _Contents) -> RunRecord:
     return candidates[0]
 
 
-def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
+def _trajectory(contents: _Contents, record: RunRecord) -> Run:
     planned, end = record.experiment.steps, _end(contents, record)
     if end is not None:
         record = record.ended(end)
@@ -282,7 +282,7 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Trajectory:
         missing_modes=int((modes < 0).sum()),
         refused={reason: count for reason, count in sorted(contents.refused.items()) if count},
     )
-    return Trajectory(
+    return Run(
         record,
         truth.states,
         modes,

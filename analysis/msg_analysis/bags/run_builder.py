@@ -99,7 +99,7 @@ class Collected:
     """The states of a run on one kind of topic, each once, by step and agent. BagError: too large for the memory.
 
     After ``finish``: ``states`` (N + 1, m, width), NaN where missing; ``modes`` (N + 1, m) from 0, -1 where missing;
-    ``lost``, ``used`` and ``made`` as in ``Trajectory``; the counts as in ``Completeness``.
+    ``lost``, ``used`` and ``made`` as in ``Run``; the counts as in ``Completeness``.
     """
 
     def __init__(self, record: RunRecord, width: int) -> None:

@@ -25,7 +25,7 @@ from msg_analysis.errors import BagError
 from msg_analysis.messages.messages import ActiveGraph, StateCodec, encode_string
 from msg_analysis.messages.topics import EXPERIMENT, GRAPH, STATE, TRUTH, Topic, network_topics
 from msg_analysis.model.reception import LOST
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 
 AT_ONCE = 4096  # messages
 # Topic, CDR bytes, time [ns], and of a sojourn the time of the first state behind it [ns].
@@ -33,7 +33,7 @@ _Message = tuple[str, bytes, int, int | None]
 
 
 def write_trajectory(
-    trajectory: Trajectory,
+    trajectory: Run,
     directory: str | Path,
     storage: Storage = DEFAULT_STORAGE,
     block_numbers: int = BLOCK_NUMBERS,
@@ -79,7 +79,7 @@ def _write(bag: BagWriter, names: Sequence[str], messages: Iterator[_Message]) -
         bag.write_many(names, of, time, b"".join(contents), np.cumsum(size) - size, size)
 
 
-def _messages(trajectory: Trajectory, block_numbers: int = BLOCK_NUMBERS) -> Iterator[_Message]:
+def _messages(trajectory: Run, block_numbers: int = BLOCK_NUMBERS) -> Iterator[_Message]:
     """The messages in the order of time."""
     experiment = trajectory.record.experiment
     run, dt = trajectory.record.run.bytes, experiment.step_length
@@ -114,7 +114,7 @@ def _messages(trajectory: Trajectory, block_numbers: int = BLOCK_NUMBERS) -> Ite
         sojourn = next(sojourns, None)
 
 
-def _in_order(trajectory: Trajectory, block_numbers: int) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
+def _in_order(trajectory: Run, block_numbers: int) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
     """Steps, agents and times (e,) of all states by time, those of one time by step and agent, a part at once."""
     count, m, made = len(trajectory.states), trajectory.states.shape[1], trajectory.made
     clock = StepClock(trajectory.record.experiment.step_length)
@@ -151,7 +151,7 @@ def _names(topic: Topic, agents: int) -> list[str]:
     return [f"/{topic.of(i)}" for i in range(agents)]
 
 
-def _heard(trajectory: Trajectory) -> Callable[[int, int, int], list[int]]:
+def _heard(trajectory: Run) -> Callable[[int, int, int], list[int]]:
     """Function of (k, agent and graph from 0): ``heard`` of that state, the steps used in the step that led there.
 
     Empty in lockstep where nothing was lost; complete in real time.
@@ -180,7 +180,7 @@ def _heard(trajectory: Trajectory) -> Callable[[int, int, int], list[int]]:
     return listed
 
 
-def _sojourns(trajectory: Trajectory) -> Iterator[ActiveGraph]:
+def _sojourns(trajectory: Run) -> Iterator[ActiveGraph]:
     """The stretches of equal graph, without those whose graph is not known."""
     experiment, modes = trajectory.record.experiment, trajectory.modes
     time = StepClock(experiment.step_length).nanoseconds

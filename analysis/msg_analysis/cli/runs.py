@@ -148,11 +148,11 @@ def diff(a: Path, b: Path, *, as_json: bool) -> None:
             document = bag_difference(a, b)
     else:
         from msg_analysis.cli.console import SolveProgress
-        from msg_analysis.experiment.experiment import ValidExperiment
+        from msg_analysis.experiment.experiment import Experiment
         from msg_analysis.report.comparison_text import print_experiment_difference as show
         from msg_analysis.report.differences import experiment_difference
 
-        one, other = (ValidExperiment.load(path) for path in (a, b))
+        one, other = (Experiment.load(path) for path in (a, b))
         with SolveProgress("leaders") as search:
             document = experiment_difference(one, other, search)
     if as_json:

@@ -53,11 +53,11 @@ def transient(
     as_json: bool,
 ) -> None:
     """Predict the errors of EXPERIMENT over time, from its own start, exactly."""
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report.documents import describe_transient, write_transient_csv
 
     require_place(table)
-    loaded = ValidExperiment.load(experiment)
+    loaded = Experiment.load(experiment)
     loaded.require_available("predict")
     document = describe_transient(
         loaded,
@@ -108,10 +108,10 @@ def _parse_times(text: str) -> FloatArray:
 @json_option
 def facts(experiment: Path, as_json: bool) -> None:
     """Check the paper's lemmas on EXPERIMENT; bounds, indices of its graphs, two graphs in closed form."""
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report.documents import describe_facts
 
-    loaded = ValidExperiment.load(experiment)
+    loaded = Experiment.load(experiment)
     loaded.require_available("predict")
     document = describe_facts(loaded)
     if as_json:

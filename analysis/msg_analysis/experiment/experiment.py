@@ -25,7 +25,7 @@ from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
 from msg_analysis.experiment.spec import ExperimentSpec, LeadersSpec, Purpose, RunSpec
 from msg_analysis.protocol import Network
 
-__all__ = ["ExperimentError", "ValidExperiment", "json_schema"]
+__all__ = ["ExperimentError", "Experiment", "json_schema"]
 
 MOST_STATES = 512
 """Of graph and links together, in a prediction with losses in bursts."""
@@ -38,7 +38,7 @@ SHOWN_GRAPHS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class ValidExperiment:
+class Experiment:
     """A valid experiment. Two are equal if their documents are, the order of the graphs included.
 
     Attributes
@@ -69,7 +69,7 @@ class ValidExperiment:
 
     def __eq__(self, other: object) -> bool:
         return (
-            isinstance(other, ValidExperiment)
+            isinstance(other, Experiment)
             and self.spec == other.spec
             and list(self.spec.graphs) == list(other.spec.graphs)
         )

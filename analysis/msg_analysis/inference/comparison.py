@@ -25,7 +25,7 @@ from msg_analysis.common.text import (
     z_text,
 )
 from msg_analysis.errors import ExitCode
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, Ranking
 from msg_analysis.inference.given_path import GivenPath
@@ -36,7 +36,7 @@ from msg_analysis.inference.sequential_sums import AnyTimeEvidence
 from msg_analysis.inference.switching import SwitchingTest
 from msg_analysis.inference.time_means import TimeMeans
 from msg_analysis.inference.timing import Timing
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import step_law
 from msg_analysis.theory.fourth_moments import FourthMoment
@@ -46,7 +46,7 @@ from msg_analysis.theory.prediction import SHOWN_AGENTS, Prediction
 MAY_DIFFER = {"name", "names", "run.seed", "run.duration", "run.processes", "run.speed"}
 
 
-def law_keys(experiment: ValidExperiment) -> dict[str, Any]:
+def law_keys(experiment: Experiment) -> dict[str, Any]:
     """Every key (nested ones with dots) that defines the law of a run, and its value."""
     found = flat(experiment.to_document())
     # The order of the graphs is that of the modes.
@@ -56,13 +56,13 @@ def law_keys(experiment: ValidExperiment) -> dict[str, Any]:
     return {key: value for key, value in found.items() if key not in MAY_DIFFER}
 
 
-def law_identity(experiment: ValidExperiment) -> str:
+def law_identity(experiment: Experiment) -> str:
     """A text of 16 hexadecimal digits, the same for runs of the same law."""
     text = json.dumps(law_keys(experiment), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def first_difference(one: ValidExperiment, other: ValidExperiment) -> tuple[str, Any, Any] | None:
+def first_difference(one: Experiment, other: Experiment) -> tuple[str, Any, Any] | None:
     """Key and both values of the first difference, by name; None where the law is the same."""
     a, b = law_keys(one), law_keys(other)
     for key in sorted(a.keys() | b.keys()):
@@ -271,7 +271,7 @@ class Comparison:
         prediction
     """
 
-    trajectory: Trajectory
+    trajectory: Run
     level: float
     steps: int
     system_error: Estimate

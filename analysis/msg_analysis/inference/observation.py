@@ -16,7 +16,7 @@ from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, Int
 from msg_analysis.common.resources import tell
 from msg_analysis.common.text import agent_text
 from msg_analysis.errors import InputError
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.step_model import StepModel, Wiring
 from msg_analysis.theory.prediction import Prediction
 
@@ -32,11 +32,11 @@ class Measurement:
     system_series: FloatArray  # (N - first,): system error of every step, replicas averaged
     covariance: FloatArray  # (m, m): mean over steps and replicas of the products of the agents' deviations
     modes: IntArray  # (N,) g(0..N-1)
-    lost: BoolArray | None  # (N, m, D) see ``Trajectory.lost``
+    lost: BoolArray | None  # (N, m, D) see ``Run.lost``
     sure_messages: int  # see ``Observation.sure_messages``
 
     @classmethod
-    def of(cls, trajectory: Trajectory) -> Measurement:
+    def of(cls, trajectory: Run) -> Measurement:
         """Everything before the first gap, of a run from a bag or from the twin."""
         experiment, steps = trajectory.record.experiment, max(trajectory.prefix, 0)
         series = np.empty(steps)
@@ -100,7 +100,7 @@ def _blocks(first: int, end: int, numbers_per_step: int, what: str) -> Iterator[
         yield begin, min(begin + length, end)
 
 
-def _deviations(trajectory: Trajectory, first: int, end: int) -> FloatArray:
+def _deviations(trajectory: Run, first: int, end: int) -> FloatArray:
     """(end - first, m, R) from the reference, or in consensus from the agents' mean."""
     experiment, values = trajectory.record.experiment, trajectory.values[first:end]
     consensus = experiment.problem == "consensus"
@@ -117,8 +117,8 @@ class Timers:
     """What the agents of a run in real time log about each of their steps."""
 
     graphs: IntArray  # (N, m) index of the graph that the agent used
-    used: IntArray  # (N, m, D) see ``Trajectory.used``
-    made: IntArray  # (N + 1, m) [ns of simulated time] see ``Trajectory.made``
+    used: IntArray  # (N, m, D) see ``Run.used``
+    made: IntArray  # (N + 1, m) [ns of simulated time] see ``Run.made``
 
 
 @dataclass(frozen=True, eq=False)  # no slots, for cached_property
@@ -130,13 +130,13 @@ class Observation:
     modes: IntArray  # (N,) g(0..N-1)
     start: FloatArray  # (m, R) x(0) of the record
     published: FloatArray | None = None  # (N + 1, m, R) what others heard of x(0..N); None where that is x
-    lost: BoolArray | None = None  # (N, m, D) see ``Trajectory.lost``
+    lost: BoolArray | None = None  # (N, m, D) see ``Run.lost``
     timers: Timers | None = None  # None in lockstep
-    used: IntArray | None = None  # (N, m, D) in lockstep, see ``Trajectory.used``
+    used: IntArray | None = None  # (N, m, D) in lockstep, see ``Run.used``
     block_numbers: int = BLOCK_NUMBERS  # of temporary arrays of a block of steps, at most
 
     @classmethod
-    def of(cls, trajectory: Trajectory, prediction: Prediction) -> Observation:
+    def of(cls, trajectory: Run, prediction: Prediction) -> Observation:
         """Everything before the first gap.
 
         InputError if the log of a run in real time does not say what the agents used.
@@ -247,7 +247,7 @@ def _largest(states: FloatArray) -> float:
     return largest
 
 
-def _known_steps(trajectory: Trajectory) -> int:
+def _known_steps(trajectory: Run) -> int:
     """Steps of the longest complete beginning in which no agent uses a value from after its end."""
     steps = trajectory.prefix
     if trajectory.agent_modes is None or trajectory.used is None or trajectory.made is None:

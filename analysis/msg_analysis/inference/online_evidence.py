@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.e_values import log_mean
 from msg_analysis.inference.observation import Observation, bounded
 from msg_analysis.inference.online_steps import LoggedStates
@@ -62,7 +62,7 @@ class AnyTime:
         }
 
 
-def needs_log(experiment: ValidExperiment) -> bool:
+def needs_log(experiment: Experiment) -> bool:
     """Whether the evidence needs what the messages log, and not only the states."""
     noise = experiment.noise
     return bool(noise.on_air or noise.delay or experiment.run.pace == "realtime")

@@ -15,7 +15,7 @@ import numpy as np
 from msg_analysis.arithmetic.step_clock import StepClock
 from msg_analysis.bags.state_columns import own_layout
 from msg_analysis.common.arrays import AnyArray, FloatArray, IntArray
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.model.phases import phases
 from msg_analysis.model.run import LoggedInputs
@@ -30,7 +30,7 @@ class LoggedStates:
     states: FloatArray  # (b, m, R) x(k)
     published: FloatArray | None  # (b, m, R) what was published of x(k); None: x(k)
     graphs: IntArray  # (b, m) that the agents used
-    used: IntArray  # (b, m, D) as in ``Trajectory``
+    used: IntArray  # (b, m, D) as in ``Run``
 
     def __getitem__(self, chosen: AnyArray | slice) -> LoggedStates:
         published = None if self.published is None else self.published[chosen]
@@ -124,7 +124,7 @@ class RecentSteps:
 class Lateness:
     """Real time: how long after they were due the agents made their newest steps, as in ``realtime.timing``."""
 
-    def __init__(self, experiment: ValidExperiment) -> None:
+    def __init__(self, experiment: Experiment) -> None:
         self._clocks = [StepClock(experiment.step_length, phase) for phase in phases(experiment).tolist()]
         self._speed = experiment.run.speed
         self._late: list[deque[int]] = [deque(maxlen=WINDOW) for _ in self._clocks]  # [ns] of simulated time

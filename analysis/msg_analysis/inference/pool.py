@@ -12,19 +12,19 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import verdict
 from msg_analysis.inference.comparison import Comparison, Member, Pool, first_difference
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.statistics import chi2_tail
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.prediction import Prediction, predict
 
 
-def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.01) -> Comparison:
+def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> Comparison:
     """Compare several runs of one experiment, (name, trajectory) each, with its prediction, to one verdict.
 
     Sums are added up over the runs, so that every step counts the same. A further test of the family asks whether the
@@ -44,7 +44,7 @@ def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.0
     """
     total: Evidence | None = None
     prediction: Prediction | None = None
-    trajectory: Trajectory | None = None
+    trajectory: Run | None = None
     members: list[Member] = []
     for name, run in runs:
         _require_another(members, name, run.record)
@@ -68,7 +68,7 @@ def compare_pooled(runs: Iterable[tuple[str, Trajectory]], *, level: float = 0.0
     return dataclasses.replace(comparison, pool=pool)
 
 
-def _examine(name: str, run: Trajectory, prediction: Prediction, level: float) -> tuple[Member, Evidence | None]:
+def _examine(name: str, run: Run, prediction: Prediction, level: float) -> tuple[Member, Evidence | None]:
     """One run by itself, with its prediction; no evidence where too little of it arrived."""
     observation = Observation.of(run, prediction)
     if observation.steps < verdict.MIN_STEPS and not run.completeness.complete:
@@ -81,7 +81,7 @@ def _examine(name: str, run: Trajectory, prediction: Prediction, level: float) -
     return member, evidence
 
 
-def _require_prediction(name: str, experiment: ValidExperiment) -> None:
+def _require_prediction(name: str, experiment: Experiment) -> None:
     reason = experiment.unpredictable()
     if reason:
         raise InputError(f"{name}: {reason}, so there is nothing to pool: compare one bag at a time")
@@ -113,7 +113,7 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _without_data(run: Trajectory) -> Trajectory:
+def _without_data(run: Run) -> Run:
     """Only the record and the completeness."""
     return dataclasses.replace(
         run,

@@ -25,7 +25,7 @@ from msg_analysis.inference.sequential_sums import AnyTimeEvidence, any_time_evi
 from msg_analysis.inference.statistics import batch_interval, holm, steps_to_half_width
 from msg_analysis.inference.switching import switching_test
 from msg_analysis.inference.time_means import TimeMeans
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.prediction import Prediction, predict
@@ -33,7 +33,7 @@ from msg_analysis.theory.prediction import Prediction, predict
 MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
 
 
-def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
+def compare(trajectory: Run, *, level: float = 0.01) -> Comparison:
     """Compare a run, or its complete beginning, with what theory predicts for it; see ``api.compare``.
 
     Every test assumes exactly the law that the record says was run; the probability of any false rejection in the
@@ -68,7 +68,7 @@ def compare(trajectory: Trajectory, *, level: float = 0.01) -> Comparison:
 
 
 def judge(
-    trajectory: Trajectory,
+    trajectory: Run,
     prediction: Prediction,
     evidence: Evidence,
     level: float,
@@ -178,7 +178,7 @@ def _accused(prediction: Prediction, evidence: Evidence) -> Accused:
     )
 
 
-def _measured(trajectory: Trajectory, level: float, unpredicted: str) -> Comparison:
+def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
     """Comparison without a prediction."""
     measurement = Measurement.of(trajectory)
     agents, enough = measurement.step.agents, True
@@ -213,7 +213,7 @@ def _measured(trajectory: Trajectory, level: float, unpredicted: str) -> Compari
     )
 
 
-def without_numbers(trajectory: Trajectory, level: float, prediction: Prediction, steps: int) -> Comparison:
+def without_numbers(trajectory: Run, level: float, prediction: Prediction, steps: int) -> Comparison:
     """Comparison with too few steps: only what was expected."""
     predicted = prediction.emulated
     return Comparison(

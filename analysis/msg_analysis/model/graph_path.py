@@ -18,7 +18,7 @@ from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.experiment.markov_chain import MarkovChain
 
 if TYPE_CHECKING:
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ class Sojourn:
     last_step: int
 
 
-def sojourns(experiment: ValidExperiment, initial: FloatArray) -> Iterator[Sojourn]:
+def sojourns(experiment: Experiment, initial: FloatArray) -> Iterator[Sojourn]:
     """The graph path of a run of N steps, drawn from the experiment's seed; ``initial`` (n,) is the law of g(0).
 
     Step k uses the graph of the chain at time k dt, so successive graphs are a Markov chain with P = expm(Gamma dt),
@@ -64,7 +64,7 @@ class PathWindow:
 
     MOST_AHEAD = 10_000  # sojourns beyond the first one that is kept; more are never published ahead
 
-    def __init__(self, experiment: ValidExperiment, initial: FloatArray) -> None:
+    def __init__(self, experiment: Experiment, initial: FloatArray) -> None:
         self._path = sojourns(experiment, initial)
         self._kept: deque[Sojourn] = deque()
         self.first = 0  # number of the first sojourn that is kept
@@ -92,12 +92,12 @@ class PathWindow:
         return sojourn is not None
 
 
-def mode_path(experiment: ValidExperiment, initial: FloatArray) -> IntArray:
+def mode_path(experiment: Experiment, initial: FloatArray) -> IntArray:
     """(N,) index of the graph of each step k -> k+1; ``initial`` (n,) is the law of g(0)."""
     return _modes(sojourns(experiment, initial), experiment.steps)
 
 
-def past_modes(experiment: ValidExperiment, first_mode: int, steps: int) -> IntArray:
+def past_modes(experiment: Experiment, first_mode: int, steps: int) -> IntArray:
     """(steps,) g(-steps), ..., g(-1): the graphs before a run, given that it begins with g(0) = ``first_mode``.
 
     Drawn backwards by the reversed chain, so that the graphs before and after time 0 are one stationary path. A longer

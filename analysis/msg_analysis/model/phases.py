@@ -18,10 +18,10 @@ from msg_analysis.arithmetic.random_streams import Stream, generator
 from msg_analysis.common.arrays import FloatArray
 
 if TYPE_CHECKING:
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
 
 
-def phases(experiment: ValidExperiment) -> FloatArray:
+def phases(experiment: Experiment) -> FloatArray:
     """(m,) phi_i = (rank_i + 1/2) / m, a part of a step; the ranks are a permutation drawn from the seed."""
     ranks = generator(experiment.run.seed, Stream.PHASE).permutation(experiment.agents)
     return np.asarray((ranks + 0.5) / experiment.agents)

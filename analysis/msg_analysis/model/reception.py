@@ -30,7 +30,7 @@ import numpy as np
 from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, link_number, normals, uniforms
 from msg_analysis.arithmetic.update_law import Reception, from_payload, to_payload
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.phases import phases
 from msg_analysis.model.step_model import Wiring
 
@@ -60,7 +60,7 @@ def neighbour_tables(wiring: Wiring) -> Neighbours:
 _WITHIN = np.arange(STEPS_PER_BLOCK)
 
 
-def loss_probabilities(experiment: ValidExperiment) -> tuple[FloatArray, FloatArray]:
+def loss_probabilities(experiment: Experiment) -> tuple[FloatArray, FloatArray]:
     """Of a message after one that was not lost, and after one that was, (m, m) each: receiver, sender."""
     loss, burst = experiment.loss, experiment.noise.burst
     if burst is None:
@@ -71,7 +71,7 @@ def loss_probabilities(experiment: ValidExperiment) -> tuple[FloatArray, FloatAr
 class Losses:
     """The lost messages of every link, block after block of steps."""
 
-    def __init__(self, experiment: ValidExperiment) -> None:
+    def __init__(self, experiment: Experiment) -> None:
         self._seed = experiment.run.seed
         after_kept, after_lost = loss_probabilities(experiment)
         self._low, self._high = np.minimum(after_kept, after_lost), np.maximum(after_kept, after_lost)
@@ -130,7 +130,7 @@ class Air:
     ``start``: step of the first messages; negative for a past before the run.
     """
 
-    def __init__(self, experiment: ValidExperiment, start: int = 0) -> None:
+    def __init__(self, experiment: Experiment, start: int = 0) -> None:
         noise = experiment.noise
         self.broadcast, self.link, self.loss = noise.broadcast, noise.link, noise.loss.any
         self.delay, self.holds = noise.delay, noise.holds
@@ -200,7 +200,7 @@ class Air:
 Array = TypeVar("Array", bound=AnyArray)
 
 
-def ahead(experiment: ValidExperiment) -> IntArray:
+def ahead(experiment: Experiment) -> IntArray:
     """(m, m) by receiver and sender: 1 where the sender steps first, in real time with ideal timers, else 0."""
     if experiment.run.pace == "lockstep":
         return np.zeros((experiment.agents, experiment.agents), dtype=np.int64)
@@ -211,7 +211,7 @@ def ahead(experiment: ValidExperiment) -> IntArray:
 class AirReception:
     """The reception of block after block of steps, from x(first) = ``start`` (m, R) on."""
 
-    def __init__(self, experiment: ValidExperiment, model: Wiring, start: FloatArray, first: int = 0) -> None:
+    def __init__(self, experiment: Experiment, model: Wiring, start: FloatArray, first: int = 0) -> None:
         self._air = air = Air(experiment, first)
         self._first = first
         links = np.argwhere(model.listens())  # (L, 2): receiver, sender
@@ -293,7 +293,7 @@ def by_sender_and_block(senders: IntArray, used: IntArray) -> Iterator[tuple[int
 class MessagesUsed:
     """Which messages are used in a run in which all steps are made in time, block after block of steps."""
 
-    def __init__(self, experiment: ValidExperiment, model: Wiring) -> None:
+    def __init__(self, experiment: Experiment, model: Wiring) -> None:
         self._air, self._lead, self._tables = Air(experiment), ahead(experiment), neighbour_tables(model)
         self._pairs: list[tuple[int, int]] = [(i, j) for i, j in np.argwhere(model.listens()).tolist()]
         # (n, m, D) number of the link from each neighbour in each graph; L beyond the last neighbour.
@@ -306,7 +306,7 @@ class MessagesUsed:
         self._links[there] = numbers[receivers, self._tables.senders][there]
 
     def used(self, first: int, modes: IntArray) -> IntArray:
-        """(K, m, D) entries of ``used`` of ``Trajectory`` for the steps first, ... with these graphs (K,)."""
+        """(K, m, D) entries of ``used`` of ``Run`` for the steps first, ... with these graphs (K,)."""
         found = np.full((len(self._pairs) + 1, len(modes)), NOTHING, dtype=np.int64)
         steps = np.arange(first, first + len(modes))
         for number, (i, j) in enumerate(self._pairs if len(modes) else ()):
@@ -324,7 +324,7 @@ class MessagesUsed:
 class AgentAir:
     """What happens to the messages of an agent (index from 0) and to those for it; see ``model.step.air``."""
 
-    def __init__(self, experiment: ValidExperiment, model: Wiring, agent: int) -> None:
+    def __init__(self, experiment: Experiment, model: Wiring, agent: int) -> None:
         self._agent = agent
         self._air = air = Air(experiment)
         self.delay, self.broadcast, self.link, self.loss = air.delay, air.broadcast, air.link, air.loss

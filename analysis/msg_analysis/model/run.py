@@ -11,7 +11,7 @@ import numpy as np
 
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray, pieces, release
 from msg_analysis.common.text import markdown_table
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.reception import LOST, NOTHING
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import Wiring
@@ -58,7 +58,7 @@ class Completeness:
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Trajectory:
+class Run:
     """One run, ordered by step.
 
     Attributes
@@ -156,7 +156,7 @@ class LoggedInputs:
     ``heard`` (states, D) uint64 has 0 beyond its end, after ``count`` (states,) entries.
     """
 
-    def __init__(self, model: Wiring, experiment: ValidExperiment) -> None:
+    def __init__(self, model: Wiring, experiment: Experiment) -> None:
         noise, self.realtime = experiment.noise, experiment.run.pace == "realtime"
         self.most = model.most_neighbours  # D
         self._last = np.uint64(experiment.steps)

@@ -25,7 +25,7 @@ import numpy as np
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.version import __version__, ros_distribution
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.protocols import info_of
 from msg_analysis.model.step_model import StepMatrices, StepModel, Wiring, build_model, build_step_model
 
@@ -113,7 +113,7 @@ class RunRecord:
     """
 
     run: uuid.UUID
-    experiment: ValidExperiment
+    experiment: Experiment
     start: FloatArray
     versions: dict[str, str] = field(default_factory=software_versions)
     matrices: StepMatrices | None = None
@@ -149,7 +149,7 @@ class RunRecord:
         document = experiment.to_document()
         document["run"]["duration"] = step * experiment.step_length
         info = experiment.protocol.info if experiment.protocol else None
-        shorter = ValidExperiment.parse(document, source=experiment.source, recorded=info)
+        shorter = Experiment.parse(document, source=experiment.source, recorded=info)
         return replace(self, experiment=shorter, planned=self.planned_steps)
 
     def to_json(self, *, with_key: bool = False) -> str:
@@ -199,7 +199,7 @@ class RunRecord:
                     f"{source}: run record of format {document['format']}, expected {FORMAT}: "
                     "read it with the version of msg_analysis that wrote it"
                 )
-            experiment = ValidExperiment.parse(document["experiment"], source=source, recorded=info_of(document))
+            experiment = Experiment.parse(document["experiment"], source=source, recorded=info_of(document))
             start = np.array(document["start"], dtype=float)
             step = document.get("step")
             matrices = None if step is None else _matrices(step, experiment, source)
@@ -232,7 +232,7 @@ def _entries(matrix: FloatArray) -> list[list[float]]:
     return [[int(i) + 1, int(j) + 1, float(matrix[i, j])] for i, j in np.argwhere(matrix)]
 
 
-def _matrices(document: Any, experiment: ValidExperiment, source: str) -> StepMatrices:
+def _matrices(document: Any, experiment: Experiment, source: str) -> StepMatrices:
     stacks = {"noise_gain": experiment.step_noise_gain}
     for key in ("weights", "noise_gain")[: 2 if experiment.protocol else 1]:
         stack = np.zeros((len(experiment.graph_list), experiment.agents, experiment.agents))

@@ -27,7 +27,7 @@ from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.model.phases import phases
 
 if TYPE_CHECKING:
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,7 +153,7 @@ def _transition(chain: MarkovChain, dt: float) -> FloatArray:
     return transition
 
 
-def build_model(experiment: ValidExperiment, matrices: StepMatrices | None = None) -> Wiring:
+def build_model(experiment: Experiment, matrices: StepMatrices | None = None) -> Wiring:
     """A ``StepModel`` where the law is linear, else the wiring alone; ``matrices`` are those of the run record."""
     if experiment.protocol is None or experiment.protocol.linear:
         return build_step_model(experiment, matrices)
@@ -167,7 +167,7 @@ def build_model(experiment: ValidExperiment, matrices: StepMatrices | None = Non
     )
 
 
-def step_matrices(experiment: ValidExperiment) -> StepMatrices:
+def step_matrices(experiment: Experiment) -> StepMatrices:
     """Compute the matrices of a step.
 
     InputError: the experiment has a protocol that is not linear, is not available, or fails.
@@ -185,7 +185,7 @@ def step_matrices(experiment: ValidExperiment) -> StepMatrices:
     return StepMatrices(weights, gain)
 
 
-def build_step_model(experiment: ValidExperiment, matrices: StepMatrices | None = None) -> StepModel:
+def build_step_model(experiment: Experiment, matrices: StepMatrices | None = None) -> StepModel:
     """What one step of an experiment does; ``matrices`` are those of the run record, computed if not given.
 
     InputError: as of ``step_matrices``.
@@ -231,7 +231,7 @@ def build_step_model(experiment: ValidExperiment, matrices: StepMatrices | None 
     )
 
 
-def _built_in(experiment: ValidExperiment) -> FloatArray:
+def _built_in(experiment: Experiment) -> FloatArray:
     """(n, m, m): W_g of the law that the agents have by themselves, with its leaders."""
     gains, agents = experiment.leader_gains, experiment.agents
     grounded = np.isinf(gains)
@@ -249,7 +249,7 @@ def _built_in(experiment: ValidExperiment) -> FloatArray:
     return weights
 
 
-def first_graph(experiment: ValidExperiment) -> FloatArray:
+def first_graph(experiment: Experiment) -> FloatArray:
     """(n,): the law of g(0)."""
     first = experiment.switching.initial
     if first == "stationary":
@@ -257,7 +257,7 @@ def first_graph(experiment: ValidExperiment) -> FloatArray:
     return np.array([float(graph.name == first) for graph in experiment.graph_list])
 
 
-def _arcs(experiment: ValidExperiment) -> BoolArray:
+def _arcs(experiment: Experiment) -> BoolArray:
     """(n, m, m): whether agent i hears agent j, as the graphs say."""
     return np.array([graph.adjacency != 0.0 for graph in experiment.graph_list])
 
@@ -265,12 +265,12 @@ def _arcs(experiment: ValidExperiment) -> BoolArray:
 StepLaw = Literal["synchronous", "sequential"]
 
 
-def step_law(experiment: ValidExperiment) -> StepLaw:
+def step_law(experiment: Experiment) -> StepLaw:
     """Whether the agents of a run step all at once (lockstep) or one after the other (real time)."""
     return "sequential" if experiment.run.pace == "realtime" else "synchronous"
 
 
-def build_run_model(experiment: ValidExperiment, step: StepModel | None = None) -> StepModel:
+def build_run_model(experiment: Experiment, step: StepModel | None = None) -> StepModel:
     """What a step of all agents of a run with a linear law does to x(k), as one jump linear system.
 
     In real time the law is sequential: noise of an agent reaches those that are due later. With messages that are

@@ -20,7 +20,7 @@ import numpy as np
 import scipy.optimize
 
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.theory import jump_system as systems
@@ -109,15 +109,15 @@ class _Network:
     """Graphs that are checked once, then used with many chains."""
 
     name: str
-    base: ValidExperiment
+    base: Experiment
     generator: Generator
 
     @classmethod
     def of(cls, name: str, graphs: dict[str, Any], generator: Generator) -> _Network:
         document = {"name": name, "graphs": graphs, "switching": {"generator": generator(1.0, 1.0, 1.0).tolist()}}
-        return cls(name, ValidExperiment.parse(document, source=name), generator)
+        return cls(name, Experiment.parse(document, source=name), generator)
 
-    def at(self, epsilon: float, r12: float, r21: float) -> ValidExperiment:
+    def at(self, epsilon: float, r12: float, r21: float) -> Experiment:
         chain = MarkovChain("continuous", self.generator(epsilon, r12, r21))
         return dataclasses.replace(self.base, chain=chain)
 

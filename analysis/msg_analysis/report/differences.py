@@ -20,10 +20,10 @@ from msg_analysis.common.files import RESULT_FILE
 from msg_analysis.common.resources import tell
 from msg_analysis.common.text import HALF_WIDTH_95
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import flat
 from msg_analysis.inference.verdict import compare
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.report.wording import agent_errors
 from msg_analysis.runs import read_document, result_row, tested_error
 from msg_analysis.theory.leader_search import SearchProgress, ignore
@@ -32,7 +32,7 @@ from msg_analysis.theory.prediction import Moments, Prediction, predict
 from msg_analysis.theory.settling import asymptotic_rates
 
 
-def state_difference(a: Trajectory, b: Trajectory, *, block_numbers: int = BLOCK_NUMBERS) -> dict[str, Any]:
+def state_difference(a: Run, b: Run, *, block_numbers: int = BLOCK_NUMBERS) -> dict[str, Any]:
     """The key ``states`` of the difference of two runs; steps count from 0, agents and replicas from 1.
 
     States of a step count as equal if both are missing; +0 and -0 are different.
@@ -58,7 +58,7 @@ def state_difference(a: Trajectory, b: Trajectory, *, block_numbers: int = BLOCK
     }
 
 
-def graph_difference(a: Trajectory, b: Trajectory) -> dict[str, Any] | None:
+def graph_difference(a: Run, b: Run) -> dict[str, Any] | None:
     """First step in which the runs used different graphs, and the names of these; None: there is none."""
     names_a, names_b = ([graph.name for graph in run.record.experiment.graph_list] for run in (a, b))
     steps = min(len(a.modes), len(b.modes))
@@ -72,7 +72,7 @@ def graph_difference(a: Trajectory, b: Trajectory) -> dict[str, Any] | None:
     return {"step": step, "a": names_a[a.modes[step]], "b": names_b[b.modes[step]], "steps": int(differs.sum())}
 
 
-def _shape(run: Trajectory) -> str:
+def _shape(run: Run) -> str:
     agents, width = run.states.shape[1:]
     return f"{agents} agents with {width} {'number' if width == 1 else 'numbers'} each"
 
@@ -163,7 +163,7 @@ MOST_AGENTS = 100  # with which leaders are searched: each set takes up to half 
 _RATES = ("mean", "second_moment", "graph")
 
 
-def experiment_difference(a: ValidExperiment, b: ValidExperiment, watch: SearchProgress = ignore) -> dict[str, Any]:
+def experiment_difference(a: Experiment, b: Experiment, watch: SearchProgress = ignore) -> dict[str, Any]:
     """The document of ``msg-analysis diff`` of two experiments; keys in docs/commands.md.
 
     An experiment without a prediction has the reason instead. ``watch``: of the search of leaders.
@@ -183,7 +183,7 @@ def experiment_difference(a: ValidExperiment, b: ValidExperiment, watch: SearchP
     }
 
 
-def _side(experiment: ValidExperiment, prediction: Prediction | str) -> dict[str, Any]:
+def _side(experiment: Experiment, prediction: Prediction | str) -> dict[str, Any]:
     return {
         "file": experiment.source,
         "name": experiment.name,
@@ -195,7 +195,7 @@ def _side(experiment: ValidExperiment, prediction: Prediction | str) -> dict[str
     }
 
 
-def _prediction(experiment: ValidExperiment) -> Prediction | str:
+def _prediction(experiment: Experiment) -> Prediction | str:
     """The prediction, or why there is none."""
     try:
         experiment.require_available("predict")
@@ -234,7 +234,7 @@ def _rates(prediction: Prediction) -> dict[str, float | None]:
 
 
 def _leaders(
-    a: ValidExperiment, b: ValidExperiment, found: list[Prediction | str], watch: SearchProgress
+    a: Experiment, b: Experiment, found: list[Prediction | str], watch: SearchProgress
 ) -> list[dict[str, Any]]:
     """Leaders of each, and the best set of as many; one without leaders gets as many, and the gain, of the other."""
     sides = []
@@ -305,7 +305,7 @@ def bag_difference(a: Path, b: Path) -> dict[str, Any]:
     }
 
 
-def _bag_side(path: Path, run: Trajectory, result: dict[str, Any]) -> dict[str, Any]:
+def _bag_side(path: Path, run: Run, result: dict[str, Any]) -> dict[str, Any]:
     record, completeness = run.record, run.completeness
     tested = tested_error(result, path / RESULT_FILE)
     given = tested is not None and result["system_error"]["standard_error"] is None
@@ -328,7 +328,7 @@ def _bag_side(path: Path, run: Trajectory, result: dict[str, Any]) -> dict[str, 
     }
 
 
-def _result(path: Path, run: Trajectory) -> dict[str, Any]:
+def _result(path: Path, run: Run) -> dict[str, Any]:
     """The comparison of a run: as saved beside its bag, or made now; only the reason where there is none."""
     folder = path if path.is_dir() else path.parent
     try:

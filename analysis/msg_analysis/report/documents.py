@@ -20,7 +20,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.text import agent_name, markdown_table
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import loading, validation
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
 from msg_analysis.inference.autocovariance import (
@@ -77,13 +77,13 @@ LAWS: dict[str, dict[str, Any]] = {
 PROCESS_NOISE: tuple[Any, ...] = (0.0, 1.0, [1.0, 0.5], [[1.0, 0.2], [0.0, 1.0]], {"a": 1.0, "b": 2.0})
 
 
-def experiment(messages: str, law: str, pace: Pace, process: Any = 1.0) -> ValidExperiment:
+def experiment(messages: str, law: str, pace: Pace, process: Any = 1.0) -> Experiment:
     """One with these messages and this law; only asked what is available, since its protocol does nothing."""
     document: dict[str, Any] = {"name": "any", "graphs": {"a": {"path": [1, 2]}, "b": {"arcs": [[1, 2], [2, 1]]}}}
     document |= {"switching": {"generator": [[-1, 1], [1, -1]]}, **LAWS[law]}
     document["noise"] = {"process": process, **MESSAGES[messages]}
     document["run"] = {"pace": pace, **document.get("run", {})}
-    found = ValidExperiment.parse(document)
+    found = Experiment.parse(document)
     if "protocol" not in law:
         return found
     info = ProtocolInfo(name="any", package="any", version="1", linear=law == "linear protocol")
@@ -142,7 +142,7 @@ class MeasuredSpectrum:
         }
 
 
-def predicted_spectrum(experiment: ValidExperiment) -> MeasuredSpectrum:
+def predicted_spectrum(experiment: Experiment) -> MeasuredSpectrum:
     """Of an experiment; errors as of ``spectrum`` and ``predict``."""
     experiment.require_available("predict")
     return MeasuredSpectrum(spectrum(predict(experiment)))
@@ -173,7 +173,7 @@ Result = TypeVar("Result")
 
 
 def describe_transient(
-    experiment: ValidExperiment,
+    experiment: Experiment,
     times: FloatArray,  # (T,) ascending [units of simulated time]
     *,
     law: TransientLaw = "emulated",
@@ -208,7 +208,7 @@ def describe_transient(
 
 
 def _settling(
-    experiment: ValidExperiment, system: JumpSystem, steady: FloatArray, unit: float, fraction: float
+    experiment: Experiment, system: JumpSystem, steady: FloatArray, unit: float, fraction: float
 ) -> dict[str, Any]:
     """Keys ``steady_system_error``, ``settling`` [units of simulated time] and ``rates`` [1 / unit]."""
     error = float(np.trace(system.lifted(steady.sum(axis=0))))
@@ -231,7 +231,7 @@ def _settling(
     }
 
 
-def describe_facts(experiment: ValidExperiment) -> dict[str, Any]:
+def describe_facts(experiment: Experiment) -> dict[str, Any]:
     """The document of ``msg-analysis facts``: lemmas, bounds, indices of the graphs, two graphs in closed form.
 
     None: a graph that is directed or disconnected; the closed form unless two graphs can each be held fixed; what the
@@ -292,7 +292,7 @@ def _mean_squares(document: dict[str, Any]) -> tuple[str, str]:
     return f"system_{kind}", f"node_{kind}s"
 
 
-def describe_experiment(experiment: ValidExperiment) -> dict[str, Any]:
+def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     """The document of ``msg-analysis info EXPERIMENT --json``; the experiment need not be one that can be run.
 
     None: infinite or not computable; a stability limit with a delay or a protocol is not known. Memory in bytes.
@@ -435,7 +435,7 @@ def describe_salvage(out: Path, report: SalvageReport) -> dict[str, Any]:
     return {"bag": str(out), **dataclasses.asdict(report), **_describe_run(out, Inventory())}
 
 
-def _protocol(experiment: ValidExperiment) -> dict[str, Any] | None:
+def _protocol(experiment: Experiment) -> dict[str, Any] | None:
     """The protocol of the agents; None for the built-in law."""
     protocol = experiment.protocol
     if protocol is None:
@@ -447,14 +447,14 @@ def _protocol(experiment: ValidExperiment) -> dict[str, Any] | None:
     }
 
 
-def _stability_limit(experiment: ValidExperiment, graph: Graph) -> float | None:
+def _stability_limit(experiment: Experiment, graph: Graph) -> float | None:
     if experiment.time == "discrete" or experiment.noise.delay or experiment.protocol:
         return None
     limit = validation.stability_limit(graph, experiment.leader_gains)
     return limit if math.isfinite(limit) else None
 
 
-def _predicted_system_error(experiment: ValidExperiment) -> float | None:
+def _predicted_system_error(experiment: Experiment) -> float | None:
     try:
         experiment.require_available("predict")
         return predict(experiment).emulated.system_error

@@ -14,7 +14,7 @@ from markupsafe import Markup, escape
 
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.text import agent_name, z_text
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.report.figures import LABELLED, places, shorten
 from msg_analysis.report.plot_style import NOBODY, Accused, graph_variable
@@ -88,7 +88,7 @@ _SIDE = 200.0
 _WEIGHTS = 5  # different line widths
 
 
-def graph_drawings(experiment: ValidExperiment, accused: Accused = NOBODY) -> list[Markup]:
+def graph_drawings(experiment: Experiment, accused: Accused = NOBODY) -> list[Markup]:
     """The first ``MOST_GRAPHS`` graphs, each agent at the same place in all of them; leaders are squares."""
     where = _scaled(places(experiment.graph_list), experiment.agents)
     leaders = set(experiment.leaders.agents) if experiment.leaders else set()
@@ -192,7 +192,7 @@ def _at(point: FloatArray) -> str:
     return f"{point[0]:.1f} {point[1]:.1f}"
 
 
-def chain_drawing(experiment: ValidExperiment, accused: Accused = NOBODY) -> Markup | None:
+def chain_drawing(experiment: Experiment, accused: Accused = NOBODY) -> Markup | None:
     """The chain: a circle per graph, an arrow per rate (or probability) from one to another.
 
     None for a single graph, and for more than ``MOST_MODES``.

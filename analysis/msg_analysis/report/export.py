@@ -25,7 +25,7 @@ from msg_analysis.common.files import require_place, written_whole
 from msg_analysis.common.resources import tell
 from msg_analysis.common.text import agent_name
 from msg_analysis.errors import InputError, NotAvailableError
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,7 +40,7 @@ class RunTable:
     """One table: its name, its columns, and how many steps it has; ``pieces`` makes its rows."""
 
     name: str
-    trajectory: Trajectory
+    trajectory: Run
     schema: pa.Schema
     steps: int
 
@@ -62,7 +62,7 @@ class RunTable:
                     release(array)
 
 
-def run_tables(trajectory: Trajectory) -> list[RunTable]:
+def run_tables(trajectory: Run) -> list[RunTable]:
     """Tables ``states`` (a row per state and replica), ``graphs`` (per step k -> k+1) and ``errors`` (per x(k)).
 
     All columns are described in docs/commands.md.
@@ -92,11 +92,11 @@ def run_tables(trajectory: Trajectory) -> list[RunTable]:
     ]
 
 
-def _timed(trajectory: Trajectory) -> bool:
+def _timed(trajectory: Run) -> bool:
     return trajectory.made is not None and trajectory.record.experiment.run.pace == "realtime"
 
 
-def _states(trajectory: Trajectory, first: int, end: int) -> dict[str, Any]:
+def _states(trajectory: Run, first: int, end: int) -> dict[str, Any]:
     experiment = trajectory.record.experiment
     agents, replicas = experiment.agents, experiment.run.replicas
     states = trajectory.states[first:end]
@@ -120,7 +120,7 @@ def _states(trajectory: Trajectory, first: int, end: int) -> dict[str, Any]:
     return columns
 
 
-def _graphs(trajectory: Trajectory, first: int, end: int) -> dict[str, Any]:
+def _graphs(trajectory: Run, first: int, end: int) -> dict[str, Any]:
     experiment = trajectory.record.experiment
     modes, step = trajectory.modes[first:end], np.arange(first, end)
     names = _Names([graph.name for graph in experiment.graph_list], modes)
@@ -128,7 +128,7 @@ def _graphs(trajectory: Trajectory, first: int, end: int) -> dict[str, Any]:
     return {"step": step, "time": step * experiment.step_length, "graph": graph, "graph_name": names}
 
 
-def _errors(trajectory: Trajectory, first: int, end: int) -> dict[str, Any]:
+def _errors(trajectory: Run, first: int, end: int) -> dict[str, Any]:
     step = np.arange(first, end)
     errors = square_errors(trajectory, first, end)
     columns: dict[str, Any] = {"step": step, "time": step * trajectory.record.experiment.step_length}
@@ -136,7 +136,7 @@ def _errors(trajectory: Trajectory, first: int, end: int) -> dict[str, Any]:
     return columns | {f"error_{agent + 1}": errors[:, agent] for agent in range(errors.shape[1])}
 
 
-def square_errors(trajectory: Trajectory, first: int, end: int) -> FloatArray:
+def square_errors(trajectory: Run, first: int, end: int) -> FloatArray:
     """(end - first, m) mean over the replicas of the squares by which states are off the mean or the reference.
 
     NaN where a state that is needed for it is missing. Their means over time are the measured errors of a comparison.
@@ -185,7 +185,7 @@ def _known(known: BoolArray) -> pa.Buffer | None:
 Table = Literal["states", "graphs", "errors"]
 
 
-def data_frame(trajectory: Trajectory, table: Table) -> pd.DataFrame:
+def data_frame(trajectory: Run, table: Table) -> pd.DataFrame:
     """One of the tables of a run. InputError: no such table; NotAvailableError: pandas is not installed."""
     import pyarrow as pa
 
@@ -214,7 +214,7 @@ def require_rerun() -> Any:
     return rerun
 
 
-def write_recording(trajectory: Trajectory, file: Path, shown: str) -> None:
+def write_recording(trajectory: Run, file: Path, shown: str) -> None:
     """States, errors and graphs over the timelines ``step`` and ``time``; what is missing is left out."""
     rerun, experiment = require_rerun(), trajectory.record.experiment
     recording = rerun.RecordingStream(f"msg_analysis_{experiment.name}", recording_id=str(trajectory.record.run))
@@ -245,7 +245,7 @@ def _send(rerun: Any, recording: Any, dt: float, path: tuple[str, ...], first: i
         recording.send_columns(rerun.new_entity_path(path), indexes=index, columns=[*columns])
 
 
-def _send_graphs(rerun: Any, recording: Any, trajectory: Trajectory, names: list[str]) -> None:
+def _send_graphs(rerun: Any, recording: Any, trajectory: Run, names: list[str]) -> None:
     """The number of the graph, and its links, whenever it changes."""
     experiment, modes = trajectory.record.experiment, trajectory.modes
     recording.log("network", rerun.GraphNodes(node_ids=names, labels=names), static=True)
@@ -270,7 +270,7 @@ ARRAY_FILE, RECORDING_FILE = "run.npz", "run.rrd"
 _OLDEST = (1980, 1, 1, 0, 0, 0)  # of files in an archive: the same run gives the same bytes
 
 
-def export_run(trajectory: Trajectory, directory: Path, forms: Sequence[Form]) -> list[Path]:
+def export_run(trajectory: Run, directory: Path, forms: Sequence[Form]) -> list[Path]:
     """Write the files of these forms into a directory, made if need be; files of the same names are replaced.
 
     InputError: a file cannot be written; NotAvailableError: the library for it is not installed.
@@ -324,7 +324,7 @@ def _table_writer(table: RunTable, form: Form) -> Callable[[Path, str], None]:
     return write
 
 
-def _write_arrays(trajectory: Trajectory, file: Path, shown: str) -> None:
+def _write_arrays(trajectory: Run, file: Path, shown: str) -> None:
     """What ``numpy.savez`` writes, but in pieces; agents and graphs count from 0, as in Python."""
     experiment = trajectory.record.experiment
     small = {

@@ -20,11 +20,11 @@ from msg_analysis.common.arrays import FloatArray, release
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import HALF_WIDTH_95, agent_name
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.inference.autocovariance import LoggedAutocovariance, LoggedDensity
 from msg_analysis.inference.comparison import Comparison
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.report.wording import agent_errors, verdict_line
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.spectrum import Spectrum
@@ -174,7 +174,7 @@ def stacked_panels(*sizes: float) -> tuple[NotebookFigure, Sequence[Axes]]:
     return figure, list(panels[:, 0])
 
 
-def run_figure(trajectory: Trajectory, agents: Sequence[int] | None, replica: int) -> NotebookFigure:
+def run_figure(trajectory: Run, agents: Sequence[int] | None, replica: int) -> NotebookFigure:
     """States of agents (from 0; None: the first ones) over time, and the graph of every step.
 
     Of long runs, ``MOST_POINTS`` states at equal distances. InputError: no such agent or replica.
@@ -207,7 +207,7 @@ def run_figure(trajectory: Trajectory, agents: Sequence[int] | None, replica: in
     return figure
 
 
-def _draw_graphs(axes: Axes, trajectory: Trajectory) -> None:
+def _draw_graphs(axes: Axes, trajectory: Run) -> None:
     """A stripe for each graph, filled while it is active."""
     experiment, modes = trajectory.record.experiment, trajectory.modes
     names = [graph.name for graph in experiment.graph_list]
@@ -282,7 +282,7 @@ def prediction_figure(prediction: Prediction) -> NotebookFigure:
     return figure
 
 
-def _name_agents(axes: Axes, experiment: ValidExperiment) -> None:
+def _name_agents(axes: Axes, experiment: Experiment) -> None:
     axes.set(xlabel="agent", xlim=(0.4, experiment.agents + 0.6))
     if experiment.agents <= _NAMED:
         names = [plain(shorten(agent_name(agent, experiment.names))) for agent in range(1, experiment.agents + 1)]

@@ -30,11 +30,11 @@ from markupsafe import Markup
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import counted, p_text, with_names
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.observation import bounded
 from msg_analysis.inference.realtime_laws import SUPPORT
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.report import drawings, error_plots, plot_style, run_plots
 from msg_analysis.report.drawings import interval_bars, plus_minus
@@ -163,7 +163,7 @@ def _dates(records: Sequence[RunRecord]) -> list[str]:
     return [date.astimezone(datetime.UTC).strftime("%Y-%m-%d %H:%M") for date in dates]
 
 
-def _pace(experiment: ValidExperiment) -> str:
+def _pace(experiment: Experiment) -> str:
     run = experiment.run
     if run.pace == "lockstep":
         return "lockstep"
@@ -178,7 +178,7 @@ _NODE_TEST = "error of agent "  # beginning of the names of the tests of the nod
 
 def write_report(
     comparison: Comparison,
-    trajectory: Trajectory,
+    trajectory: Run,
     path: str | Path,
     *,
     restarts: Sequence[str] = (),
@@ -206,7 +206,7 @@ def write_report(
 
 def render(
     comparison: Comparison,
-    trajectory: Trajectory,
+    trajectory: Run,
     *,
     restarts: Sequence[str] = (),  # one line per process that was restarted
     strangers: Sequence[Mapping[str, Any]] = (),  # refused messages: node, topic, reason, count
@@ -293,7 +293,7 @@ def render(
 def _models(
     document: dict[str, Any],
     comparison: Comparison,
-    trajectory: Trajectory,
+    trajectory: Run,
     accused: Accused,
     events: Sequence[Event],
 ) -> tuple[dict[str, UIElement], run_plots.Drawn]:
@@ -392,7 +392,7 @@ def _number(value: float | None, digits: int = 4) -> str:
     return "–" if value is None else _typeset(f"{value:#.{digits}g}".rstrip("."))
 
 
-def _namer(experiment: ValidExperiment) -> Callable[[str], str]:
+def _namer(experiment: Experiment) -> Callable[[str], str]:
     return lambda text: with_names(text, experiment.names)
 
 

@@ -16,7 +16,7 @@ from msg_analysis.arithmetic.step_clock import StepClock
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray, pieces
 from msg_analysis.common.text import agent_text, counted
 from msg_analysis.model.phases import phases
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.report.figures import shorten
 from msg_analysis.report.plot_style import (
     BLACK,
@@ -52,7 +52,7 @@ class Event:
 
 
 def run_events(
-    trajectory: Trajectory, reported: Sequence[Mapping[str, Any]] = (), most: int = MOST_EVENTS
+    trajectory: Run, reported: Sequence[Mapping[str, Any]] = (), most: int = MOST_EVENTS
 ) -> tuple[list[Event], int]:
     """The events in order of time, of each kind at most so many, and how many more there are.
 
@@ -82,7 +82,7 @@ def run_events(
     return sorted(kept, key=lambda event: (event.first, KINDS.index(event.kind))), more
 
 
-def _late(trajectory: Trajectory) -> Iterable[tuple[int, BoolArray]]:
+def _late(trajectory: Run) -> Iterable[tuple[int, BoolArray]]:
     """Pieces (first step, (steps, m)): which states were made more than a period after they were due."""
     if trajectory.made is None:
         return
@@ -94,7 +94,7 @@ def _late(trajectory: Trajectory) -> Iterable[tuple[int, BoolArray]]:
         yield first, made[first:last] - due > experiment.step_length * 1e9
 
 
-def _missing(trajectory: Trajectory) -> Iterable[tuple[int, BoolArray]]:
+def _missing(trajectory: Run) -> Iterable[tuple[int, BoolArray]]:
     """Pieces (first step, (steps, m)): which states are missing."""
     if not trajectory.completeness.missing:
         return
@@ -198,7 +198,7 @@ class Drawn:
 
 
 def trajectory_plots(
-    trajectory: Trajectory, predicted: float | None, events: Sequence[Event] = ()
+    trajectory: Run, predicted: float | None, events: Sequence[Event] = ()
 ) -> tuple[dict[str, UIElement], Drawn]:
     """The figures by name, empty for a run without states, and what is in them."""
     experiment = trajectory.record.experiment

@@ -10,17 +10,17 @@ from collections.abc import Sequence
 from typing import Any
 
 from msg_analysis.common.text import agent_name, agent_text, listed, number_text, percent, with_names
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory.graph_indices import algebraic_connectivity
 from msg_analysis.theory.prediction import LAW_NAMES
 
 
-def explain(experiment: ValidExperiment) -> list[str]:
+def explain(experiment: Experiment) -> list[str]:
     """What the agents do, what switches, what is random, and what was run: a short paragraph each."""
     return [_task(experiment), _switching(experiment), _noise(experiment), _run(experiment)]
 
 
-def graph_facts(experiment: ValidExperiment) -> list[dict[str, Any]]:
+def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
     """Of every graph: ``name``, ``links``, ``directed``, ``connectivity``, ``share`` (predicted, of time), ``held``.
 
     ``held`` is the mean holding time [units of simulated time]; None for a graph that is never left.
@@ -39,7 +39,7 @@ def graph_facts(experiment: ValidExperiment) -> list[dict[str, Any]]:
     ]
 
 
-def _task(experiment: ValidExperiment) -> str:
+def _task(experiment: Experiment) -> str:
     agents, leaders = experiment.agents, experiment.leaders
     if experiment.protocol:
         info = experiment.protocol.info
@@ -60,7 +60,7 @@ def _task(experiment: ValidExperiment) -> str:
     )
 
 
-def _switching(experiment: ValidExperiment) -> str:
+def _switching(experiment: Experiment) -> str:
     modes, chain = len(experiment.graph_list), experiment.chain
     if modes == 1:
         return f"The graph is always {experiment.graph_list[0].name}."
@@ -80,7 +80,7 @@ def _switching(experiment: ValidExperiment) -> str:
     )
 
 
-def _noise(experiment: ValidExperiment) -> str:
+def _noise(experiment: Experiment) -> str:
     noise = experiment.noise
     process = noise.process
     size = f"gain {process:g}" if isinstance(process, float | int) else "a gain matrix"
@@ -100,7 +100,7 @@ def _noise(experiment: ValidExperiment) -> str:
     return "; ".join(parts) + "."
 
 
-def _losses(experiment: ValidExperiment) -> str:
+def _losses(experiment: Experiment) -> str:
     noise, loss = experiment.noise, experiment.noise.loss
     text = f"{100 * loss.default:.3g} % of the messages are lost"
     if special := [probability for *_, probability in (*loss.arcs, *loss.edges)]:
@@ -111,7 +111,7 @@ def _losses(experiment: ValidExperiment) -> str:
     return text + (", and the last value that was heard takes the place of a lost one" if noise.holds else "")
 
 
-def _run(experiment: ValidExperiment) -> str:
+def _run(experiment: Experiment) -> str:
     run = experiment.run
     replicas = "1 replica" if run.replicas == 1 else f"{run.replicas} independent replicas on the same graph path"
     start = {"stationary": "the steady state", "zero": "0"}

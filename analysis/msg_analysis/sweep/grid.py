@@ -27,7 +27,7 @@ from pydantic import ValidationError
 
 from msg_analysis.common.text import agent_text
 from msg_analysis.experiment.examples import find
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import other_kind, read_yaml
 from msg_analysis.experiment.problems import ExperimentError, problem, show, translate
 from msg_analysis.sweep.points import Job, JobKind
@@ -281,7 +281,7 @@ def _plan(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path,
         try:
             for key, value in values.items():
                 document = put(document, key, value)
-            experiment = ValidExperiment.parse(document, source=str(path), directory=directory)
+            experiment = Experiment.parse(document, source=str(path), directory=directory)
             lines = experiment.unavailable("predict" if spec.kind == "predict" else "run")
         except KeyProblemError as error:
             lines = [str(error)]
@@ -300,7 +300,7 @@ def _plan(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path,
     return Sweep(path.stem, spec, name, tuple(points), names or None)
 
 
-def _runs(spec: SweepSpec, values: Mapping[str, Any], experiment: ValidExperiment) -> Iterator[Point]:
+def _runs(spec: SweepSpec, values: Mapping[str, Any], experiment: Experiment) -> Iterator[Point]:
     document = experiment.to_document()
     if spec.kind == "predict":
         yield Point(values, None, None, Job.of("predict", document))

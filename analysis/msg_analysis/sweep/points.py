@@ -304,11 +304,11 @@ def evaluate(job: Job, stopping: Callable[[], bool] = lambda: False) -> Outcome:
 
 
 def _result(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
 
     if job.kind == "network":
         return of_comparison(run_network(job, stopping))
-    experiment = ValidExperiment.parse(json.loads(job.document), source="experiment")
+    experiment = Experiment.parse(json.loads(job.document), source="experiment")
     if job.kind == "predict":
         from msg_analysis.theory.prediction import predict
 

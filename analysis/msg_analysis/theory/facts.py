@@ -20,7 +20,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.model.step_model import build_step_model
 
 if TYPE_CHECKING:
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
 
 
 MAX_UNKNOWNS = 1500  # largest n m^2: all eigenvalues of a matrix of this size take a few seconds
@@ -77,7 +77,7 @@ class Fact:
         }
 
 
-def check_facts(experiment: ValidExperiment) -> list[Fact]:
+def check_facts(experiment: Experiment) -> list[Fact]:
     """Check every lemma on eigenvalues that applies to this experiment's time and problem (Lemmas 1 to 4 of the paper).
 
     Continuous time: N_c, M_c and their projections (consensus), or N_k, M_k (tracking). Discrete time: H_c, A_c and

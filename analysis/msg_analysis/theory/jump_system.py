@@ -30,7 +30,7 @@ from msg_analysis.theory.message_losses import LossEvents, lost, lost_adjoint
 from msg_analysis.theory.message_steps import message_steps
 
 if TYPE_CHECKING:
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.model.step_model import StepModel
 
 
@@ -241,7 +241,7 @@ def _by_message(step: StepModel, problem: str) -> JumpSystem:
     )
 
 
-def continuous(experiment: ValidExperiment) -> JumpSystem:
+def continuous(experiment: Experiment) -> JumpSystem:
     """The paper's continuous-time system (Sections 3.1 and 3.2), without noise on the air, loss, delay or protocol.
 
     Leaders of infinite gain are the exact limit: their rows and columns are deleted, ``lift`` puts the zeros back.

@@ -21,7 +21,7 @@ from msg_analysis.common.arrays import BoolArray
 from msg_analysis.common.resources import few_blas_threads
 from msg_analysis.common.text import agent_name, markdown_table, number_text, with_names
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.spec import LeadersSpec
 from msg_analysis.model.step_model import build_run_model
 from msg_analysis.theory import jump_system as systems
@@ -40,7 +40,7 @@ MOST_SETS = 1_000_000  # number of sets beyond which enumeration is refused
 class LeaderProblem:
     """System error as a function of the set of leaders of an experiment, whose own leaders are ignored."""
 
-    experiment: ValidExperiment
+    experiment: Experiment
     law: SelectionLaw  # "continuous" (the paper's), "emulated" (steps of the run) or "discrete" (the paper's appendix)
     gain: float = math.inf  # kappa of the leaders [1 / unit of time]; inf holds them at the reference
 
@@ -184,7 +184,7 @@ class Selection:
         }
 
 
-def resolve_law(experiment: ValidExperiment, law: SelectionLaw | None = None) -> SelectionLaw:
+def resolve_law(experiment: Experiment, law: SelectionLaw | None = None) -> SelectionLaw:
     """``law`` if the experiment has it, else InputError; None stands for the paper's law, or else that of the steps."""
     if experiment.time == "discrete":
         possible: list[SelectionLaw] = ["discrete"]
@@ -204,7 +204,7 @@ def resolve_law(experiment: ValidExperiment, law: SelectionLaw | None = None) ->
 
 @few_blas_threads
 def system_error(
-    experiment: ValidExperiment, agents: list[int], *, law: SelectionLaw | None = None, gain: float = math.inf
+    experiment: Experiment, agents: list[int], *, law: SelectionLaw | None = None, gain: float = math.inf
 ) -> float:
     """E(S) with the given agents as leaders; inf where S does not reach all agents.
 
@@ -227,9 +227,7 @@ def system_error(
     return LeaderProblem(experiment, resolve_law(experiment, law), gain).system_error(frozenset(agents))
 
 
-def joint_robustness_centrality(
-    experiment: ValidExperiment, agents: list[int], *, law: SelectionLaw | None = None
-) -> float:
+def joint_robustness_centrality(experiment: Experiment, agents: list[int], *, law: SelectionLaw | None = None) -> float:
     """1/E(S) in the exact limit of infinite gain (the paper's definition, Section 4); inf where E(S) is 0.
 
     Parameters
@@ -243,7 +241,7 @@ def joint_robustness_centrality(
 
 @few_blas_threads
 def select_leaders(
-    experiment: ValidExperiment,
+    experiment: Experiment,
     count: int | None = None,
     *,
     method: SearchMethod = "auto",

@@ -31,7 +31,7 @@ from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
 
 if TYPE_CHECKING:
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
 
 
 ERROR_ROUNDING = 1e-14  # node errors below this, relative to the largest one, are rounding
@@ -148,7 +148,7 @@ class Prediction:
         the air, loss or delay
     """
 
-    experiment: ValidExperiment
+    experiment: Experiment
     step: StepModel
     solver: MomentSolver
     steady: FloatArray
@@ -220,7 +220,7 @@ class Prediction:
         with blas_threads(self.experiment.agents):
             return fourth_moment(build_run_model(self.experiment, self.step), self.system)
 
-    def for_run(self, experiment: ValidExperiment) -> Prediction:
+    def for_run(self, experiment: Experiment) -> Prediction:
         """The same for another run, with what was computed before.
 
         Parameters
@@ -250,14 +250,14 @@ class Prediction:
         return document
 
 
-def _why_no_paper(experiment: ValidExperiment) -> str:
+def _why_no_paper(experiment: Experiment) -> str:
     if experiment.noise.steps_only:
         return "with noise on the air, loss or delay"
     return "in discrete time" if experiment.time == "discrete" else "with a protocol"
 
 
 @few_blas_threads
-def predict(experiment: ValidExperiment, step: StepModel | None = None) -> Prediction:
+def predict(experiment: Experiment, step: StepModel | None = None) -> Prediction:
     """Steady-state prediction of an experiment (Propositions 2 and 3 of the paper, 7 and 8 in discrete time).
 
     Parameters
@@ -286,7 +286,7 @@ def predict(experiment: ValidExperiment, step: StepModel | None = None) -> Predi
     return Prediction(experiment, step, solver, steady, emulated, continuous, paper)
 
 
-def stationary_start_factor(experiment: ValidExperiment, mode: int) -> FloatArray:
+def stationary_start_factor(experiment: Experiment, mode: int) -> FloatArray:
     """(m, m) square root S of the law of x(0) given g(0) = mode in the steady state: S S^T = C_g0 / pi_g0.
 
     C are the steady second moments of the experiment's steps, in real time those of the sequential law. S is the
@@ -366,7 +366,7 @@ def _static(system: JumpSystem, names: Sequence[str] | None) -> Moments | None:
     return Moments(covariance, names=names)
 
 
-def _holds_together(experiment: ValidExperiment, mode: int) -> bool:
+def _holds_together(experiment: Experiment, mode: int) -> bool:
     """Whether one graph held fixed bounds the errors: one agent, or the reference, reaches all others."""
     leads = experiment.graph_list[mode].adjacency.T > 0
     leaders = np.flatnonzero(experiment.leader_gains).tolist()

@@ -28,7 +28,7 @@ from msg_analysis.theory.rational_krylov import RationalFlow, slowest_rate
 from msg_analysis.theory.solvers import mean_propagator, second_moment_propagator
 
 if TYPE_CHECKING:
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
 
 
 TransientLaw = Literal["emulated", "continuous"]
@@ -119,7 +119,7 @@ def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | Non
     return Snapshot(law, np.multiply.outer(law, system.reduced(deviation)), system.started(deviation[None], law))
 
 
-def start_of(experiment: ValidExperiment, system: JumpSystem, stationary: FloatArray) -> Snapshot:
+def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray) -> Snapshot:
     """The start that ``run.start`` and ``switching.initial`` define, for one of the experiment's laws.
 
     ``stationary``: (n, d, d) second moments for ``run.start: stationary``.
@@ -148,7 +148,7 @@ class SolvedTransient:
 
 @few_blas_threads
 def solve_transient(
-    experiment: ValidExperiment,
+    experiment: Experiment,
     times: FloatArray,  # (T,) ascending [units of simulated time]
     *,
     law: TransientLaw = "emulated",
@@ -177,7 +177,7 @@ def solve_transient(
     return SolvedTransient(transient(whole, start, _steps(times, unit)), system, steady, unit)
 
 
-def unreduced_consensus(experiment: ValidExperiment) -> JumpSystem:
+def unreduced_consensus(experiment: Experiment) -> JumpSystem:
     """Consensus in continuous time with the mean of the agents included: its second moments grow without bound.
 
     Proposition 1 of the paper with Z_i = L_i. In steps, ``systems.emulated(step, "tracking")`` reduces nothing either.
@@ -347,7 +347,7 @@ def _check_times(system: JumpSystem, times: FloatArray) -> None:
         )
 
 
-def _system(experiment: ValidExperiment, law: TransientLaw) -> tuple[JumpSystem, float | None]:
+def _system(experiment: Experiment, law: TransientLaw) -> tuple[JumpSystem, float | None]:
     """The reduced system of a law, and the time of a step (None in continuous time)."""
     if law == "emulated":
         return systems.emulated(build_run_model(experiment), experiment.problem), experiment.step_length

@@ -14,7 +14,7 @@ from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.common.resources import tell
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.reception import Air, by_sender_and_block, neighbour_tables
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.twin.log_replay import replay
 from msg_analysis.twin.simulate import RunBlock, run_blocks
 
@@ -39,7 +39,7 @@ class Check:
     difference: str | None
 
 
-def check(trajectory: Trajectory) -> Check:
+def check(trajectory: Run) -> Check:
     """Compute a run again with the offline twin, and compare every state, lost message and graph bit for bit.
 
     In lockstep the twin needs only the run record. In real time it also takes from the log which values every agent
@@ -68,7 +68,7 @@ _Found = tuple[float, str] | None
 """When the cause of a difference was there, a step, and the difference in words."""
 
 
-def _in_lockstep(trajectory: Trajectory, path: IntArray) -> str | None:
+def _in_lockstep(trajectory: Run, path: IntArray) -> str | None:
     """The first difference: states follow from graphs and losses of earlier steps; the earliest is the cause."""
     for block in _with_progress(trajectory, run_blocks(trajectory.record, path)):
         found = [
@@ -82,7 +82,7 @@ def _in_lockstep(trajectory: Trajectory, path: IntArray) -> str | None:
     return None
 
 
-def _in_real_time(trajectory: Trajectory, path: IntArray) -> tuple[str | None, int]:
+def _in_real_time(trajectory: Run, path: IntArray) -> tuple[str | None, int]:
     """The first difference, and how many states could be compared."""
     difference, compared, air = None, 0, Air(trajectory.record.experiment)
     for block in _with_progress(trajectory, replay(trajectory)):
@@ -100,13 +100,13 @@ def _in_real_time(trajectory: Trajectory, path: IntArray) -> tuple[str | None, i
     return difference, compared
 
 
-def _states(trajectory: Trajectory, block: RunBlock) -> list[tuple[str, FloatArray, FloatArray]]:
+def _states(trajectory: Run, block: RunBlock) -> list[tuple[str, FloatArray, FloatArray]]:
     """What is compared of states: a word for it, the logged ones of the block's steps, and those of the law."""
     arrays = ("logged", trajectory.states, block.states), ("published", trajectory.published, block.published)
     return [(word, log[block.steps], law) for word, log, law in arrays if log is not None and law is not None]
 
 
-def _with_progress(trajectory: Trajectory, blocks: Iterable[RunBlock]) -> Iterable[RunBlock]:
+def _with_progress(trajectory: Run, blocks: Iterable[RunBlock]) -> Iterable[RunBlock]:
     """The blocks; the memory of what was read of the log is given back after each."""
     for block in blocks:
         tell("comparing with the twin", block.first, len(trajectory.states))
@@ -128,7 +128,7 @@ def _first(wrong: BoolArray, when: float, describe: Callable[..., str]) -> _Foun
     return when + where[0], describe(*where)
 
 
-def _first_state(trajectory: Trajectory, first: int, what: str, here: FloatArray, law: FloatArray) -> _Found:
+def _first_state(trajectory: Run, first: int, what: str, here: FloatArray, law: FloatArray) -> _Found:
     """Of the states from step ``first`` on, (K, m, R) as logged and by the law."""
     there = ~(np.isnan(here) | np.isnan(law)).any(axis=2)
 
@@ -144,7 +144,7 @@ def _first_state(trajectory: Trajectory, first: int, what: str, here: FloatArray
     return _first(there & (here != law).any(axis=2), first, describe)
 
 
-def _first_graph(trajectory: Trajectory, block: RunBlock, path: IntArray) -> _Found:
+def _first_graph(trajectory: Run, block: RunBlock, path: IntArray) -> _Found:
     graphs = [graph.name for graph in trajectory.record.experiment.graph_list]
     logged, law = trajectory.modes[block.steps], path[block.steps]
     return _first(
@@ -154,13 +154,13 @@ def _first_graph(trajectory: Trajectory, block: RunBlock, path: IntArray) -> _Fo
     )
 
 
-def _same_graph(trajectory: Trajectory, block: RunBlock, path: IntArray) -> BoolArray:
+def _same_graph(trajectory: Run, block: RunBlock, path: IntArray) -> BoolArray:
     """(K, m, 1) in which steps an agent used the graph of the seed: under another one the neighbours differ."""
     assert trajectory.agent_modes is not None
     return np.asarray(trajectory.agent_modes[1:][block.steps] == path[block.steps, None])[:, :, None]
 
 
-def _first_loss(trajectory: Trajectory, block: RunBlock, path: IntArray) -> _Found:
+def _first_loss(trajectory: Run, block: RunBlock, path: IntArray) -> _Found:
     if trajectory.lost is None or block.lost is None or trajectory.agent_modes is None:
         return None
     logged, law = trajectory.lost[block.steps], block.lost
@@ -178,7 +178,7 @@ def _first_loss(trajectory: Trajectory, block: RunBlock, path: IntArray) -> _Fou
     return _first(_same_graph(trajectory, block, path) & (logged != law), block.first + 0.5, describe)
 
 
-def _first_use(trajectory: Trajectory, block: RunBlock, path: IntArray) -> _Found:
+def _first_use(trajectory: Run, block: RunBlock, path: IntArray) -> _Found:
     """In lockstep, where values of several steps can be used: the first that is not the one which the seed gives."""
     if trajectory.used is None or block.used is None or trajectory.agent_modes is None:
         return None
@@ -196,7 +196,7 @@ def _first_use(trajectory: Trajectory, block: RunBlock, path: IntArray) -> _Foun
     return _first(wrong, block.first + 0.5, describe)
 
 
-def _uses(trajectory: Trajectory, block: RunBlock) -> tuple[int, IntArray, IntArray]:
+def _uses(trajectory: Run, block: RunBlock) -> tuple[int, IntArray, IntArray]:
     """In real time: the first of these states that was made by a step; (K, m, D) ``used`` for them, and the senders."""
     assert trajectory.used is not None
     assert trajectory.agent_modes is not None
@@ -207,7 +207,7 @@ def _uses(trajectory: Trajectory, block: RunBlock) -> tuple[int, IntArray, IntAr
     return first, trajectory.used[first - 1 : end - 1], senders
 
 
-def _first_early_use(trajectory: Trajectory, first: int, used: IntArray, senders: IntArray) -> _Found:
+def _first_early_use(trajectory: Run, first: int, used: IntArray, senders: IntArray) -> _Found:
     """The first value that was used in a state made before it, or at the same time."""
     assert trajectory.made is not None
     made, heard = trajectory.made[first : first + len(used)], trajectory.made[used, senders]

@@ -15,12 +15,12 @@ from msg_analysis.arithmetic.update_law import step as update
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.model.agent_law import ProtocolLaw
 from msg_analysis.model.reception import NOTHING, Air, add_broadcast_noise, by_sender_and_block, neighbour_tables
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.step_model import StepModel
 from msg_analysis.twin.simulate import RunBlock, from_start, noise_of_all
 
 
-def replay(trajectory: Trajectory) -> Iterator[RunBlock]:
+def replay(trajectory: Run) -> Iterator[RunBlock]:
     """What the law gives from the logged inputs of every step: ``states`` and ``published``; NaN where inputs miss.
 
     By induction, a log in real time that equals this from x(0) on is what the law gives for the start, the seed, and
@@ -41,7 +41,7 @@ def replay(trajectory: Trajectory) -> Iterator[RunBlock]:
 class _LinearReplay:
     """Steps of a linear law. Each follows from the log alone, so that many are made at once."""
 
-    def __init__(self, trajectory: Trajectory, model: StepModel) -> None:
+    def __init__(self, trajectory: Run, model: StepModel) -> None:
         self._log, self._model = trajectory, model
         self._air = Air(trajectory.record.experiment)
         self._noise = noise_of_all(trajectory.record.experiment, model)
@@ -103,7 +103,7 @@ def _terms(model: StepModel, i: int) -> tuple[IntArray, FloatArray]:
 class _ProtocolReplay:
     """The same of a protocol, agent by agent and step by step."""
 
-    def __init__(self, trajectory: Trajectory) -> None:
+    def __init__(self, trajectory: Run) -> None:
         self._log = trajectory
         record, model = trajectory.record, trajectory.record.model
         self._laws = [ProtocolLaw(record, model, i) for i in range(model.agents)]

@@ -30,7 +30,7 @@ from msg_analysis.arithmetic.step_clock import StepClock
 from msg_analysis.arithmetic.update_law import ManySteps, Round, from_payload, to_payload, weighted_sum
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray, large_zeros, release
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.problems import problem
 from msg_analysis.experiment.protocols import AgentProtocol
 from msg_analysis.model.agent_law import ProtocolLaw
@@ -38,13 +38,13 @@ from msg_analysis.model.graph_path import mode_path, past_modes, sojourns
 from msg_analysis.model.phases import phases
 from msg_analysis.model.process_noise import ProcessNoise
 from msg_analysis.model.reception import Air, AirReception, MessagesUsed, add_broadcast_noise, ahead
-from msg_analysis.model.run import Completeness, Trajectory
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import StepMatrices, StepModel, Wiring, build_model
 
 
-def ideal_log(experiment: ValidExperiment, model: Wiring, modes: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """``agent_modes``, ``used`` and ``made`` of ``Trajectory`` for a run with these graphs (N,), from 0."""
+def ideal_log(experiment: Experiment, model: Wiring, modes: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """``agent_modes``, ``used`` and ``made`` of ``Run`` for a run with these graphs (N,), from 0."""
     agent_modes, made = ideal_times(experiment, modes)
     messages, shape = MessagesUsed(experiment, model), (len(modes), model.agents, model.most_neighbours)
     used = large_zeros(shape, np.int64, total=8 * math.prod(shape))
@@ -55,7 +55,7 @@ def ideal_log(experiment: ValidExperiment, model: Wiring, modes: IntArray) -> tu
     return agent_modes, used, made
 
 
-def ideal_times(experiment: ValidExperiment, modes: IntArray) -> tuple[IntArray, IntArray]:
+def ideal_times(experiment: Experiment, modes: IntArray) -> tuple[IntArray, IntArray]:
     """``agent_modes`` and ``made`` alone."""
     shape = len(modes) + 1, experiment.agents
     agent_modes, made = (large_zeros(shape, np.int64, total=8 * shape[0] * shape[1]) for _ in range(2))
@@ -66,20 +66,20 @@ def ideal_times(experiment: ValidExperiment, modes: IntArray) -> tuple[IntArray,
     return agent_modes, made
 
 
-def law_of_all(experiment: ValidExperiment, model: StepModel) -> ManySteps:
+def law_of_all(experiment: Experiment, model: StepModel) -> ManySteps:
     """The steps of all agents under every graph."""
     lead = ahead(experiment).astype(np.bool_)
     holds = model.listens() if experiment.noise.holds else None
     return ManySteps([_rounds(model, mode, lead, holds) for mode in range(model.modes)])
 
 
-def noise_of_all(experiment: ValidExperiment, model: StepModel, *, kept: bool = False) -> ProcessNoise:
+def noise_of_all(experiment: Experiment, model: StepModel, *, kept: bool = False) -> ProcessNoise:
     """The process noise of all agents; ``kept`` as of ``ProcessNoise``."""
     return ProcessNoise(experiment.run.seed, model.noise_gain, experiment.run.replicas, kept=kept)
 
 
 def states_of_all(
-    experiment: ValidExperiment,
+    experiment: Experiment,
     model: StepModel,
     modes: IntArray,
     start: FloatArray,
@@ -150,7 +150,7 @@ def _rounds(model: StepModel, mode: int, lead: BoolArray, heard: BoolArray | Non
 
 @dataclass(frozen=True, slots=True)
 class RunBlock:
-    """What ``Trajectory`` has from step ``first`` on. The last step of a run has a state, and nothing lost or used."""
+    """What ``Run`` has from step ``first`` on. The last step of a run has a state, and nothing lost or used."""
 
     first: int
     states: FloatArray  # (K, m, width)
@@ -243,7 +243,7 @@ GRID = 2.0**-12
 """Unit of x(0), in standard deviations, where the past would be longer: far more than processors differ by."""
 
 
-def draw_start(experiment: ValidExperiment, model: Wiring, first_mode: int) -> FloatArray:
+def draw_start(experiment: Experiment, model: Wiring, first_mode: int) -> FloatArray:
     """(m, replicas) x(0): zero, the given values, or drawn from the stationary law given g(0) = ``first_mode``."""
     replicas = experiment.run.replicas
     start = experiment.run.start
@@ -259,7 +259,7 @@ def draw_start(experiment: ValidExperiment, model: Wiring, first_mode: int) -> F
     return _gaussian(experiment, first_mode) if found is None else found
 
 
-def _from_the_past(experiment: ValidExperiment, model: StepModel, first_mode: int) -> FloatArray | None:
+def _from_the_past(experiment: Experiment, model: StepModel, first_mode: int) -> FloatArray | None:
     """x(0) at the end of a past that is long enough; None where that would take too long."""
     size = experiment.agents * experiment.run.replicas
     steps, before, law = STEPS_PER_BLOCK, None, law_of_all(experiment, model)
@@ -273,7 +273,7 @@ def _from_the_past(experiment: ValidExperiment, model: StepModel, first_mode: in
 
 
 def _end_of_the_past(
-    experiment: ValidExperiment, model: StepModel, law: ManySteps, noise: ProcessNoise, first_mode: int, steps: int
+    experiment: Experiment, model: StepModel, law: ManySteps, noise: ProcessNoise, first_mode: int, steps: int
 ) -> tuple[FloatArray, float]:
     """x(0) of a past of so many steps that begins at the reference, and the size of its rounding errors.
 
@@ -294,7 +294,7 @@ def _same(change: FloatArray, size: FloatArray, floor: float) -> bool:
     return bool((changes <= TOLERANCE * np.maximum(sizes, TOLERANCE * sizes.max()) + floor).all())
 
 
-def _gaussian(experiment: ValidExperiment, first_mode: int) -> FloatArray:
+def _gaussian(experiment: Experiment, first_mode: int) -> FloatArray:
     """x(0) with the second moments of the stationary law, rounded so that processors agree."""
     from msg_analysis.theory.prediction import stationary_start_factor  # here, since it is seldom needed
 
@@ -311,7 +311,7 @@ def _gaussian(experiment: ValidExperiment, first_mode: int) -> FloatArray:
 KEY_SIZE = 32  # bytes
 
 
-def new_record(experiment: ValidExperiment, run: uuid.UUID | None = None) -> RunRecord:
+def new_record(experiment: Experiment, run: uuid.UUID | None = None) -> RunRecord:
     """Everything that a new run of an experiment starts from; ``run``: its id, a new random one if not given."""
     model = build_model(experiment)
     start = draw_start(experiment, model, next(sojourns(experiment, model.initial)).mode)
@@ -325,7 +325,7 @@ def new_record(experiment: ValidExperiment, run: uuid.UUID | None = None) -> Run
     return record
 
 
-def simulate(experiment: ValidExperiment, *, record: RunRecord | None = None) -> Trajectory:
+def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Run:
     """Run an experiment without ROS, or repeat the run of a record (then its experiment is used); see ``api``.
 
     The states equal those of a network run to the last bit: in lockstep, or with ideal timers and no latency.
@@ -340,7 +340,7 @@ def simulate(experiment: ValidExperiment, *, record: RunRecord | None = None) ->
     if experiment.run.pace == "realtime":
         agent_modes, made = ideal_times(experiment, modes)
     expected = states.shape[0] * states.shape[1] * (2 if experiment.truth else 1)
-    return Trajectory(
+    return Run(
         record,
         states,
         modes,
@@ -354,7 +354,7 @@ def simulate(experiment: ValidExperiment, *, record: RunRecord | None = None) ->
 
 
 def _whole(blocks: Iterable[RunBlock], steps: int) -> dict[str, AnyArray]:
-    """The arrays of ``Trajectory`` of a run of so many steps, by name, from its blocks."""
+    """The arrays of ``Run`` of a run of so many steps, by name, from its blocks."""
     length = {"states": steps + 1, "published": steps + 1, "lost": steps, "used": steps}
     arrays: dict[str, AnyArray] = {}
     for block in blocks:

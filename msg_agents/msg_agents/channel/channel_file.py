@@ -18,7 +18,7 @@ from msg_agents.channel.links import LinkSettings, LossModel
 from msg_agents.channel.namespaces import MOST_HOSTS
 from msg_agents.process_layout import agent_numbers, assignment_problems, process_name, split_agents
 from msg_analysis.common.arrays import BoolArray, FloatArray
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import read_yaml
 from msg_analysis.experiment.network_spec import expected, is_number
 from msg_analysis.experiment.problems import ExperimentError, problem, translate
@@ -161,12 +161,12 @@ class Channel:
     mtu: int
 
     @classmethod
-    def load(cls, path: Path, experiment: ValidExperiment) -> Channel:
+    def load(cls, path: Path, experiment: Experiment) -> Channel:
         """Read a channel file (YAML); InputError if it cannot be read or does not fit the experiment."""
         return cls.parse(read_yaml(path), experiment, source=str(path))
 
     @classmethod
-    def parse(cls, document: Any, experiment: ValidExperiment, source: str = "channel") -> Channel:
+    def parse(cls, document: Any, experiment: Experiment, source: str = "channel") -> Channel:
         """Check a document from a YAML reader; the ExperimentError lists the mistakes, with ``source`` as place."""
         if not isinstance(document, dict):
             keys = ", ".join(ChannelSpec.model_fields)
@@ -215,7 +215,7 @@ class Channel:
         return loss
 
 
-def _hosts(spec: ChannelSpec, experiment: ValidExperiment) -> tuple[dict[str, tuple[int, ...]], list[str]]:
+def _hosts(spec: ChannelSpec, experiment: Experiment) -> tuple[dict[str, tuple[int, ...]], list[str]]:
     """Agents, from 0, by host, and the mistakes."""
     if spec.hosts is None:
         return {process_name(agents): agents for agents in split_agents(experiment)}, []

@@ -161,13 +161,13 @@ def new(file: Path, *, as_json: bool, **given: Any) -> None:
 def _write(file: Path, chosen: Choices) -> str:
     """Check the experiment as a whole, write it, and give its name."""
     from msg_analysis.common.files import require_place, write_whole
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.experiment.loading import parse_yaml
 
     require_place(file)
     name = experiment_name(file.stem)
     text = experiment_text(name, chosen)
-    ValidExperiment.parse(parse_yaml(text, str(file)), source=str(file)).require_available()
+    Experiment.parse(parse_yaml(text, str(file)), source=str(file)).require_available()
     write_whole(file, text.encode())
     return name
 

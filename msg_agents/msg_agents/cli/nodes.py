@@ -116,10 +116,10 @@ def _agents_of_record(context: click.Context, _option: click.Parameter, incomple
 @experiment_argument
 def prepare(experiment: Path) -> None:
     """Print the run record of a new run of EXPERIMENT: the file with which single nodes are started."""
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.twin.simulate import new_record
 
-    what = ValidExperiment.load(experiment)
+    what = Experiment.load(experiment)
     what.require_available()
     click.echo(new_record(what).to_json(with_key=True))
 

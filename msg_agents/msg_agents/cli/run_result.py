@@ -22,7 +22,7 @@ from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
     from msg_agents.run.result import ReportWhen, RunResult
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
 
 
 def finish(
@@ -120,7 +120,7 @@ def _show(result: RunResult, as_json: bool) -> None:
         click.echo(f"{result.rate:.0f} steps/s over {result.wall_time:.1f} s")
 
 
-def _without_comparison(experiment: ValidExperiment) -> dict[str, Any]:
+def _without_comparison(experiment: Experiment) -> dict[str, Any]:
     """What `msg-analysis tabulate` reads of a result, without numbers."""
     from msg_analysis.inference.estimates import Estimate
 

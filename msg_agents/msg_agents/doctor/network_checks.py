@@ -36,7 +36,7 @@ from msg_agents.run.runner import run_network
 from msg_agents.terminal import raise_for
 from msg_agents.watch.panel import View
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 LIMIT = 12.0  # s for both agents to make steps: long enough for a machine that is busy
 MEASURED = 0.5  # s of steps: some thousand
@@ -78,7 +78,7 @@ def check_round_trip() -> Check:
     """Whether two processes of a run hear each other, and how long a message takes there and back."""
     name, watch = "round_trip", _Stopwatch()
     try:
-        result = run_network(ValidExperiment.parse(PAIR), None, restarts=0, view=watch)
+        result = run_network(Experiment.parse(PAIR), None, restarts=0, view=watch)
     except InputError as error:
         return Check(name, "error", str(error))
     except OSError as error:  # too few files or processes, a full disk

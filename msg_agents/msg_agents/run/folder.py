@@ -19,7 +19,7 @@ from typing import Any
 from msg_agents.environment import MEMORY, free_space
 from msg_analysis.common.files import require_utf8
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.experiment.experiment import Experiment, ExperimentError
 from msg_analysis.experiment.loading import read_yaml
 
 PREFIX = "msg_agents_run_"
@@ -59,7 +59,7 @@ def _clear_abandoned() -> None:
                 os.close(lock)
 
 
-def make_bag_directory(experiment: ValidExperiment, out: Path, *, option: str = "--out: ") -> Path:
+def make_bag_directory(experiment: Experiment, out: Path, *, option: str = "--out: ") -> Path:
     """Make an empty directory <out>/<name>_<time> for a new bag; no other run can then take that name.
 
     InputError: it cannot be made; ``option`` is how the user gave ``out``.
@@ -82,7 +82,7 @@ def make_bag_directory(experiment: ValidExperiment, out: Path, *, option: str = 
 
 def load_with_overrides(
     path: Path, run: Mapping[str, Any], *, name: Callable[[str], str] = "--{}".format
-) -> ValidExperiment:
+) -> Experiment:
     """The experiment, checked once, after values of ``run`` were replaced; None replaces nothing.
 
     ``processes`` may be a number as text. ``name``: how errors call the new value of a key.
@@ -92,13 +92,13 @@ def load_with_overrides(
         changes["processes"] = int(changes["processes"])
     document = read_yaml(path)
     if not changes or not isinstance(document, dict) or not isinstance(section := document.get("run", {}), dict):
-        return ValidExperiment.parse(document, source=str(path), directory=path.parent)
+        return Experiment.parse(document, source=str(path), directory=path.parent)
     changed = document | {"run": section | changes}
     try:
-        return ValidExperiment.parse(changed, source=str(path), directory=path.parent)
+        return Experiment.parse(changed, source=str(path), directory=path.parent)
     except InputError as error:
-        ValidExperiment.parse(document, source=str(path), directory=path.parent)  # the fault may be the file's
+        Experiment.parse(document, source=str(path), directory=path.parent)  # the fault may be the file's
         problems = error.problems if isinstance(error, ExperimentError) else []
         wrong = [key for key in changes if any(line.startswith(f"run.{key}:") for line in problems)]
         given = ", ".join(name(key) for key in wrong or changes)
-        return ValidExperiment.parse(changed, source=given, directory=path.parent)
+        return Experiment.parse(changed, source=given, directory=path.parent)

@@ -30,7 +30,7 @@ from msg_analysis.common.files import REPORT_FILE
 from msg_analysis.common.resources import SINGLE_THREAD
 from msg_analysis.errors import ExitCode, InputError
 from msg_analysis.experiment.examples import find
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import new_record
 
 TRUE, FALSE = {"true", "1", "yes", "on"}, {"false", "0", "no", "off"}
@@ -111,7 +111,7 @@ def number(arguments: Mapping[str, str], name: str, *, least: float = 0.0) -> fl
     return value
 
 
-def load_experiment(arguments: Mapping[str, str]) -> ValidExperiment:
+def load_experiment(arguments: Mapping[str, str]) -> Experiment:
     """The experiment with the changes of the launch arguments; InputError if it is wrong or cannot be run."""
     changes: dict[str, Any] = {}
     for name, kind in (("seed", int), ("duration", float), ("speed", float)):

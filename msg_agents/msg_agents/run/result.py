@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from msg_analysis.common.files import REPORT_FILE
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.model.run import Trajectory
+from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.run import Run
 
 if TYPE_CHECKING:
     from msg_analysis.inference.comparison import Comparison
@@ -187,7 +187,7 @@ class RunResult:
         file of the report; None: not written
     """
 
-    experiment: ValidExperiment
+    experiment: Experiment
     bag: Path | None
     failures: list[str] = field(default_factory=list)
     interrupted_by: int | None = None
@@ -200,7 +200,7 @@ class RunResult:
     until: dict[str, Any] | None = None
     clocks: list[dict[str, Any]] | None = None
     channel: dict[str, Any] | None = None
-    trajectory: Trajectory | None = None
+    trajectory: Run | None = None
     comparison: Comparison | None = None
     report: Path | None = None
 

@@ -24,7 +24,7 @@ from msg_agents.environment import channel_environment
 from msg_agents.process_layout import SWITCHER, ProcessPlan
 from msg_agents.run.supervisor import Supervisor
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graph_sources import heard_links
 from msg_analysis.model.step_model import Wiring
 from msg_analysis.theory.prediction import predict
@@ -84,7 +84,7 @@ class RunChannel:
         for place, host in enumerate(self.hosts):
             self._active.let_through(place, all_packets=stands or host in starting)
 
-    def to_json(self, supervisor: Supervisor, experiment: ValidExperiment) -> dict[str, Any]:
+    def to_json(self, supervisor: Supervisor, experiment: Experiment) -> dict[str, Any]:
         """Its hosts, and what it did, as in the result of the run."""
         hosts = {
             name: {"address": host.address, "agents": [agent + 1 for agent in self.channel.hosts[name]]}
@@ -100,7 +100,7 @@ class RunChannel:
         return document | {"findings": channel_findings(document)}
 
 
-def predicted_errors(channel: Channel, experiment: ValidExperiment) -> dict[str, Any] | None:
+def predicted_errors(channel: Channel, experiment: Experiment) -> dict[str, Any] | None:
     """Errors predicted before the run: in place of what the channel loses, the last value heard; nothing is late.
 
     None where that is not what happens (lockstep, reliable delivery, losses in the experiment itself, packets that the
@@ -118,7 +118,7 @@ def predicted_errors(channel: Channel, experiment: ValidExperiment) -> dict[str,
     if arcs:
         document["noise"] |= {"loss": {"arcs": arcs}, "on_loss": "hold"}
     try:
-        predicted = predict(ValidExperiment.parse(document)).emulated
+        predicted = predict(Experiment.parse(document)).emulated
     except InputError:
         return None
     return {"system_error": predicted.system_error, "node_errors": predicted.node_errors.tolist()}

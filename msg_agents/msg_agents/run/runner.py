@@ -42,7 +42,7 @@ from msg_analysis.bags.writing import RECORDING_MARKER
 from msg_analysis.common.resources import available_cores
 from msg_analysis.common.text import agent_text, with_names
 from msg_analysis.errors import BagError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.twin.simulate import new_record
 
@@ -50,7 +50,7 @@ FIRST_POLL, POLL = 0.02, 0.05  # s; the first until the switcher here has heard 
 
 
 def run_network(
-    experiment: ValidExperiment,
+    experiment: Experiment,
     out: Path | None,
     *,
     domain: int | None = None,
@@ -233,7 +233,7 @@ def run_network(
 
 def _watch(
     supervisor: Supervisor,
-    experiment: ValidExperiment,
+    experiment: Experiment,
     result: RunResult,
     restarts: int,
     interruption: Interruption,

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from msg_agents.watch.web_server import WebServer
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.inference.estimates import Estimate
 
 
@@ -85,7 +85,7 @@ FAR = 2.0  # standard errors
 _LEGEND = "  ● measured ◆ predicted"
 
 
-def panel_of(snapshot: Snapshot, experiment: ValidExperiment, *, width: int, height: int) -> RenderableType:
+def panel_of(snapshot: Snapshot, experiment: Experiment, *, width: int, height: int) -> RenderableType:
     """The panel, for a terminal of ``width`` by ``height`` characters."""
     agents = "1 agent" if experiment.agents == 1 else f"{experiment.agents} agents"
     title = Text(f"{experiment.name}: {agents}, {experiment.run.pace}", style="bold")
@@ -102,7 +102,7 @@ def panel_of(snapshot: Snapshot, experiment: ValidExperiment, *, width: int, hei
     return Panel(Group(*lines), title=title, title_align="left")
 
 
-def plain_line(snapshot: Snapshot, experiment: ValidExperiment) -> str:
+def plain_line(snapshot: Snapshot, experiment: Experiment) -> str:
     """The same as one line of text."""
     parts = [f"step {snapshot.reached} of {snapshot.last or experiment.steps}", *_speed(snapshot)]
     if snapshot.sojourn is not None:
@@ -117,7 +117,7 @@ def _speed(snapshot: Snapshot) -> list[str]:
     return [] if snapshot.rate is None else [f"{snapshot.rate:.0f} steps/s"]
 
 
-def _progress(snapshot: Snapshot, experiment: ValidExperiment, width: int) -> RenderableType:
+def _progress(snapshot: Snapshot, experiment: Experiment, width: int) -> RenderableType:
     last = snapshot.last or experiment.steps
     share = snapshot.reached / last
     parts = [f"step {snapshot.reached} of {last}", f"{100 * share:.0f} %", *_speed(snapshot)]
@@ -132,7 +132,7 @@ def _progress(snapshot: Snapshot, experiment: ValidExperiment, width: int) -> Re
     return line if width > len(text) + 6 else Text(text, no_wrap=True, overflow="ellipsis")
 
 
-def _graph(snapshot: Snapshot, experiment: ValidExperiment) -> Text:
+def _graph(snapshot: Snapshot, experiment: Experiment) -> Text:
     text = Text("graph ", no_wrap=True, overflow="ellipsis")
     sojourn = snapshot.sojourn
     if sojourn is None:
@@ -147,7 +147,7 @@ def _graph(snapshot: Snapshot, experiment: ValidExperiment) -> Text:
     return text
 
 
-def _coverage(snapshot: Snapshot, experiment: ValidExperiment) -> Text:
+def _coverage(snapshot: Snapshot, experiment: Experiment) -> Text:
     """What the errors below are computed from."""
     report = snapshot.report
     if report is None or not report.steps:
@@ -193,7 +193,7 @@ def gauge(estimate: Estimate, width: int) -> Text:
     return text.append(_LEGEND, style="dim not bold default")
 
 
-def _agents(snapshot: Snapshot, experiment: ValidExperiment, room: int) -> list[RenderableType]:
+def _agents(snapshot: Snapshot, experiment: Experiment, room: int) -> list[RenderableType]:
     """One row per agent; of many, a summary and the rows that are furthest off, or slowest."""
     nodes = snapshot.report.nodes if snapshot.report else []
     steps_known = len(snapshot.steps) == experiment.agents
@@ -221,7 +221,7 @@ def _agents(snapshot: Snapshot, experiment: ValidExperiment, room: int) -> list[
     return [table, *tail] if order else tail
 
 
-def _summary(snapshot: Snapshot, experiment: ValidExperiment) -> Text:
+def _summary(snapshot: Snapshot, experiment: Experiment) -> Text:
     steps, rates = snapshot.steps, snapshot.rates
     text = f"{experiment.agents} agents at step"
     text += f"s {min(steps)} to {max(steps)}" if len(steps) > 1 else f" {steps[0]}"
@@ -276,7 +276,7 @@ class Display:
         """Whether anything is drawn."""
         return self.panel or self._web is not None
 
-    def begin(self, experiment: ValidExperiment) -> None:
+    def begin(self, experiment: Experiment) -> None:
         """Give the page what does not change in a run."""
         if self._web is not None:
             self._web.begin(run_description(experiment))
@@ -286,7 +286,7 @@ class Display:
         if self.panel:
             self._jobs.check()
 
-    def draw(self, snapshot: Snapshot, experiment: ValidExperiment) -> None:
+    def draw(self, snapshot: Snapshot, experiment: Experiment) -> None:
         """Draw a snapshot in place of the last one."""
         if self.panel:
             size = self._console.size
@@ -308,7 +308,7 @@ LINES = 10.0  # s between two lines where there is no terminal
 class RunView(View):
     """Shows a run in all these ways; a context."""
 
-    def __init__(self, experiment: ValidExperiment, web: WebServer | None = None, *, tells_domain: bool = True) -> None:
+    def __init__(self, experiment: Experiment, web: WebServer | None = None, *, tells_domain: bool = True) -> None:
         from msg_analysis.common.text import SafeConsole
 
         self._experiment, self._tells_domain = experiment, tells_domain

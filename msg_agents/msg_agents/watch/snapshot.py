@@ -16,7 +16,7 @@ from msg_analysis.model.graph_path import Sojourn, sojourns
 from msg_analysis.model.step_model import first_graph
 
 if TYPE_CHECKING:
-    from msg_analysis.experiment.experiment import ValidExperiment
+    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.inference.online_errors import LiveReport
     from msg_analysis.inference.online_steps import Recent
 
@@ -92,7 +92,7 @@ class Presence:
 class SojournFinder:
     """Finds the sojourn of a step of a run."""
 
-    def __init__(self, experiment: ValidExperiment) -> None:
+    def __init__(self, experiment: Experiment) -> None:
         self._rest: Iterator[Sojourn] = sojourns(experiment, first_graph(experiment))
         self._now = next(self._rest, None)
         self._before: deque[Sojourn] = deque(maxlen=MOST_SOJOURNS)
@@ -149,7 +149,7 @@ class Snapshot:
 class SnapshotSource:
     """Makes snapshots of a run from the steps that its agents have reached."""
 
-    def __init__(self, experiment: ValidExperiment) -> None:
+    def __init__(self, experiment: Experiment) -> None:
         self._steps = experiment.steps
         self._last: int | None = None  # where the run ends early
         self._sojourns, self._rates, self._presence = SojournFinder(experiment), StepRates(), Presence(experiment.names)
@@ -195,7 +195,7 @@ class SnapshotSource:
         return now if recent is None else replace(now, path=self._sojourns.since(int(recent.steps[0])))
 
 
-def run_description(experiment: ValidExperiment) -> dict[str, Any]:
+def run_description(experiment: Experiment) -> dict[str, Any]:
     """What does not change in a run, for a page that draws it: agents, graphs, positions."""
     from msg_analysis.report.figures import places
 

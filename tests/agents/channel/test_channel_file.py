@@ -13,14 +13,14 @@ import yaml
 
 from msg_agents.channel.channel_file import BASE, Channel, ChannelSpec, PairSpec, TwoStates, json_schema
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.experiment.experiment import Experiment, ExperimentError
 
 ROOT = Path(__file__).parents[3]
 TWO = {"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}}
 
 
-def experiment(**run: Any) -> ValidExperiment:
-    return ValidExperiment.parse(
+def experiment(**run: Any) -> Experiment:
+    return Experiment.parse(
         {
             "name": "net",
             "problem": "consensus",

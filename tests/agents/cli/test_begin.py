@@ -17,7 +17,7 @@ pytest.importorskip("rclpy")
 
 from msg_agents.cli.main import main
 from msg_analysis.experiment.examples import names, text_of
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 
@@ -149,7 +149,7 @@ def test_new_asks_on_a_terminal(terminal: Terminal, here: Path) -> None:
         terminal.type(f"{answer}\n".encode())
     assert terminal.read_to_the_end() == 0
     assert "Next: msg-analysis predict lab.yaml" in terminal.text
-    experiment = ValidExperiment.load(here / "lab.yaml")
+    experiment = Experiment.load(here / "lab.yaml")
     assert (experiment.name, experiment.agents, experiment.problem, experiment.run.duration) == (
         "lab",
         6,

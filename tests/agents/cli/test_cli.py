@@ -22,7 +22,7 @@ pytest.importorskip("rclpy")
 
 from msg_agents.cli.main import main
 from msg_analysis.bags.run_writer import write_trajectory
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import new_record, simulate
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
@@ -76,7 +76,7 @@ def experiment(tmp_path: Path) -> Path:
 @pytest.fixture
 def run_file(tmp_path: Path) -> Path:
     file = tmp_path / "run.json"
-    file.write_text(new_record(ValidExperiment.parse(document())).to_json())
+    file.write_text(new_record(Experiment.parse(document())).to_json())
     return file
 
 
@@ -217,7 +217,7 @@ def test_the_recorder_never_overwrites(tmp_path: Path, run_file: Path) -> None:
 
 
 def test_check(tmp_path: Path) -> None:
-    twin = simulate(ValidExperiment.parse(document()))
+    twin = simulate(Experiment.parse(document()))
     write_trajectory(twin, tmp_path / "runs" / "good")
     process = call("check", directory=tmp_path)  # finds the newest one below ./runs
     assert (process.returncode, process.stderr) == (0, "")
@@ -257,8 +257,8 @@ def test_prepare(experiment: Path) -> None:
     assert (process.returncode, process.stderr) == (0, "")
     record = json.loads(process.stdout)
     assert uuid.UUID(record["run"]).version == 4
-    assert ValidExperiment.parse(record["experiment"]) == ValidExperiment.parse(document())
-    assert np.array_equal(record["start"], simulate(ValidExperiment.parse(document())).states[0])
+    assert Experiment.parse(record["experiment"]) == Experiment.parse(document())
+    assert np.array_equal(record["start"], simulate(Experiment.parse(document())).states[0])
 
 
 def test_help_and_version() -> None:

@@ -11,7 +11,7 @@ import pytest
 from msg_agents.cli import nodes
 from msg_agents.cli.nodes import load_record, read_record_ahead
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import new_record
 
 
@@ -26,7 +26,7 @@ def written(directory: Path, **changes: Any) -> Path:
     document = {"name": "net", "problem": "consensus", "time": "continuous", "graphs": graphs, "switching": switching}
     run = {"dt": changes.pop("dt", 0.05), "duration": 5, "start": [1.0, -1.0, 2.0]}
     file = directory / "run.json"
-    file.write_text(new_record(ValidExperiment.parse({**document, **changes, "run": run})).to_json(with_key=True))
+    file.write_text(new_record(Experiment.parse({**document, **changes, "run": run})).to_json(with_key=True))
     return file
 
 

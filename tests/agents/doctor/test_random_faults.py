@@ -17,8 +17,8 @@ from waiting import state_of, wait_for
 from msg_agents.environment import RESTARTS
 from msg_agents.run.result import RunResult
 from msg_agents.terminal import Interruption
-from msg_analysis.experiment.experiment import ValidExperiment
-from msg_analysis.model.run import Trajectory
+from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.run import Run
 from msg_analysis.twin.simulate import simulate
 
 AGENTS, STEPS = 3, 1000
@@ -161,26 +161,26 @@ def test_what_a_run_survives() -> None:
     assert not plan(*(kill("switcher") for _ in range(4))).survivable
 
 
-def simulated(seed: int) -> Trajectory:
+def simulated(seed: int) -> Run:
     document = {
         "name": "small",
         "graphs": {"line": {"path": [1, 2, 3]}, "pair": {"path": [1, 2]}},
         "switching": {"rates": {"line": {"pair": 2.0}, "pair": {"line": 2.0}}},
         "run": {"duration": 5, "start": "zero", "seed": seed},
     }
-    return simulate(ValidExperiment.parse(document))
+    return simulate(Experiment.parse(document))
 
 
 @pytest.fixture(scope="module")
-def twin() -> Trajectory:
+def twin() -> Run:
     return simulated(0)
 
 
-def run(trajectory: Trajectory, **changes: Any) -> RunResult:
+def run(trajectory: Run, **changes: Any) -> RunResult:
     return RunResult(trajectory.record.experiment, None, trajectory=trajectory, **changes)
 
 
-def test_equal(twin: Trajectory) -> None:
+def test_equal(twin: Run) -> None:
     assert judge(run(twin), plan()) == Verdict("equal", "303 states", 303)
     assert judge(run(twin, restarts=[KILLED]), plan(KILL, STOP)).status == "equal"
 
@@ -189,13 +189,13 @@ def one_bit(states: Any) -> None:
     states[57, 1, 0] = np.nextafter(states[57, 1, 0], np.inf)
 
 
-def changed(twin: Trajectory, change: Callable[[Any], None]) -> Trajectory:
+def changed(twin: Run, change: Callable[[Any], None]) -> Run:
     states = twin.states.copy()
     change(states)
     return replace(twin, states=states)
 
 
-def test_one_bit(twin: Trajectory) -> None:
+def test_one_bit(twin: Run) -> None:
     """In the last place of one number; whatever else has happened."""
     wrong = changed(twin, one_bit)
     for verdict in (
@@ -207,12 +207,12 @@ def test_one_bit(twin: Trajectory) -> None:
         assert verdict.text.startswith("agent 2 at step 57, replica 1: logged ")
 
 
-def test_another_seed(twin: Trajectory) -> None:
+def test_another_seed(twin: Run) -> None:
     other = replace(simulated(1), record=twin.record)
     assert judge(run(other), plan(KILL)).status == "differs"
 
 
-def test_missing_and_twice(twin: Trajectory) -> None:
+def test_missing_and_twice(twin: Run) -> None:
     count = twin.completeness
     for found in (replace(count, missing=1), replace(count, missing_modes=1), replace(count, duplicates=1)):
         verdict = judge(run(replace(twin, completeness=found)), plan(KILL))
@@ -228,7 +228,7 @@ def test_missing_and_twice(twin: Trajectory) -> None:
         ([KILL] * 4, 3, ["agents_2_to_3: killed by SIGKILL. Not started again: all restarts are used up", LAST]),
     ],
 )
-def test_ended_by_its_faults(twin: Trajectory, faults: list[Fault], restarts: int, failures: list[str]) -> None:
+def test_ended_by_its_faults(twin: Run, faults: list[Fault], restarts: int, failures: list[str]) -> None:
     """But not without them, or if it could have gone on."""
     short = replace(twin, completeness=replace(twin.completeness, missing=200))
     ended = run(short, failures=failures)
@@ -239,7 +239,7 @@ def test_ended_by_its_faults(twin: Trajectory, faults: list[Fault], restarts: in
     assert judge(worse, plan(*faults, restarts=restarts)).status == "failed"
 
 
-def test_restarts_without_a_fault(twin: Trajectory) -> None:
+def test_restarts_without_a_fault(twin: Run) -> None:
     crash = "agent_2: exit code 1 (KeyError: 3), started again"
     for restarts, faults in (([crash], [KILL]), ([KILLED, crash], [KILL, KILL]), ([KILLED, KILLED], [KILL, STOP])):
         verdict = judge(run(twin, restarts=restarts), plan(*faults))
@@ -247,7 +247,7 @@ def test_restarts_without_a_fault(twin: Trajectory) -> None:
         assert verdict.text == f"restarted without a fault: {restarts[-1]}"
 
 
-def test_a_standstill(twin: Trajectory) -> None:
+def test_a_standstill(twin: Run) -> None:
     """Its bag was not read."""
     result = RunResult(twin.record.experiment, None, interrupted_by=2, failures=["stopped by Ctrl-C at step 3"])
     words = "ended after 60 s without a step"

@@ -10,7 +10,7 @@ import networkx as nx
 import pytest
 from random_networks import GRAPH_NAMES, MOST_AGENTS, random_document
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 SEEDS = range(300)
 
@@ -23,7 +23,7 @@ def documents() -> list[dict[str, Any]]:
 def test_every_one_can_be_run(documents: list[dict[str, Any]]) -> None:
     """In lockstep, as the loader of experiment files says."""
     for document in documents:
-        experiment = ValidExperiment.parse(json.loads(json.dumps(document)))
+        experiment = Experiment.parse(json.loads(json.dumps(document)))
         experiment.require_available()
         assert experiment.run.pace == "lockstep"
         assert experiment.agents == document["agents"]
@@ -75,7 +75,7 @@ def test_some_are_connected_only_in_all_graphs_together() -> None:
     """Then an error in the path of the graphs is sure to be one in the states."""
     apart = 0
     for seed in range(100):
-        experiment = ValidExperiment.parse(random_document(seed))
+        experiment = Experiment.parse(random_document(seed))
         graphs = [nx.from_numpy_array(graph.adjacency != 0, create_using=nx.DiGraph) for graph in experiment.graph_list]
         assert nx.is_weakly_connected(nx.compose_all(graphs))
         apart += not any(nx.is_weakly_connected(graph) for graph in graphs)

@@ -23,7 +23,7 @@ from msg_agents.environment import node_environment
 from msg_agents.nodes.recorder import Recorder, write_size
 from msg_agents.stepping.state_receiver import StateReceiver
 from msg_agents.stepping.synchronizer import RESEND_LIMIT, ReceivedSteps
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import encode_batch
 from msg_analysis.messages.messages import StateCodec
@@ -38,7 +38,7 @@ STEPS = 5 * RESEND_LIMIT
 @pytest.fixture
 def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Recorder]:
     """A recorder that hears no other node."""
-    experiment = ValidExperiment.parse(
+    experiment = Experiment.parse(
         {
             "name": "pair",
             "graphs": {"line": {"path": [1, 2]}},

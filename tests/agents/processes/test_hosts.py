@@ -13,11 +13,11 @@ from msg_agents.discovery.profiles import PROFILE_VARIABLES
 from msg_agents.discovery.rtps import PEERS_VARIABLE
 from msg_agents.process_layout import Hosts, Share, plan_network
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 
-def experiment(agents: int = 5, processes: Any = "auto") -> ValidExperiment:
-    return ValidExperiment.parse(
+def experiment(agents: int = 5, processes: Any = "auto") -> Experiment:
+    return Experiment.parse(
         {
             "name": "spread",
             "problem": "consensus",

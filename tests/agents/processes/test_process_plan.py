@@ -25,11 +25,11 @@ from msg_agents.process_layout import (
     plan_network,
 )
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 
-def experiment(agents: int, processes: Any) -> ValidExperiment:
-    return ValidExperiment.parse(
+def experiment(agents: int, processes: Any) -> Experiment:
+    return Experiment.parse(
         {
             "name": "plan",
             "problem": "consensus",

@@ -8,7 +8,7 @@ import pytest
 
 from msg_agents.run.folder import load_with_overrides
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 FILE = Path(__file__).parents[3] / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"
 
@@ -22,12 +22,12 @@ def _changed(directory: Path, run: str) -> Path:
 
 def test_equal_to_a_change_after_the_check_with_one_check(monkeypatch: pytest.MonkeyPatch) -> None:
     changes = {"seed": 5, "duration": 2.0, "pace": "realtime", "speed": 3.0, "processes": 2}
-    wanted = ValidExperiment.load(FILE).with_run(**changes).to_document()
+    wanted = Experiment.load(FILE).with_run(**changes).to_document()
     checks = []
-    parse = ValidExperiment.parse
-    monkeypatch.setattr(ValidExperiment, "parse", lambda *args, **more: checks.append(1) or parse(*args, **more))
+    parse = Experiment.parse
+    monkeypatch.setattr(Experiment, "parse", lambda *args, **more: checks.append(1) or parse(*args, **more))
     assert load_with_overrides(FILE, changes | {"processes": "2"}).to_document() == wanted
-    assert load_with_overrides(FILE, dict.fromkeys(changes)).to_document() == ValidExperiment.load(FILE).to_document()
+    assert load_with_overrides(FILE, dict.fromkeys(changes)).to_document() == Experiment.load(FILE).to_document()
     assert len(checks) == 3
 
 

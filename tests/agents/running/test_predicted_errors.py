@@ -8,13 +8,13 @@ import pytest
 
 from msg_agents.channel.channel_file import Channel
 from msg_agents.run.run_channel import predicted_errors
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 TWO_HOSTS = {"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}}
 
 
-def line_ring(**run: Any) -> ValidExperiment:
-    return ValidExperiment.parse(
+def line_ring(**run: Any) -> Experiment:
+    return Experiment.parse(
         {
             "name": "line_ring",
             "problem": "consensus",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from msg_agents.stepping.state_receiver import StateReceiver
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import encode_batch
 from msg_analysis.messages.messages import AgentState
@@ -22,7 +22,7 @@ STEPS = 200
 
 def _record(**noise: Any) -> RunRecord:
     return new_record(
-        ValidExperiment.parse(
+        Experiment.parse(
             {
                 "name": "net",
                 "graphs": {"line": {"path": [1, 2, 3]}, "star": {"star": {"center": 2}}},

@@ -11,31 +11,31 @@ import pytest
 from msg_agents.recovery import Checkpoint, entry_size
 from msg_agents.watch.observer import BLOCK, CheckpointReader, RunObserver
 from msg_analysis.arithmetic.update_law import to_payload
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.online_steps import StateLog
 from msg_analysis.inference.verdict import compare
 from msg_analysis.messages.messages import StateCodec
 from msg_analysis.messages.topics import agent_node_name
 from msg_analysis.model.reception import LOST, neighbour_tables
-from msg_analysis.model.run import Trajectory
+from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.simulate import simulate
 
 
-def _experiment(duration: float = 20, **changes: Any) -> ValidExperiment:
+def _experiment(duration: float = 20, **changes: Any) -> Experiment:
     document = {
         "name": "net",
         "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
         "switching": {"generator": [[-1, 1], [1, -1]]},
         "run": {"dt": 0.05, "duration": duration, "replicas": 2, "seed": 3},
     }
-    return ValidExperiment.parse(document | changes)
+    return Experiment.parse(document | changes)
 
 
 class Writers:
     """Writes a trajectory as the agents would, up to any step."""
 
-    def __init__(self, trajectory: Trajectory, directory: Path) -> None:
+    def __init__(self, trajectory: Run, directory: Path) -> None:
         self.record: RunRecord = trajectory.record
         experiment, run = self.record.experiment, self.record.run.bytes
         size = entry_size(self.record)
@@ -95,7 +95,7 @@ def test_gives_what_was_written(tmp_path: Path, noise: dict[str, float]) -> None
     assert reader.missed == 0
 
 
-def neighbour_counts(trajectory: Trajectory) -> np.ndarray:
+def neighbour_counts(trajectory: Run) -> np.ndarray:
     """(N, m, D): how many neighbours are left from the d-th on, in the graph of the step."""
     tables = neighbour_tables(trajectory.record.model)
     return tables.count[trajectory.modes][:, :, None] - np.arange(trajectory.record.model.most_neighbours)

@@ -9,15 +9,15 @@ import pytest
 
 from msg_agents.watch import snapshot
 from msg_agents.watch.snapshot import SnapshotSource, snapshot_document
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.online_errors import LiveEstimate, LiveReport
 from msg_analysis.inference.online_steps import WINDOW
 from msg_analysis.twin.simulate import simulate
 
 
-def experiment() -> ValidExperiment:
-    return ValidExperiment.parse(
+def experiment() -> Experiment:
+    return Experiment.parse(
         {
             "name": "net",
             "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},

@@ -20,16 +20,16 @@ from msg_agents.watch.snapshot import (
     run_description,
     snapshot_document,
 )
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.online_errors import LiveReport
 from msg_analysis.model.graph_path import Sojourn
 from msg_analysis.twin.simulate import simulate
 
 
-def _experiment(agents: int = 5) -> ValidExperiment:
+def _experiment(agents: int = 5) -> Experiment:
     numbers = list(range(1, agents + 1))
-    return ValidExperiment.parse(
+    return Experiment.parse(
         {
             "name": "net",
             "graphs": {"line": {"path": numbers}, "a ring [bold] of $$ a very long name": {"cycle": numbers}},
@@ -57,7 +57,7 @@ def _snapshot(agents: int, **changes: object) -> Snapshot:
     return Snapshot(**(values | changes))  # type: ignore[arg-type]
 
 
-def _lines(snapshot: Snapshot, experiment: ValidExperiment, width: int, height: int) -> list[str]:
+def _lines(snapshot: Snapshot, experiment: Experiment, width: int, height: int) -> list[str]:
     console = Console(file=io.StringIO(), width=width, height=height, force_terminal=True, color_system=None)
     console.print(panel_of(snapshot, experiment, width=width, height=height))
     assert isinstance(console.file, io.StringIO)

@@ -9,7 +9,7 @@ import pytest
 from rosbags.highlevel import anyreader
 from rosbags.rosbag2 import storage_mcap
 
-from experiments import Completeness, RunRecord, Trajectory, line_ring
+from experiments import Completeness, Run, RunRecord, line_ring
 
 _QOS = functools.cache(storage_mcap.get_qos)
 _TYPES = functools.cache(anyreader.get_types_from_msg)
@@ -23,10 +23,10 @@ def _parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def make_run() -> Callable[..., Trajectory]:
+def make_run() -> Callable[..., Run]:
     """A trajectory with random states; no theory in it."""
 
-    def make(agents: int = 3, steps: int = 40, replicas: int = 2, seed: int = 0, name: str = "small") -> Trajectory:
+    def make(agents: int = 3, steps: int = 40, replicas: int = 2, seed: int = 0, name: str = "small") -> Run:
         graphs = {"line": {"path": list(range(1, agents + 1))}, "star": {"star": {"center": 1}}}
         run = {"duration": steps * 0.05, "replicas": replicas, "start": "zero"}
         experiment = line_ring(agents, 0.5, name=name, graphs=graphs, agents=agents, run=run)
@@ -35,6 +35,6 @@ def make_run() -> Callable[..., Trajectory]:
         modes = np.repeat(rng.integers(0, 2, steps // 4 + 1), 4)[:steps]
         record = RunRecord(uuid.UUID(int=rng.integers(1, 2**62).item()), experiment, states[0])
         expected = (steps + 1) * agents
-        return Trajectory(record, states, modes, Completeness(expected, expected, 0))
+        return Run(record, states, modes, Completeness(expected, expected, 0))
 
     return make

@@ -13,7 +13,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 
-from experiments import Trajectory, compare, line_ring, read_bag, simulate, write_trajectory
+from experiments import Run, compare, line_ring, read_bag, simulate, write_trajectory
 from msg_analysis.bags.mcap_chunks import Storage
 from msg_analysis.bags.reading import read_record
 from msg_analysis.bags.salvage import salvage
@@ -26,13 +26,13 @@ Record = Callable[..., Path]
 
 
 @pytest.fixture(scope="module")
-def run() -> Trajectory:
+def run() -> Run:
     """Long enough for numbers; published with noise, so that there are two topics of states."""
     return simulate(line_ring(3, 2.0, noise={"broadcast": 0.3}, run={"duration": 15, "seed": 5}))
 
 
 @pytest.fixture
-def record(run: Trajectory, tmp_path: Path, typestore: Any) -> Record:
+def record(run: Run, tmp_path: Path, typestore: Any) -> Record:
     """Record the run again, with rosbags, as of the wall clock: what ``select`` makes of its messages."""
     write_trajectory(run, tmp_path / "ours")
     with AnyReader([tmp_path / "ours"]) as reader:
@@ -62,7 +62,7 @@ def _shuffled(messages: list[Message]) -> list[Message]:
     return random.Random(1).sample(messages, len(messages))
 
 
-def _same(found: Trajectory, run: Trajectory) -> None:
+def _same(found: Run, run: Run) -> None:
     assert found.completeness.complete
     assert np.array_equal(found.states, run.states)
     assert found.published is not None
@@ -71,7 +71,7 @@ def _same(found: Trajectory, run: Trajectory) -> None:
     assert np.array_equal(found.modes, run.modes)
 
 
-def test_extra_topics_in_a_namespace(run: Trajectory, record: Record) -> None:
+def test_extra_topics_in_a_namespace(run: Run, record: Record) -> None:
     """As `ros2 bag record -a` gives them: /rosout, another program's /experiment, states that are none."""
     string = "std_msgs/msg/String"
 
@@ -87,7 +87,7 @@ def test_extra_topics_in_a_namespace(run: Trajectory, record: Record) -> None:
     assert topics["/lab/agent_2/truth"] == 301
 
 
-def test_a_missing_beginning(run: Trajectory, record: Record) -> None:
+def test_a_missing_beginning(run: Run, record: Record) -> None:
     """No numbers without x(0), but what there is is said. Latched topics are there: they come to who is late."""
 
     def late(messages: list[Message]) -> list[Message]:
@@ -107,7 +107,7 @@ def test_a_missing_beginning(run: Trajectory, record: Record) -> None:
     assert describe_bag(bag)["completeness"]["stretch"] == (120, 300)
 
 
-def test_a_missing_end(run: Trajectory, record: Record) -> None:
+def test_a_missing_end(run: Run, record: Record) -> None:
     """The numbers are those of the complete beginning."""
     bag = record(lambda messages: [m for m in messages if m[0] in ("/experiment", "/graph")] + messages[: 6 * 220])
     comparison = compare(read_bag(bag))
@@ -147,9 +147,7 @@ STORAGES = [StoragePlugin.MCAP, StoragePlugin.SQLITE3]
     ("storage", "compression"),
     [*itertools.product(STORAGES, ["NONE", "MESSAGE", "FILE"]), (StoragePlugin.MCAP, "STORAGE")],
 )
-def test_every_storage_and_compression(
-    run: Trajectory, record: Record, storage: StoragePlugin, compression: str
-) -> None:
+def test_every_storage_and_compression(run: Run, record: Record, storage: StoragePlugin, compression: str) -> None:
     """With metadata.yaml and without, from the directory and from the file; compared as ours is."""
     bag = record(_shuffled, compression=CompressionMode[compression], storage=storage)
     _same(read_bag(bag), run)
@@ -166,7 +164,7 @@ def test_every_storage_and_compression(
 
 @pytest.mark.parametrize("storage", STORAGES)
 def test_a_message_that_cannot_be_unpacked(
-    run: Trajectory, record: Record, storage: StoragePlugin, typestore: Any, tmp_path: Path
+    run: Run, record: Record, storage: StoragePlugin, typestore: Any, tmp_path: Path
 ) -> None:
     """It is refused, and all others are read."""
 
@@ -192,7 +190,7 @@ def test_messages_made_to_fill_the_memory(record: Record) -> None:
             read_bag(record(bombs, name=storage.name, storage=storage))
 
 
-def test_split_without_metadata_and_with_a_lost_file(run: Trajectory, record: Record, tmp_path: Path) -> None:
+def test_split_without_metadata_and_with_a_lost_file(run: Run, record: Record, tmp_path: Path) -> None:
     """Files of one recording, the one in the middle lost, one that was just begun when the machine went off."""
     whole = tmp_path / "split"
     whole.mkdir()
@@ -215,7 +213,7 @@ def test_split_without_metadata_and_with_a_lost_file(run: Trajectory, record: Re
     assert again.completeness.received == found.completeness.received
 
 
-def test_torn_file_that_is_compressed_as_a_whole(run: Trajectory, tmp_path: Path) -> None:
+def test_torn_file_that_is_compressed_as_a_whole(run: Run, tmp_path: Path) -> None:
     """Cut or flipped: what could be unpacked up to there counts."""
     write_trajectory(run, tmp_path / "bag", Storage("none", chunk_size=3000))
     whole = (tmp_path / "bag" / "bag_0.mcap").read_bytes()

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
-from experiments import Trajectory, line_ring, read_bag, simulate, write_trajectory
+from experiments import Run, line_ring, read_bag, simulate, write_trajectory
 from msg_analysis.bags.mcap_chunks import COMPRESSIONS, Compression, Storage
 from msg_analysis.errors import InputError
 
@@ -26,7 +26,7 @@ NOISE: dict[str, dict[str, float]] = {
 
 
 @pytest.fixture(scope="module", params=NOISE)
-def run(request: pytest.FixtureRequest) -> Trajectory:
+def run(request: pytest.FixtureRequest) -> Run:
     """A run of the twin, with a second topic of states where they are published with noise."""
     setting = {"duration": STEPS * 0.05, "replicas": REPLICAS, "seed": 5, "start": "zero"}
     return simulate(line_ring(AGENTS, 2.0, name="peers", noise=NOISE[request.param], run=setting))
@@ -35,7 +35,7 @@ def run(request: pytest.FixtureRequest) -> Trajectory:
 @pytest.mark.parametrize("split", [None, 3])
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_every_peer_reads_every_bag(
-    run: Trajectory, compression: Compression, split: int | None, tmp_path: Path, typestore: Any
+    run: Run, compression: Compression, split: int | None, tmp_path: Path, typestore: Any
 ) -> None:
     """Every message, in the order of time, with the right counts and values, in one file or in several."""
     bag = tmp_path / "bag"
@@ -56,7 +56,7 @@ def test_every_peer_reads_every_bag(
     np.testing.assert_array_equal(found.published, run.published)
 
 
-def _values(run: Trajectory, bag: Path, typestore: Any) -> Counter[str]:
+def _values(run: Run, bag: Path, typestore: Any) -> Counter[str]:
     """All messages by rosbags, with the definitions in the bag: right values; their numbers by topic."""
     expected = {"state": run.states if run.published is None else run.published, "truth": run.states}
     found = {kind: np.full_like(states, np.nan) for kind, states in expected.items()}

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from experiments import Trajectory, check, compare, read_bag, write_trajectory
+from experiments import Run, check, compare, read_bag, write_trajectory
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.messages.acceptance import Refusal
@@ -20,17 +20,17 @@ from msg_analysis.model.run_record import Until
 from msg_analysis.model.step_model import build_model
 
 Message = tuple[str, str, bytes, int]  # topic, type, data, time
-MakeRun = Callable[..., Trajectory]
+MakeRun = Callable[..., Run]
 STEP = 50_000_000  # ns
 
 
-def _state(run: Trajectory, k: int, i: int, /, **changes: Any) -> AgentState:
+def _state(run: Run, k: int, i: int, /, **changes: Any) -> AgentState:
     mode = 0 if k == 0 else int(run.modes[k - 1]) + 1
     fields = {"stamp": k * STEP, "run": run.record.run.bytes, "agent": i + 1, "step": k, "mode": mode}
     return AgentState(**(fields | {"state": run.states[k, i]} | changes))
 
 
-def _messages(run: Trajectory, namespace: str = "") -> list[Message]:
+def _messages(run: Run, namespace: str = "") -> list[Message]:
     """What a faithful recorder would have: the experiment, a sojourn every four steps, the states."""
     steps, agents, _ = run.states.shape
     out: list[Message] = [(f"{namespace}/experiment", "std_msgs/msg/String", encode_string(run.record.to_json()), 0)]
@@ -68,7 +68,7 @@ def _mcap(path: Path, messages: Iterable[Message], **options: Any) -> Path:
     return path
 
 
-def _same(found: Trajectory, run: Trajectory) -> None:
+def _same(found: Run, run: Run) -> None:
     assert found.record.run == run.record.run
     assert np.array_equal(found.states, run.states)
     assert np.array_equal(found.modes, run.modes)
@@ -274,7 +274,7 @@ def test_metadata_that_cannot_be_used(tmp_path: Path, changes: dict[str, Any], e
         read_bag(tmp_path)
 
 
-def bag(path: Path, run: Trajectory, ends: Sequence[int], last: Sequence[int]) -> Path:
+def bag(path: Path, run: Run, ends: Sequence[int], last: Sequence[int]) -> Path:
     """The states of every agent up to its ``last`` step, and messages of these early ends."""
     kept = [m for m in _messages(run) if m[1] != AGENT_STATE.full_name or m[3] <= last[int(m[0][7]) - 1] * STEP]
     stops = [("/stop", PROGRESS.full_name, Progress(k * STEP, run.record.run.bytes, 0, k).encode(), k) for k in ends]
@@ -282,14 +282,14 @@ def bag(path: Path, run: Trajectory, ends: Sequence[int], last: Sequence[int]) -
 
 
 @pytest.fixture
-def may_end(make_run: MakeRun) -> Trajectory:
+def may_end(make_run: MakeRun) -> Run:
     """Of 40 steps, which may end early."""
     whole = make_run()
     return dataclasses.replace(whole, record=dataclasses.replace(whole.record, until=Until(0.01)))
 
 
 @pytest.mark.parametrize("end", [1, 22, 24, 39])
-def test_what_comes_after_the_end_does_not_count(tmp_path: Path, may_end: Trajectory, end: int) -> None:
+def test_what_comes_after_the_end_does_not_count(tmp_path: Path, may_end: Run, end: int) -> None:
     found = read_bag(bag(tmp_path / "x.mcap", may_end, [end, end], [end, 40, end + 1]))
     assert found.record.experiment.steps == end
     assert (found.record.planned_steps, found.record.until) == (40, Until(0.01))
@@ -304,7 +304,7 @@ def test_what_comes_after_the_end_does_not_count(tmp_path: Path, may_end: Trajec
     assert np.array_equal(again.states, found.states)
 
 
-def test_missing_states_before_the_end(tmp_path: Path, may_end: Trajectory) -> None:
+def test_missing_states_before_the_end(tmp_path: Path, may_end: Run) -> None:
     found = read_bag(bag(tmp_path / "x.mcap", may_end, [22], [22, 20, 30]))
     assert (found.completeness.missing, found.completeness.expected) == (2, 69)
 
@@ -312,7 +312,7 @@ def test_missing_states_before_the_end(tmp_path: Path, may_end: Trajectory) -> N
 @pytest.mark.parametrize(
     ("ends", "reason"), [([20, 21], Refusal.CONTRADICTION), ([40], Refusal.OUT_OF_RANGE), ([0], Refusal.OUT_OF_RANGE)]
 )
-def test_impossible_ends(tmp_path: Path, may_end: Trajectory, ends: list[int], reason: str) -> None:
+def test_impossible_ends(tmp_path: Path, may_end: Run, ends: list[int], reason: str) -> None:
     """They do not count: the run has its planned length."""
     found = read_bag(bag(tmp_path / "x.mcap", may_end, ends, [40, 40, 40]))
     assert found.record.planned is None

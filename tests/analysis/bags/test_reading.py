@@ -20,7 +20,7 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from experiments import RunRecord, Trajectory, ValidExperiment, read_bag, write_trajectory
+from experiments import Experiment, Run, RunRecord, read_bag, write_trajectory
 from msg_analysis.bags.mcap_chunks import DamageError, locate, unpack
 from msg_analysis.bags.mcap_reading import MAGIC, McapFile
 from msg_analysis.messages.cdr import CdrError
@@ -46,7 +46,7 @@ def _record(kind: str) -> RunRecord:
         document["noise"] = {"loss": 0.3, "delay": int(kind == "late"), "on_loss": "hold" if kind == "hold" else "own"}
     if kind == "realtime":
         document["run"]["pace"] = "realtime"
-    return RunRecord(uuid.UUID(int=7), ValidExperiment.parse(document), np.zeros((AGENTS, WIDTH)))
+    return RunRecord(uuid.UUID(int=7), Experiment.parse(document), np.zeros((AGENTS, WIDTH)))
 
 
 RECORDS = {kind: _record(kind) for kind in KINDS}
@@ -206,7 +206,7 @@ def test_random_bags(tmp_path: Path, typestore: Any, data: st.DataObject) -> Non
     assert count.refused == expected["refused"]
 
 
-def test_memory_is_that_of_the_result(tmp_path: Path, make_run: Callable[..., Trajectory]) -> None:
+def test_memory_is_that_of_the_result(tmp_path: Path, make_run: Callable[..., Run]) -> None:
     """20 MB of states: nothing beside the result grows with their length, and little with their number."""
     run = make_run(steps=10_000, replicas=64)
     write_trajectory(run, tmp_path / "bag")

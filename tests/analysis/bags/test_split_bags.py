@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from experiments import Trajectory, read_bag, write_trajectory
+from experiments import Run, read_bag, write_trajectory
 from msg_analysis.bags.mcap_chunks import Storage
 from msg_analysis.bags.playback import Playback
 from msg_analysis.bags.salvage import salvage_in_place
@@ -24,7 +24,7 @@ from msg_analysis.bags.writing import BagWriter
 from msg_analysis.messages.messages import ActiveGraph, stamp_ns
 from msg_analysis.messages.topics import network_topics
 
-MakeRun = Callable[..., Trajectory]
+MakeRun = Callable[..., Run]
 AGENTS, STEPS, STEP = 4, 400, 50_000_000
 LATCHED = ("/experiment", "/graph")
 
@@ -41,12 +41,12 @@ def files_of(bag: Path) -> list[Path]:
 
 
 @pytest.fixture
-def run(make_run: MakeRun) -> Trajectory:
+def run(make_run: MakeRun) -> Run:
     return make_run(AGENTS, STEPS, 3)
 
 
 @pytest.fixture
-def arriving(run: Trajectory, tmp_path: Path) -> list[tuple[str, bytes, int]]:
+def arriving(run: Run, tmp_path: Path) -> list[tuple[str, bytes, int]]:
     """As a recorder receives the run: agents are up to 15 steps apart, sojourns come up to 100 steps early."""
     write_trajectory(run, tmp_path / "unsplit")
     # Each agent's states come in order.
@@ -86,9 +86,7 @@ def record(bag: BagWriter, messages: list[tuple[str, bytes, int]], portion: int 
 
 
 @pytest.fixture(params=[1, 37])
-def bag(
-    request: pytest.FixtureRequest, run: Trajectory, arriving: list[tuple[str, bytes, int]], tmp_path: Path
-) -> Path:
+def bag(request: pytest.FixtureRequest, run: Run, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> Path:
     storage = Storage("zstd", 12_000)
     with BagWriter(tmp_path / "split", network_topics(AGENTS), record=run.record.to_json(), storage=storage) as writer:
         record(writer, arriving, request.param)
@@ -115,7 +113,7 @@ def test_files_follow_each_other_in_time(bag: Path) -> None:
     assert information["message_count"] == sum(entry["message_count"] for entry in information["files"])
 
 
-def test_every_file_reads_alone(run: Trajectory, bag: Path) -> None:
+def test_every_file_reads_alone(run: Run, bag: Path) -> None:
     """With the experiment, and the graph of every step between two of its states."""
     covered = np.zeros((STEPS + 1, AGENTS), dtype=int)
     for file in files_of(bag):
@@ -154,7 +152,7 @@ def test_repetitions_say_what_they_repeat(bag: Path) -> None:
         assert numbers == set(range(len(numbers)))
 
 
-def test_the_whole_bag_is_that_which_is_not_split(run: Trajectory, bag: Path, tmp_path: Path) -> None:
+def test_the_whole_bag_is_that_which_is_not_split(run: Run, bag: Path, tmp_path: Path) -> None:
     found = read_bag(bag)
     assert found.completeness.complete
     assert (found.completeness.duplicates, found.completeness.refused) == (0, {})
@@ -186,7 +184,7 @@ def test_rosbags_reads_it(bag: Path, arriving: list[tuple[str, bytes, int]]) -> 
     assert {(topic, data) for topic, _, data in found} == {(topic, data) for topic, data, _ in arriving}
 
 
-def test_an_agent_that_is_far_behind(run: Trajectory, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> None:
+def test_an_agent_that_is_far_behind(run: Run, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> None:
     """Its states come when all files that waited for them are closed: nothing is lost, and the graphs are there."""
     late = [message for message in arriving if message[0] == "/agent_2/state"]
     bag = tmp_path / "split"
@@ -196,9 +194,7 @@ def test_an_agent_that_is_far_behind(run: Trajectory, arriving: list[tuple[str, 
     assert np.array_equal(read_bag(bag).modes, run.modes)
 
 
-def test_a_latched_message_that_is_late(
-    run: Trajectory, arriving: list[tuple[str, bytes, int]], tmp_path: Path
-) -> None:
+def test_a_latched_message_that_is_late(run: Run, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> None:
     """It is in the file of its time, and at once in the later one that has begun already."""
     states = [message for message in arriving if message[0] not in LATCHED]
     experiment = next(message for message in arriving if message[0] == "/experiment")
@@ -213,7 +209,7 @@ def test_a_latched_message_that_is_late(
     assert [[topic for topic, _ in messages_of(file)].count("/experiment") for file in files_of(bag)] == [1, 1]
 
 
-def test_torn_in_two_files(run: Trajectory, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> None:
+def test_torn_in_two_files(run: Run, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> None:
     """The recorder is killed while a file waits for late states: both are salvaged, with true counts."""
     bag = tmp_path / "split"
     writer = BagWriter(bag, network_topics(AGENTS), record=run.record.to_json(), storage=Storage("zstd", 9000))

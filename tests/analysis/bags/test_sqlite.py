@@ -16,14 +16,14 @@ import zstandard
 from click.testing import CliRunner
 from rosbags.highlevel import AnyReader
 
-from experiments import Trajectory, read_bag, write_trajectory
+from experiments import Run, read_bag, write_trajectory
 from msg_analysis.bags.playback import Playback
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.cli.main import main
 from msg_analysis.errors import BagError
 from msg_analysis.report.documents import describe_bag
 
-MakeRun = Callable[..., Trajectory]
+MakeRun = Callable[..., Run]
 Message = tuple[str, str, int, bytes]  # topic, type, time, data
 TOPICS = {  # columns by version: of Foxy (1), Galactic and Humble (2, 3), Iron, Jazzy and later (4)
     1: "id INTEGER PRIMARY KEY, name TEXT NOT NULL, type TEXT NOT NULL, serialization_format TEXT NOT NULL",
@@ -51,12 +51,12 @@ WORDS = {
 
 
 @pytest.fixture
-def run(make_run: MakeRun) -> Trajectory:
+def run(make_run: MakeRun) -> Run:
     return make_run(3, 200, 2)
 
 
 @pytest.fixture
-def messages(run: Trajectory, tmp_path: Path) -> list[Message]:
+def messages(run: Run, tmp_path: Path) -> list[Message]:
     write_trajectory(run, tmp_path / "ours")
     with AnyReader([tmp_path / "ours"]) as reader:
         return [(c.topic, c.msgtype, time, bytes(data)) for c, time, data in reader.messages()]
@@ -86,9 +86,7 @@ def database(file: Path, messages: list[Message], version: int = 4, mode: str = 
 
 
 @pytest.mark.parametrize("version", TOPICS)
-def test_every_version_is_read_and_played(
-    version: int, run: Trajectory, messages: list[Message], tmp_path: Path
-) -> None:
+def test_every_version_is_read_and_played(version: int, run: Run, messages: list[Message], tmp_path: Path) -> None:
     file = database(tmp_path / "theirs_0.db3", messages, version)
     found = read_bag(file)
     assert found.completeness.complete
@@ -103,7 +101,7 @@ def test_every_version_is_read_and_played(
     assert playback.topics["/graph"].type_name == "msg_agents_interfaces/msg/ActiveGraph"
 
 
-def test_several_files_with_the_names_of_old_versions(run: Trajectory, messages: list[Message], tmp_path: Path) -> None:
+def test_several_files_with_the_names_of_old_versions(run: Run, messages: list[Message], tmp_path: Path) -> None:
     """Until version 3 of metadata.yaml, names of files begin with that of the bag. Without it, they go by number."""
     bag = tmp_path / "theirs"
     bag.mkdir()
@@ -151,14 +149,14 @@ def test_the_log_of_a_killed_recorder_counts(messages: list[Message], tmp_path: 
     assert file.read_bytes() == before
 
 
-def test_nothing_is_left_beside_a_file_in_wal_mode(run: Trajectory, messages: list[Message], tmp_path: Path) -> None:
+def test_nothing_is_left_beside_a_file_in_wal_mode(run: Run, messages: list[Message], tmp_path: Path) -> None:
     (tmp_path / "bag").mkdir()
     file = database(tmp_path / "bag/theirs_0.db3", messages, mode="WAL")
     assert np.array_equal(read_bag(file).states, run.states)
     assert [path.name for path in file.parent.iterdir()] == [file.name]
 
 
-def test_salvage_makes_mcap_of_it(run: Trajectory, messages: list[Message], tmp_path: Path) -> None:
+def test_salvage_makes_mcap_of_it(run: Run, messages: list[Message], tmp_path: Path) -> None:
     """Also of a file that is cut off, as far as SQLite can read it; others read the new bag."""
     file = database(tmp_path / "theirs_0.db3", messages)
     report = salvage(file, tmp_path / "whole")
@@ -177,7 +175,7 @@ def test_salvage_makes_mcap_of_it(run: Trajectory, messages: list[Message], tmp_
 
 
 def test_messages_compressed_one_by_one_are_salvaged_unpacked(
-    run: Trajectory, messages: list[Message], tmp_path: Path
+    run: Run, messages: list[Message], tmp_path: Path
 ) -> None:
     packed = [(topic, kind, time, zstandard.compress(data)) for topic, kind, time, data in messages]
     file = database(tmp_path / "theirs_0.db3", packed)
@@ -244,7 +242,7 @@ def _made(file: Path, *statements: str) -> None:
     connection.close()
 
 
-def test_rows_that_are_no_messages(run: Trajectory, messages: list[Message], tmp_path: Path) -> None:
+def test_rows_that_are_no_messages(run: Run, messages: list[Message], tmp_path: Path) -> None:
     """They are left out and counted, like a message of a topic that is not there; also the last one."""
     file = database(tmp_path / "theirs_0.db3", messages)
     _made(

@@ -18,7 +18,7 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.highlevel import AnyReader
 
-from experiments import Completeness, Trajectory, line_ring, read_bag, simulate, write_trajectory
+from experiments import Completeness, Run, line_ring, read_bag, simulate, write_trajectory
 from msg_analysis.bags import salvage as salvage_module
 from msg_analysis.bags.mcap_chunks import Compression, Storage
 from msg_analysis.bags.salvage import salvage, salvage_in_place
@@ -27,10 +27,10 @@ from msg_analysis.errors import BagError, InputError
 from msg_analysis.messages.messages import encode_string
 from msg_analysis.messages.topics import network_topics
 
-MakeRun = Callable[..., Trajectory]
+MakeRun = Callable[..., Run]
 
 
-def _same(one: Trajectory, other: Trajectory) -> None:
+def _same(one: Run, other: Run) -> None:
     assert one.record.to_json() == other.record.to_json()
     assert np.array_equal(one.states, other.states, equal_nan=True)
     assert np.array_equal(one.modes, other.modes)
@@ -46,7 +46,7 @@ def test_what_is_missing_stays_missing(tmp_path: Path, make_run: MakeRun) -> Non
     run.states[7, 1] = np.nan
     run.modes[10:12] = -1
     count = Completeness(expected=123, received=122, missing=1, missing_modes=2)
-    write_trajectory(Trajectory(run.record, run.states, run.modes, count), tmp_path / "bag")
+    write_trajectory(Run(run.record, run.states, run.modes, count), tmp_path / "bag")
     found = read_bag(tmp_path / "bag")
     _same(found, run)
     assert found.completeness == count
@@ -78,14 +78,14 @@ def _boundaries(file: Path) -> list[int]:
 
 
 @pytest.fixture
-def recorded(tmp_path: Path, make_run: MakeRun) -> tuple[Trajectory, Path]:
+def recorded(tmp_path: Path, make_run: MakeRun) -> tuple[Run, Path]:
     """A run and its bag of many small chunks."""
     run = make_run()
     write_trajectory(run, tmp_path / "whole", Storage(chunk_size=2000))
     return run, tmp_path / "whole" / "whole_0.mcap"
 
 
-def test_torn_at_every_chunk_and_at_500_bytes(recorded: tuple[Trajectory, Path], tmp_path: Path) -> None:
+def test_torn_at_every_chunk_and_at_500_bytes(recorded: tuple[Run, Path], tmp_path: Path) -> None:
     """What is there up to the tear comes back; every tenth, and those at chunks, salvaged and read by rosbags."""
     run, whole = recorded
     data, boundaries = whole.read_bytes(), _boundaries(whole)
@@ -128,7 +128,7 @@ def test_torn_at_every_chunk_and_at_500_bytes(recorded: tuple[Trajectory, Path],
     assert previous == 123
 
 
-def test_200_flipped_bytes(recorded: tuple[Trajectory, Path], tmp_path: Path) -> None:
+def test_200_flipped_bytes(recorded: tuple[Run, Path], tmp_path: Path) -> None:
     """A flipped byte costs its chunk, or what is behind it, and never puts a wrong number in."""
     run, whole = recorded
     data, everything = whole.read_bytes(), {(topic, raw) for topic, _, raw in _messages(whole.parent)}
@@ -212,7 +212,7 @@ def test_run_record_survives_in_the_metadata(tmp_path: Path, make_run: MakeRun) 
     bag.close(complete=False)
 
 
-def test_salvaged_file_is_valid(recorded: tuple[Trajectory, Path], tmp_path: Path) -> None:
+def test_salvaged_file_is_valid(recorded: tuple[Run, Path], tmp_path: Path) -> None:
     data = recorded[1].read_bytes()
     (tmp_path / "torn.mcap").write_bytes(data[: len(data) // 2])
     report = salvage(tmp_path / "torn.mcap", tmp_path / "out")
@@ -235,7 +235,7 @@ def test_salvaged_file_is_valid(recorded: tuple[Trajectory, Path], tmp_path: Pat
     assert (tmp_path / "torn.mcap").read_bytes() == data[: len(data) // 2]
 
 
-def _torn_recording(recorded: tuple[Trajectory, Path], directory: Path) -> Path:
+def _torn_recording(recorded: tuple[Run, Path], directory: Path) -> Path:
     directory.mkdir()
     data = recorded[1].read_bytes()
     (directory / "run_0.mcap").write_bytes(data[: len(data) * 2 // 3])
@@ -243,7 +243,7 @@ def _torn_recording(recorded: tuple[Trajectory, Path], directory: Path) -> Path:
     return directory
 
 
-def test_salvage_in_place(recorded: tuple[Trajectory, Path], tmp_path: Path) -> None:
+def test_salvage_in_place(recorded: tuple[Run, Path], tmp_path: Path) -> None:
     directory = _torn_recording(recorded, tmp_path / "run")
     before = read_bag(directory)
     report = salvage_in_place(directory)
@@ -255,7 +255,7 @@ def test_salvage_in_place(recorded: tuple[Trajectory, Path], tmp_path: Path) -> 
 
 
 def test_failing_salvage_loses_nothing(
-    recorded: tuple[Trajectory, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recorded: tuple[Run, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     directory = _torn_recording(recorded, tmp_path / "run")
     before = {file.name: file.read_bytes() for file in directory.iterdir()}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from experiments import GOLDEN, ValidExperiment, predict
+from experiments import GOLDEN, Experiment, predict
 from msg_analysis import Experiment, Run, read_bag
 from msg_analysis.cli import console
 from msg_analysis.cli import main as cli
@@ -36,7 +36,7 @@ def from_zero(tmp_path):
 
 
 def test_transient_tends_to_the_prediction(from_zero):
-    prediction = predict(ValidExperiment.load(from_zero))
+    prediction = predict(Experiment.load(from_zero))
     for law, moments in {"emulated": prediction.emulated, "continuous": prediction.continuous_moments}.items():
         document = document_of("transient", from_zero, "--times", "0:50:0.5", "--law", law)
         assert document["law"] == law
@@ -144,7 +144,7 @@ def test_facts(name, law):
     document = document_of("facts", GOLDEN / f"{name}.yaml")
     assert all(fact["holds"] for fact in document["facts"])
     assert set(document) == {"names", "modes", "facts", "bounds", "graphs", "two_topology", "notes"}
-    prediction = predict(ValidExperiment.load(GOLDEN / f"{name}.yaml"))
+    prediction = predict(Experiment.load(GOLDEN / f"{name}.yaml"))
     moments = prediction.emulated
     nothing = {"system": {"error": None}, "nodes": {"error": None}}
     form = (document["two_topology"] or {None: nothing})[law]

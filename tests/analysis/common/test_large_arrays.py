@@ -64,7 +64,7 @@ assert array.sum() == 25_000_000
 def test_a_run_that_is_read_into_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any]
 ) -> None:
-    """Trajectory and comparison are the same as in memory, also of an incomplete bag."""
+    """Run and comparison are the same as in memory, also of an incomplete bag."""
     run = simulate(line_ring(run={"dt": 0.1, "duration": 200}, **changes))
     run.states[1500, 1] = np.nan
     write_trajectory(run, tmp_path / "bag")

@@ -26,7 +26,7 @@ from msg_analysis.experiment.examples import (
     shows,
     text_of,
 )
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.sweep.grid import load_sweep
 
 OWN = {"name": "own", "graphs": {"line": {"path": [1, 2]}}}
@@ -142,7 +142,7 @@ def test_every_choice_gives_a_valid_file(chosen: Choices, tmp_path: Path) -> Non
     file = tmp_path / "network.yaml"
     file.write_text(experiment_text("network", chosen))
     assert max(map(len, file.read_text().splitlines())) <= 120
-    experiment = ValidExperiment.load(file)
+    experiment = Experiment.load(file)
     experiment.require_available()
     assert (experiment.agents, experiment.time, experiment.steps) == (chosen.agents, chosen.time, 4000)
     assert experiment.run.seed == chosen.seed
@@ -187,4 +187,4 @@ def test_the_file_as_it_is() -> None:
 )
 def test_the_name_of_the_file_becomes_that_of_the_experiment(stem: str, name: str) -> None:
     assert experiment_name(stem) == name
-    ValidExperiment.parse(yaml.safe_load(experiment_text(name, Choices())))
+    Experiment.parse(yaml.safe_load(experiment_text(name, Choices())))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from experiments import Observation, ValidExperiment, line_ring, observed, predict
+from experiments import Experiment, Observation, line_ring, observed, predict
 from msg_analysis.inference import autocovariance
 from msg_analysis.inference.autocovariance import LoggedAutocovariance, logged_autocovariance, why_not_tested
 from msg_analysis.inference.given_path import means_given_path
@@ -15,7 +15,7 @@ LAGS = np.array([0, 1, 2, 5, 9])
 LONG_LAGS = np.array([0, 1, 2, 3, 6, 10, 19, 33, 60])  # those of runs of 600 steps
 
 
-def steps(noise: dict[str, Any] | None = None, **changes: Any) -> ValidExperiment:
+def steps(noise: dict[str, Any] | None = None, **changes: Any) -> Experiment:
     """Five agents, 1200 steps."""
     run = {"duration": 60, "seed": 1} | changes.pop("run", {})
     return line_ring(5, 0.5, noise=noise or {"process": 1.0}, run=run, **changes)
@@ -122,4 +122,4 @@ def test_what_is_not_tested() -> None:
 def test_without_noise_there_is_no_p() -> None:
     quiet = {"name": "q", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "noise": {"process": 0.0}}
     run = {"duration": 10, "start": [1, 2, 3]}
-    assert found(observed(ValidExperiment.parse(quiet | {"run": run}))).p is None
+    assert found(observed(Experiment.parse(quiet | {"run": run}))).p is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from experiments import RunRecord, ValidExperiment, compare, new_record, simulate
+from experiments import Experiment, RunRecord, compare, new_record, simulate
 from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.inference.candidates import Candidate, find_rates, select
 
@@ -37,7 +37,7 @@ AIR = BASE | {"noise": {"process": 1.0, "loss": 0.1, "broadcast": 0.2}}
 
 def run(truth, claimed):
     """A run of one law that claims to be of another; losses that the claim does not know are not logged."""
-    true, claim = ValidExperiment.parse(truth), ValidExperiment.parse(claimed)
+    true, claim = Experiment.parse(truth), Experiment.parse(claimed)
     record = new_record(claim)
     trajectory = simulate(true, record=RunRecord(record.run, true, record.start))
     lost = trajectory.lost if claim.noise.loss.any else None

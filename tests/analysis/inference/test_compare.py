@@ -13,7 +13,7 @@ from scipy import stats
 from tests.analysis.theory.test_message_steps import HEAVY, LOSSY
 
 from experiments import (
-    ValidExperiment,
+    Experiment,
     changed,
     claimed,
     compare,
@@ -283,7 +283,7 @@ LINE_RING = document(5, 0.5, run={"dt": 0.1, "duration": 400.0, "replicas": 1, "
 
 
 def compared(document, **changes):
-    return compare(simulate(ValidExperiment.parse(document | changes)))
+    return compare(simulate(Experiment.parse(document | changes)))
 
 
 @pytest.mark.parametrize("document", [HEAVY, LOSSY], ids=["switching", "losses"])
@@ -310,14 +310,14 @@ def test_heavy_tails(document):
 
 def test_heavy_tails_of_several_runs_and_live():
     runs = [
-        (str(seed), simulate(ValidExperiment.parse(HEAVY | {"run": {"dt": 0.6, "duration": 240.0, "seed": seed}})))
+        (str(seed), simulate(Experiment.parse(HEAVY | {"run": {"dt": 0.6, "duration": 240.0, "seed": seed}})))
         for seed in (1, 2)
     ]
     found = compare_pooled(runs)
     assert found.trust.reason == "heavy_tails"
     assert found.system_error.standard_error is None
     assert all(member.system_error.standard_error is None for member in found.pool.members)
-    live = LiveEstimate(new_record(ValidExperiment.parse(HEAVY)))
+    live = LiveEstimate(new_record(Experiment.parse(HEAVY)))
     assert "infinite" in live.report().note
 
 

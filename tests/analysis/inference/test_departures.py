@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiments import Observation, ValidExperiment, compare, five, observed, predict, simulate
+from experiments import Experiment, Observation, compare, five, observed, predict, simulate
 from msg_analysis.inference.dependence import LongLags, StandingStill
 from msg_analysis.inference.diagnostics import Departure, Law
 from msg_analysis.inference.e_values import Looks, WindowEvidence, Windows, variance_evidence
@@ -126,7 +126,7 @@ def sojourns(transition: list[list[float]], steps: int) -> Sojourns:
 @functools.cache
 def law_of(transition: str, steps: int) -> Law:
     graphs = {"a": {"path": [1, 2, 3]}, "b": {"complete": True}, "c": {"star": {"center": 1}}}
-    law = ValidExperiment.parse(
+    law = Experiment.parse(
         {
             "name": "chain",
             "time": "discrete",

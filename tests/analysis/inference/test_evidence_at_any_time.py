@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import Observation, ValidExperiment, compare, five, observed, predict, simulate
+from experiments import Experiment, Observation, compare, five, observed, predict, simulate
 from msg_analysis.inference.evidence import Evidence, usual_looks
 from msg_analysis.inference.observation import spaced_steps
 from msg_analysis.inference.pool import compare_pooled
@@ -17,7 +17,7 @@ from msg_analysis.theory import packed_symmetric
 
 def test_the_error_martingale_is_fair() -> None:
     """Over the next graph and the next state, by Gauss-Hermite quadrature, the factor of every rate has mean 1."""
-    law = ValidExperiment.parse(
+    law = Experiment.parse(
         {
             "name": "two",
             "problem": "consensus",

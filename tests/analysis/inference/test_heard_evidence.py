@@ -8,7 +8,7 @@ import pytest
 from mcap.reader import make_reader
 from tests.support.watched_run import messages_of, watch, watched, whole_sums
 
-from experiments import ValidExperiment, five, predict, simulate, write_trajectory
+from experiments import Experiment, five, predict, simulate, write_trajectory
 from msg_analysis.inference import online_evidence
 from msg_analysis.inference.online_errors import LiveEstimate
 from msg_analysis.inference.online_evidence import NetworkPath
@@ -40,7 +40,7 @@ LAWS: dict[str, dict[str, Any]] = {
 }
 
 
-def law(duration: float = 40.0, seed: int = 1, **changes: Any) -> ValidExperiment:
+def law(duration: float = 40.0, seed: int = 1, **changes: Any) -> Experiment:
     return five(seed, duration, **{**changes, "run": {"replicas": 2} | changes.get("run", {})})
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import Observation, Trajectory, ValidExperiment, line_ring, predict, simulate
+from experiments import Experiment, Observation, Run, line_ring, predict, simulate
 from msg_analysis.arithmetic.update_law import to_payload
 from msg_analysis.inference.estimates import Estimate, estimates
 from msg_analysis.inference.online_errors import LiveEstimate, RunningErrors
@@ -16,14 +16,14 @@ from msg_analysis.inference.time_means import time_means
 from msg_analysis.model.phases import phases
 
 
-def experiment(**changes: Any) -> ValidExperiment:
+def experiment(**changes: Any) -> Experiment:
     chain = {"generator": [[-1.0, 1.0], [0.5, -0.5]]}
     graphs = {"a": {"path": [1, 2, 3, 4]}, "b": {"cycle": [1, 2, 3, 4]}}
     run = {"dt": 0.1, "duration": 30, "seed": 5} | changes.pop("run", {})
     return line_ring(**{"graphs": graphs, "switching": chain} | changes, run=run)
 
 
-def messages(trajectory: Trajectory) -> list[tuple[int, int, int, bytes]]:
+def messages(trajectory: Run) -> list[tuple[int, int, int, bytes]]:
     """(agent, step, mode from 1, payload) of every state, in the order of steps."""
     modes = [0, *(trajectory.modes + 1).tolist()]
     return [
@@ -33,7 +33,7 @@ def messages(trajectory: Trajectory) -> list[tuple[int, int, int, bytes]]:
     ]
 
 
-def errors_from_zero(experiment: ValidExperiment, steps: int) -> list[float]:
+def errors_from_zero(experiment: Experiment, steps: int) -> list[float]:
     """Expected system error of every step, by the recursion of the second moments of the states themselves."""
     step = predict(experiment).step
     centre = np.eye(step.agents) - 1.0 / step.agents
@@ -277,7 +277,7 @@ def test_the_newest_steps_are_kept_in_order() -> None:
 
 def test_lateness_is_that_of_the_newest_steps_in_wall_time() -> None:
     """Agent i makes x(k) at (k - 1 + phi_i) dt of simulated time, of which there are four units in a second."""
-    experiment = ValidExperiment.parse(
+    experiment = Experiment.parse(
         {
             "name": "late",
             "graphs": {"line": {"path": [1, 2, 3]}},

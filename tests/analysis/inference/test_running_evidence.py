@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import Observation, RunRecord, ValidExperiment, compare, five, predict, simulate
+from experiments import Experiment, Observation, RunRecord, compare, five, predict, simulate
 from msg_analysis.inference import online_errors, online_evidence
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.online_errors import LiveEstimate, LiveReport, precision_words, reached
@@ -16,7 +16,7 @@ from msg_analysis.inference.statistics import RunningBatches, simultaneous_half_
 from msg_analysis.model.run_record import Until
 
 
-def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> ValidExperiment:
+def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> Experiment:
     return five(seed, duration, run={"replicas": 2} | changes.pop("run", {}), **changes)
 
 
@@ -81,7 +81,7 @@ def test_the_last_step_of_a_run_that_ends_early() -> None:
     assert seen.count == 1500
 
 
-def record_of(law: ValidExperiment, until: Until | None) -> tuple[RunRecord, Any]:
+def record_of(law: Experiment, until: Until | None) -> tuple[RunRecord, Any]:
     run = simulate(law)
     return RunRecord(run.record.run, law, run.record.start, until=until), run
 

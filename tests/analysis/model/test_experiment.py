@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError, NotAvailableError
-from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment, json_schema
+from msg_analysis.experiment.experiment import Experiment, ExperimentError, json_schema
 from msg_analysis.experiment.spec import ExperimentSpec
 
 ROOT = Path(__file__).parents[3]
@@ -23,8 +23,8 @@ EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"
 SMALL: dict[str, Any] = {"name": "small", "graphs": {"line": {"path": [1, 2, 3]}}}
 
 
-def small(**changes: Any) -> ValidExperiment:
-    return ValidExperiment.parse(SMALL | changes)
+def small(**changes: Any) -> Experiment:
+    return Experiment.parse(SMALL | changes)
 
 
 def adjacency_of(graph: dict[str, Any], agents: int) -> FloatArray:
@@ -68,8 +68,8 @@ def test_defaults_of_a_minimal_file() -> None:
 
 def test_shipped_experiments_are_valid_and_say_what_the_golden_files_say() -> None:
     for name in ("line_ring", "tracking", "discrete"):
-        shipped = ValidExperiment.load(EXPERIMENTS / f"{name}.yaml")
-        assert shipped == ValidExperiment.load(ROOT / f"tests/data/golden/{name}.yaml")
+        shipped = Experiment.load(EXPERIMENTS / f"{name}.yaml")
+        assert shipped == Experiment.load(ROOT / f"tests/data/golden/{name}.yaml")
 
 
 @pytest.mark.parametrize(
@@ -103,17 +103,17 @@ def test_graphml_is_read_and_becomes_part_of_the_document(tmp_path: Path, direct
     graph.add_weighted_edges_from([(2, 1, 0.5), (1, 3, 2.0), (3, 2, 1.0)])
     nx.write_graphml(graph, tmp_path / "net.graphml")
     (tmp_path / "file.yaml").write_text("name: net\ngraphs: {net: {graphml: net.graphml}}\n")
-    experiment = ValidExperiment.load(tmp_path / "file.yaml")
+    experiment = Experiment.load(tmp_path / "file.yaml")
     expected = oracle(graph, 3)
     assert np.array_equal(experiment.graph_list[0].adjacency, expected.T if directed else expected)
     (tmp_path / "net.graphml").unlink()
-    assert ValidExperiment.parse(experiment.to_document()) == experiment
+    assert Experiment.parse(experiment.to_document()) == experiment
 
 
 def test_graphml_nodes_with_other_names_are_numbered_in_file_order(tmp_path: Path) -> None:
     graph = nx.Graph([("carol", "alice"), ("alice", "bob")])
     nx.write_graphml(graph, tmp_path / "net.graphml")
-    experiment = ValidExperiment.parse(SMALL | {"graphs": {"net": {"graphml": "net.graphml"}}}, directory=tmp_path)
+    experiment = Experiment.parse(SMALL | {"graphs": {"net": {"graphml": "net.graphml"}}}, directory=tmp_path)
     assert np.array_equal(experiment.graph_list[0].adjacency, nx.to_numpy_array(graph))
 
 
@@ -153,7 +153,7 @@ def test_infinite_gain_survives_json(gain: Any) -> None:
     experiment = small(problem="tracking", leaders={"agents": [2], "gain": gain})
     text = json.dumps(experiment.to_document(), allow_nan=False)
     assert json.loads(text)["leaders"]["gain"] == "inf"
-    assert ValidExperiment.parse(json.loads(text)) == experiment
+    assert Experiment.parse(json.loads(text)) == experiment
     assert experiment.leader_gains.tolist() == [0.0, math.inf, 0.0]
 
 
@@ -219,14 +219,14 @@ def test_everything_runs_and_what_is_too_large_has_no_prediction() -> None:
 def test_numbers_and_words_are_those_of_yaml_1_2(tmp_path: Path) -> None:
     file = tmp_path / "file.yaml"
     file.write_text("name: no\ngraphs: {on: {path: [1, 02, 3]}}\nrun: {dt: 1e-3, duration: 1.0e+1}\n")
-    experiment = ValidExperiment.load(file)
+    experiment = Experiment.load(file)
     assert experiment.name == "no"
     assert experiment.graph_list[0].name == "on"
     assert experiment.agents == 3
     assert experiment.steps == 10000
     file.write_text("name: true\ngraphs: {a: {path: [1, 2]}}\n")
     with pytest.raises(ExperimentError, match="name: true: expected a text"):
-        ValidExperiment.load(file)
+        Experiment.load(file)
 
 
 @pytest.mark.parametrize(
@@ -250,19 +250,19 @@ def test_files_that_are_not_experiments(tmp_path: Path, text: str, expected: str
     file = tmp_path / "file.yaml"
     file.write_text(text)
     with pytest.raises(InputError) as caught:
-        ValidExperiment.load(file)
+        Experiment.load(file)
     assert str(caught.value).startswith(str(file))
     assert expected in str(caught.value)
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nope\.yaml: no such file"):
-        ValidExperiment.load(tmp_path / "nope.yaml")
+        Experiment.load(tmp_path / "nope.yaml")
     with pytest.raises(InputError, match="is a directory"):
-        ValidExperiment.load(tmp_path)
+        Experiment.load(tmp_path)
     (tmp_path / "binary").write_bytes(b"name: \xff")
     with pytest.raises(InputError, match="byte 6: not UTF-8"):
-        ValidExperiment.load(tmp_path / "binary")
+        Experiment.load(tmp_path / "binary")
 
 
 def test_schema_is_up_to_date_and_describes_every_key() -> None:
@@ -341,13 +341,13 @@ def documents(draw: st.DrawFn) -> dict[str, Any]:
 @settings(max_examples=60, deadline=None)
 @given(documents())
 def test_document_survives_json_and_yaml(document: dict[str, Any]) -> None:
-    experiment = ValidExperiment.parse(document)
+    experiment = Experiment.parse(document)
     written = experiment.to_document()
     for again in (
         json.loads(json.dumps(written, allow_nan=False)),
         yaml.load(yaml.dump(written, Dumper=yaml.CSafeDumper, sort_keys=False), yaml.CSafeLoader),
     ):
-        other = ValidExperiment.parse(again)
+        other = Experiment.parse(again)
         assert other == experiment
         assert other.to_document() == written
         assert np.array_equal(other.chain.matrix, experiment.chain.matrix)

@@ -9,7 +9,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from experiments import RunRecord, ValidExperiment
+from experiments import Experiment, RunRecord
 from msg_analysis.api import Experiment
 from msg_analysis.experiment.experiment import ExperimentError
 from msg_analysis.inference.comparison import law_identity
@@ -37,9 +37,9 @@ def write_csv(graph: Any, file: Path, kind: str | None = None) -> None:
         writer.writerows([a, b, w] + [kind] * (kind is not None) for a, b, w in graph.edges(data="weight"))
 
 
-def parsed(graphs: dict[str, Any], directory: Path | None = None, **others: Any) -> ValidExperiment:
+def parsed(graphs: dict[str, Any], directory: Path | None = None, **others: Any) -> Experiment:
     rates = {"rates": {a: {b: 1.0 for b in graphs if b != a} for a in graphs}} if len(graphs) > 1 else {}
-    return ValidExperiment.parse({"name": "net", "graphs": graphs, "switching": rates} | others, directory=directory)
+    return Experiment.parse({"name": "net", "graphs": graphs, "switching": rates} | others, directory=directory)
 
 
 def mistakes(graphs: dict[str, Any], directory: Path | None = None, **others: Any) -> list[str]:
@@ -63,7 +63,7 @@ def test_the_same_graph_in_every_way(directed: bool, tmp_path: Path) -> None:
         assert np.array_equal(made.adjacency, expected), made.name
         assert made.symmetric != directed
     (tmp_path / "net.csv").unlink()
-    assert ValidExperiment.parse(json.loads(json.dumps(experiment.to_document()))) == experiment
+    assert Experiment.parse(json.loads(json.dumps(experiment.to_document()))) == experiment
     assert {"arcs" if directed else "edges"} == {
         key for each in experiment.to_document()["graphs"].values() for key in each
     }
@@ -210,14 +210,14 @@ def _ring_from(graphml: str) -> dict[str, Any]:
 def test_graphml_that_is_none(tmp_path: Path, content: str) -> None:
     (tmp_path / "net.graphml").write_text(content)
     with pytest.raises(ExperimentError, match=r"graphs\.ring\.graphml: .*net\.graphml"):
-        ValidExperiment.parse(_ring_from("net.graphml"), directory=tmp_path)
+        Experiment.parse(_ring_from("net.graphml"), directory=tmp_path)
 
 
 def test_graphml_with_mistakes(tmp_path: Path) -> None:
     with pytest.raises(ExperimentError, match=r"graphs\.ring\.graphml: /dev/zero: cannot be read: longer than 64 MB"):
-        ValidExperiment.parse(_ring_from("/dev/zero"))
+        Experiment.parse(_ring_from("/dev/zero"))
     graph = nx.Graph()
     graph.add_edge(1, 2, weight=-1.0)
     nx.write_graphml(graph, tmp_path / "net.graphml")
     with pytest.raises(ExperimentError, match=r"weight -1\.0 of 1 - 2: expected a weight > 0"):
-        ValidExperiment.parse(_ring_from("net.graphml"), directory=tmp_path)
+        Experiment.parse(_ring_from("net.graphml"), directory=tmp_path)

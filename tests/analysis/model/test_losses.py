@@ -8,14 +8,14 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments import ValidExperiment, line_ring
+from experiments import Experiment, line_ring
 from msg_analysis.experiment.experiment import ExperimentError
 from msg_analysis.model.reception import NOTHING, Air, Losses, loss_probabilities
 
 BLOCK = 256
 
 
-def experiment(noise: dict[str, Any], **changes: Any) -> ValidExperiment:
+def experiment(noise: dict[str, Any], **changes: Any) -> Experiment:
     return line_ring(**{"graphs": {"a": {"path": [1, 2, 3]}, "b": {"arcs": [[3, 1]]}}, "noise": noise} | changes)
 
 
@@ -42,8 +42,8 @@ def test_by_link() -> None:
     document = what.to_document()
     assert document["noise"] | loss == document["noise"] | document["noise"]["loss"]
     assert (document["noise"]["on_loss"], document["noise"]["burst"]) == ("hold", 4.0)
-    assert ValidExperiment.parse(document) == what
-    assert ValidExperiment.parse(document).to_document() == document
+    assert Experiment.parse(document) == what
+    assert Experiment.parse(document).to_document() == document
     assert experiment({"loss": {"arcs": [[1, 2, 0]]}}).noise.loss.any is False
 
 

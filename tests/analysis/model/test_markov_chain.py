@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment import validation
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graphs import Graph, hops
 from msg_analysis.experiment.markov_chain import MarkovChain, stationary_law
 from msg_analysis.experiment.validation import connection_problems
@@ -83,10 +83,10 @@ def test_whom_nothing_connects_against_networkx(seed: int, agents: int, density:
         assert roots in list(nx.strongly_connected_components(digraph))
 
 
-def setup(time: str, matrix: np.ndarray, steps: int, dt: float = 0.3, **switching: object) -> ValidExperiment:
+def setup(time: str, matrix: np.ndarray, steps: int, dt: float = 0.3, **switching: object) -> Experiment:
     n = len(matrix)
     key = "generator" if time == "continuous" else "transition"
-    return ValidExperiment.parse(
+    return Experiment.parse(
         {
             "name": "chain",
             "time": time,
@@ -151,12 +151,12 @@ def test_step_of_grounded_leaders() -> None:
         "noise": {"process": 2.0},
         "run": {"dt": 0.1, "duration": 1},
     }
-    model = build_step_model(ValidExperiment.parse(document))
+    model = build_step_model(Experiment.parse(document))
     np.testing.assert_allclose(model.weights[0], [[0, 0, 0], [0.1, 0.8, 0.1], [0, 0.1, 0.9]])
     np.testing.assert_allclose(model.offsets[0], [3.0, 0.0, 0.0], atol=1e-15)
     np.testing.assert_allclose(model.noise[0], np.diag([0, 0.4, 0.4]))
     document |= {"time": "discrete", "run": {"duration": 5}}
-    model = build_step_model(ValidExperiment.parse(document))
+    model = build_step_model(Experiment.parse(document))
     followers = scipy.linalg.expm(-np.array([[2.0, -1.0], [-1.0, 1.0]]))
     np.testing.assert_allclose(model.weights[0][1:, 1:], followers)
     assert not model.weights[0][0].any()

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from msg_analysis.experiment import loading
-from msg_analysis.experiment.experiment import ExperimentError, ValidExperiment
+from msg_analysis.experiment.experiment import Experiment, ExperimentError
 
 GOOD: dict[str, Any] = {
     "name": "good",
@@ -40,7 +40,7 @@ def changed(changes: dict[str, Any]) -> dict[str, Any]:
 
 def problems_of(changes: dict[str, Any]) -> list[str]:
     with pytest.raises(ExperimentError) as caught:
-        ValidExperiment.parse(changed(changes))
+        Experiment.parse(changed(changes))
     return caught.value.problems
 
 
@@ -253,13 +253,13 @@ def test_mistake(changes: dict[str, Any], fragments: list[str]) -> None:
 
 def test_other_mistakes() -> None:
     """A period of three, and a key that is no text; the document itself is good."""
-    assert ValidExperiment.parse(GOOD).agents == 5
+    assert Experiment.parse(GOOD).agents == 5
     graphs = {name: {"path": [1, 2, 3]} for name in "abc"}
     ring = {"transition": [[0, 1, 0], [0, 0, 1], [1, 0, 0]]}
     problems = problems_of(DISCRETE | {"graphs": graphs, "switching": ring})
     assert "the chain has period 3" in problems[0]
     with pytest.raises(ExperimentError, match="experiment: key 1: expected a text"):
-        ValidExperiment.parse({**GOOD, 1: 2})
+        Experiment.parse({**GOOD, 1: 2})
 
 
 def test_all_mistakes_come_together() -> None:
@@ -272,18 +272,18 @@ def test_all_mistakes_come_together() -> None:
 
 def test_text_names_the_source_and_lists_the_problems() -> None:
     with pytest.raises(ExperimentError) as caught:
-        ValidExperiment.parse(changed({"foo": 1, "bar": 2}), source="file.yaml")
+        Experiment.parse(changed({"foo": 1, "bar": 2}), source="file.yaml")
     lines = str(caught.value).splitlines()
     assert lines[0] == "file.yaml: 2 problems"
     assert [line.split(":")[0] for line in lines[1:]] == ["  foo", "  bar"]
     with pytest.raises(ExperimentError, match=r"^file\.yaml: foo: unknown key"):
-        ValidExperiment.parse(changed({"foo": 1}), source="file.yaml")
+        Experiment.parse(changed({"foo": 1}), source="file.yaml")
 
 
 def test_memory_is_compared_with_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
     needed = sum(loading.memory_needed(agents=5, modes=2, steps=8000, replicas=1))
     monkeypatch.setattr(loading, "available_memory", lambda: needed)
-    ValidExperiment.parse(GOOD)
+    Experiment.parse(GOOD)
     monkeypatch.setattr(loading, "available_memory", lambda: needed - 1)
     assert "need 320 kB: expected at most 323 kB, the memory available" in problems_of({})[0]
 

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 from euler import DIRECTED, Euler, EulerSteps, document, experiment
 
-from experiments import ValidExperiment, predict, simulate
+from experiments import Experiment, predict, simulate
 from msg_analysis.cli.main import main
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
@@ -74,7 +74,7 @@ MISTAKES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
 @pytest.mark.parametrize(("protocol", "changes", "expected"), MISTAKES, ids=str)
 def test_mistakes_in_the_file(protocol: Any, changes: dict[str, Any], expected: list[str]) -> None:
     with pytest.raises(ExperimentError) as caught:
-        ValidExperiment.parse(document(protocol, **changes))
+        Experiment.parse(document(protocol, **changes))
     assert len(caught.value.problems) == len(expected)
     for text in expected:
         assert any(text in line for line in caught.value.problems), caught.value.problems
@@ -215,7 +215,7 @@ def test_no_prediction_is_refused_clearly(command: list[str], tmp_path: Path) ->
     assert outcome.stderr.startswith(f'error: {file}: protocol.name: "saturated": expected a linear protocol, but')
     assert "without a prediction: use `simulate` or `msg-agents run`" in outcome.stderr
     with pytest.raises(InputError, match="is not linear"):
-        predict(ValidExperiment.load(file))
+        predict(Experiment.load(file))
 
 
 def test_processes_that_a_protocol_forks_end_as_ever() -> None:

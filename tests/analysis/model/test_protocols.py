@@ -14,8 +14,8 @@ import yaml
 from euler import DIRECTED, Euler, EulerSteps, experiment
 
 from experiments import (
+    Experiment,
     RunRecord,
-    ValidExperiment,
     check,
     compare,
     new_record,
@@ -355,7 +355,7 @@ def test_the_examples_of_the_documentation(offer: Callable[..., None]) -> None:
         exec(block, scope)
     offer(("median", scope["Median"]), ("half", scope["Half"]))
     (example,) = (block for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL) if "median" in block)
-    assert compare(simulate(ValidExperiment.parse(yaml.safe_load(example)))).verdict == "unpredicted"
+    assert compare(simulate(Experiment.parse(yaml.safe_load(example)))).verdict == "unpredicted"
     half = experiment({"name": "half"}, graphs=DIRECTED, run={"start": "stationary"})
     step = build_step_model(half)
     assert step.weights[0, 1].tolist() == [0.5, 0.5, 0, 0, 0]

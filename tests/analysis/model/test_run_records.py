@@ -11,8 +11,8 @@ from euler import Euler, EulerSteps, experiment
 from pydantic import Field
 
 from experiments import (
+    Experiment,
     RunRecord,
-    ValidExperiment,
     check,
     compare,
     line_ring,
@@ -27,7 +27,7 @@ from msg_analysis.protocol import Parameters
 from msg_analysis.report.documents import describe_bag
 
 
-def planned() -> ValidExperiment:
+def planned() -> Experiment:
     return line_ring(run={"duration": 40, "seed": 3})
 
 

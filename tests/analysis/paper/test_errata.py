@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import ValidExperiment, predict
+from experiments import Experiment, predict
 
 ROOT = Path(__file__).parents[3]
 SCRIPT = ROOT / "benchmarks/errata.py"
@@ -49,5 +49,5 @@ def test_the_script_and_the_package_agree(noise):
     pi = np.array([0.5, 0.5])
     graphs = [errata.laplacian(pair, 5) for pair in pairs]
     expected = errata.continuous(graphs, pi, errata.generator(pi, 1.0), np.diag(np.square(noise)))
-    prediction = predict(ValidExperiment.parse(document))
+    prediction = predict(Experiment.parse(document))
     np.testing.assert_allclose(prediction.continuous.node_errors, expected, rtol=1e-10)

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.paper import examples as paper
 from msg_analysis.paper import figures
 from msg_analysis.paper.examples import CENTRALITY, NODE, SYSTEM, Curve, Example
@@ -154,7 +154,7 @@ def test_orders_of_example_3(examples: dict[int, Example]) -> None:
 def test_shipped_experiments_are_the_examples(
     examples: dict[int, Example], name: str, network: str, rates: tuple[float, float, float]
 ) -> None:
-    experiment = ValidExperiment.load(EXPERIMENTS / f"{name}.yaml")
+    experiment = Experiment.load(EXPERIMENTS / f"{name}.yaml")
     assert experiment.name == name
     expected = laplacians(network)
     drawn = next(example.networks[network] for example in examples.values() if network in example.networks)

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from experiments import Completeness, Trajectory, ValidExperiment, claimed, compare, document, line_ring, simulate
+from experiments import Completeness, Experiment, Run, claimed, compare, document, line_ring, simulate
 from msg_analysis.common import arrays
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.report import plot_style
@@ -47,7 +47,7 @@ def test_who_is_named() -> None:
 
 
 def test_drawings() -> None:
-    experiment = ValidExperiment.parse(DOCUMENT)
+    experiment = Experiment.parse(DOCUMENT)
     marked = Accused(agents=(2,), links=((1, 3, None),), jumps=(("line", "ring"),))
     line, ring = graph_drawings(experiment, marked)
     assert line.count('class="accused"') == 1  # the agent; it has no link 1-3
@@ -73,8 +73,8 @@ def test_frames_in_the_covariance() -> None:
 @pytest.fixture(scope="module")
 def louder() -> Comparison:
     """Agent 2 has twice the noise that the record says."""
-    did = simulate(ValidExperiment.parse(DOCUMENT | {"noise": {"process": [1, 2, 1]}}))
-    return compare(claimed(did, ValidExperiment.parse(DOCUMENT)))
+    did = simulate(Experiment.parse(DOCUMENT | {"noise": {"process": [1, 2, 1]}}))
+    return compare(claimed(did, Experiment.parse(DOCUMENT)))
 
 
 def test_the_difference_of_the_covariances(louder: Comparison) -> None:
@@ -135,7 +135,7 @@ def test_bars() -> None:
 PERIOD = 50_000_000  # ns of simulated time
 
 
-def _run(**run: object) -> Trajectory:
+def _run(**run: object) -> Run:
     line = {"graphs": {"line": {"path": [1, 2, 3]}}, "switching": {}}
     return simulate(line_ring(**line, run={"duration": 10, "start": "zero"} | run))
 

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from experiments import Completeness, RunRecord, Trajectory, compare, late, line_ring, simulate
+from experiments import Completeness, Run, RunRecord, compare, late, line_ring, simulate
 from msg_analysis import Experiment, InputError
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.comparison import Test as FamilyTest
@@ -63,7 +63,7 @@ class Page(HTMLParser):
             self.data += data
 
 
-def _trajectory(agents: int, steps: int, **names: str) -> Trajectory:
+def _trajectory(agents: int, steps: int, **names: str) -> Run:
     run = {"dt": 0.1, "duration": steps * 0.1, "start": "zero"}
     ring = {"cycle" if agents > 2 else "path": list(range(1, agents + 1))}
     graphs = {"line": {"path": list(range(1, agents + 1))}, "ring": ring}
@@ -76,10 +76,10 @@ def _trajectory(agents: int, steps: int, **names: str) -> Trajectory:
     record = RunRecord(uuid.UUID(int=5), experiment, states[0])
     modes = np.repeat(rng.integers(0, 2, steps // 4 + 1), 4)[:steps]
     expected = (steps + 1) * agents
-    return Trajectory(record, states, modes, Completeness(expected, expected, 0))
+    return Run(record, states, modes, Completeness(expected, expected, 0))
 
 
-def _comparison(trajectory: Trajectory) -> Comparison:
+def _comparison(trajectory: Run) -> Comparison:
     """Made-up numbers, all of them there."""
     agents = trajectory.states.shape[1]
     rng = np.random.default_rng(1)

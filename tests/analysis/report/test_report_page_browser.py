@@ -14,7 +14,7 @@ import pytest
 from browser import CUT, FAINT, Log, Tab
 from PIL import Image
 
-from experiments import Completeness, Trajectory, ValidExperiment, claimed, compare, late, simulate
+from experiments import Completeness, Experiment, Run, claimed, compare, late, simulate
 from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.report.page import write_report
 from msg_analysis.report.plot_style import BLUE, DARK
@@ -35,8 +35,8 @@ def _document(agents: int, **run: Any) -> dict[str, Any]:
     }
 
 
-def _trajectory(agents: int, **run: Any) -> Trajectory:
-    return simulate(ValidExperiment.parse(_document(agents, **run)))
+def _trajectory(agents: int, **run: Any) -> Run:
+    return simulate(Experiment.parse(_document(agents, **run)))
 
 
 def _open(tab: Tab, path: Path) -> tuple[Any, Log]:
@@ -69,11 +69,11 @@ def _check(page: Any, log: Log, path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def reports(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[Path, Trajectory]]:
+def reports(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[Path, Run]]:
     """The report of a run, and the run, by the number of agents and the settings of the run."""
 
     @functools.cache
-    def made(agents: int, **run: Any) -> tuple[Path, Trajectory]:
+    def made(agents: int, **run: Any) -> tuple[Path, Run]:
         path, trajectory = tmp_path_factory.mktemp("reports") / "report.html", _trajectory(agents, **run)
         events = [KILLED] if len(trajectory.modes) > KILLED["step"] else []
         write_report(compare(trajectory), trajectory, path, events=events)
@@ -83,7 +83,7 @@ def reports(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[Pat
 
 
 @pytest.mark.parametrize("agents", [5, 100])
-def test_small_and_large(tab: Tab, reports: Callable[..., tuple[Path, Trajectory]], agents: int) -> None:
+def test_small_and_large(tab: Tab, reports: Callable[..., tuple[Path, Run]], agents: int) -> None:
     """Figures are drawn when near, on paper all are; hover shows values; agents are chosen by numbers and a click."""
     path, _ = reports(agents, **({} if agents == 5 else HUNDRED))
     assert path.stat().st_size < 3_000_000
@@ -146,7 +146,7 @@ def test_small_and_large(tab: Tab, reports: Callable[..., tuple[Path, Trajectory
 def test_agents_by_name(tab: Tab, tmp_path: Path) -> None:
     """Both fields take names and numbers, and the figures show names, whatever is in them."""
     names = ["Bad Ems", "<b>Ulm</b>", "$$x$$", "Kiel", "1"]
-    trajectory = simulate(ValidExperiment.parse(_document(5) | {"names": names}))
+    trajectory = simulate(Experiment.parse(_document(5) | {"names": names}))
     path = tmp_path / "report.html"
     write_report(compare(trajectory), trajectory, path)
     page, log = _open(tab, path)
@@ -259,7 +259,7 @@ def _finger(page: Any, touch: Any) -> None:
     assert page.evaluate("document.documentElement.scrollWidth <= 390")
 
 
-def test_trajectories(tab: Tab, reports: Callable[..., tuple[Path, Trajectory]]) -> None:
+def test_trajectories(tab: Tab, reports: Callable[..., tuple[Path, Run]]) -> None:
     """Agents are switched on and off, and every part of the run can be seen, with the keyboard alone."""
     path, trajectory = reports(5, **LONG)
     page, log = _open(tab, path)
@@ -321,7 +321,7 @@ def test_trajectories(tab: Tab, reports: Callable[..., tuple[Path, Trajectory]])
 
 
 @pytest.mark.parametrize(("agents", "run"), [(5, LONG), (100, HUNDRED)])
-def test_replicas(tab: Tab, reports: Callable[..., tuple[Path, Trajectory]], agents: int, run: dict[str, Any]) -> None:
+def test_replicas(tab: Tab, reports: Callable[..., tuple[Path, Run]], agents: int, run: dict[str, Any]) -> None:
     """Each that has room can be chosen with the keyboard; its values are those of the run, to 16 bits of their span."""
     path, trajectory = reports(agents, **run)
     assert path.stat().st_size < 3_000_000
@@ -351,22 +351,22 @@ def test_replicas(tab: Tab, reports: Callable[..., tuple[Path, Trajectory]], age
     assert log.complaints == []
 
 
-def _in_real_time() -> tuple[Any, Trajectory]:
+def _in_real_time() -> tuple[Any, Run]:
     trajectory = _trajectory(3, pace="realtime", speed=5.0)
     trajectory = late(trajectory, 60_000_000)
     return compare(trajectory), trajectory
 
 
-def _disagreeing() -> tuple[Any, Trajectory]:
+def _disagreeing() -> tuple[Any, Run]:
     document = _document(4)
     wrong = document | {"graphs": document["graphs"] | {"ring $$x$$": {"edges": [[1, 2], [2, 3], [3, 4], [1, 4, 0.3]]}}}
-    said, did = ValidExperiment.parse(document), simulate(ValidExperiment.parse(wrong).with_run(duration=100))
+    said, did = Experiment.parse(document), simulate(Experiment.parse(wrong).with_run(duration=100))
     said = said.with_run(duration=100)
     trajectory = claimed(did, said)
     return compare(trajectory), trajectory
 
 
-def _incomplete() -> tuple[Any, Trajectory]:
+def _incomplete() -> tuple[Any, Run]:
     trajectory = _trajectory(3)
     trajectory.states[5, 1] = np.nan
     count = Completeness(expected=1203, received=1202, missing=1)
@@ -374,12 +374,12 @@ def _incomplete() -> tuple[Any, Trajectory]:
     return compare(trajectory), trajectory
 
 
-def _pooled() -> tuple[Any, Trajectory]:
+def _pooled() -> tuple[Any, Run]:
     comparison = compare_pooled([(f"bag_{seed}", _trajectory(3, seed=seed)) for seed in (1, 2, 3)])
     return comparison, comparison.trajectory
 
 
-def _tracking() -> tuple[Any, Trajectory]:
+def _tracking() -> tuple[Any, Run]:
     document = {
         "name": "led",
         "problem": "tracking",
@@ -391,7 +391,7 @@ def _tracking() -> tuple[Any, Trajectory]:
         "noise": {"process": 0.5, "loss": 0.1},
         "run": {"duration": 300},
     }
-    trajectory = simulate(ValidExperiment.parse(document))
+    trajectory = simulate(Experiment.parse(document))
     return compare(trajectory), trajectory
 
 

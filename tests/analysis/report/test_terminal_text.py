@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.protocols import ProtocolInfo
 from msg_analysis.report import comparison_text, tables, theory_text
 from msg_analysis.report.documents import describe_experiment
@@ -132,7 +132,7 @@ DOCUMENT: dict[str, Any] = {
 
 
 def test_experiment_explained() -> None:
-    document = describe_experiment(ValidExperiment.parse(DOCUMENT))
+    document = describe_experiment(Experiment.parse(DOCUMENT))
     line, arcs, ring = document["graphs"]
     assert (document["agents"], document["run"]["steps"], document["unavailable"]) == (4, 1000, [])
     assert [tuple(edge) for edge in line["edges"]] == [(1, 2, 1.0), (2, 3, 1.0), (3, 4, 1.0)]
@@ -152,7 +152,7 @@ def test_experiment_explained() -> None:
 def test_experiment_that_cannot_be_run_here() -> None:
     """One of a bag, whose protocol is not installed."""
     used = ProtocolInfo("mine", "pack", "1.2", linear=True)
-    what = ValidExperiment.parse(DOCUMENT | {"protocol": {"name": "mine"}}, recorded=used)
+    what = Experiment.parse(DOCUMENT | {"protocol": {"name": "mine"}}, recorded=used)
     text = shown(tables.print_experiment, describe_experiment(what))
     assert 'protocol.name: "mine": expected an available protocol' in text
 
@@ -160,7 +160,7 @@ def test_experiment_that_cannot_be_run_here() -> None:
 def test_noise_by_graph_and_delay_explained() -> None:
     """Limits of the graphs alone would say nothing about steps with a delay."""
     gains = {"line": 1.0, "ring": [0.5, 1.0, 1.0, 2.0], "arcs": [[1.0, 0.0, 0.0, 0.5]] * 4}
-    document = describe_experiment(ValidExperiment.parse(DOCUMENT | {"noise": {"process": gains, "delay": 2}}))
+    document = describe_experiment(Experiment.parse(DOCUMENT | {"noise": {"process": gains, "delay": 2}}))
     assert document["stability_limit"] is None
     assert document["predicted_system_error"] > 0
     output = " ".join(shown(tables.print_experiment, document).split())
@@ -170,7 +170,7 @@ def test_noise_by_graph_and_delay_explained() -> None:
 
 def test_one_graph_that_is_never_left() -> None:
     plain = {"name": "one", "graphs": {"line": {"path": [1, 2]}}}
-    (graph,) = describe_experiment(ValidExperiment.parse(plain))["graphs"]
+    (graph,) = describe_experiment(Experiment.parse(plain))["graphs"]
     assert graph["mean_holding_time"] is None
     assert graph["stationary"] == 1.0
 
@@ -180,7 +180,7 @@ def test_algebraic_connectivity_against_networkx() -> None:
 
     network = nx.connected_watts_strogatz_graph(12, 4, 0.3, seed=1)
     links = [[i + 1, j + 1] for i, j in network.edges]
-    experiment = ValidExperiment.parse({"name": "net", "graphs": {"net": {"edges": links}}})
+    experiment = Experiment.parse({"name": "net", "graphs": {"net": {"edges": links}}})
     expected = nx.algebraic_connectivity(network, method="lanczos", seed=1)
     assert algebraic_connectivity(experiment.graph_list[0]) == pytest.approx(expected, rel=1e-6)
 
@@ -259,7 +259,7 @@ def test_real_time() -> None:
 
 def test_losses_by_link() -> None:
     loss = {"default": 0.2, "edges": [[2, 3, 0.6]], "arcs": [[1, 2, 0.05]]}
-    document = describe_experiment(ValidExperiment.parse(DOCUMENT | {"noise": {"loss": loss, "burst": 5}}))
+    document = describe_experiment(Experiment.parse(DOCUMENT | {"noise": {"loss": loss, "burst": 5}}))
     output = " ".join(shown(tables.print_experiment, document).split())
     assert "loss 0.2 (2-3: 0.6, 1>2: 0.05), on_loss own, burst 5.0, delay 0" in output
 
@@ -281,4 +281,4 @@ def test_losses_by_link() -> None:
     ],
 )
 def test_what_happens_to_messages_explained(noise: dict[str, Any], words: str) -> None:
-    assert any(sentence.endswith(words) for sentence in explain(ValidExperiment.parse(DOCUMENT | {"noise": noise})))
+    assert any(sentence.endswith(words) for sentence in explain(Experiment.parse(DOCUMENT | {"noise": noise})))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from experiments import RunRecord, Trajectory, compare, line_ring, new_record, simulate
+from experiments import Run, RunRecord, compare, line_ring, new_record, simulate
 from msg_analysis.api import Experiment, Run, write_report
 from msg_analysis.cli.main import main
 from msg_analysis.common.text import agent_name, agent_text, with_names
@@ -64,7 +64,7 @@ RUN = {"replicas": 1, "seed": 3, "start": "zero"}
 NOON = datetime.datetime(2026, 11, 25, 12, 0, 59, tzinfo=datetime.UTC)
 
 
-def run(started: datetime.datetime = NOON, **changes: object) -> Trajectory:
+def run(started: datetime.datetime = NOON, **changes: object) -> Run:
     found = simulate(line_ring(**PAIR, run=RUN | changes))
     return dataclasses.replace(found, record=dataclasses.replace(found.record, started=started))
 

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 import experiments
-from experiments import ValidExperiment, simulate
+from experiments import Experiment, simulate
 from msg_analysis.errors import InputError
 from msg_analysis.sweep import results as conducting
 from msg_analysis.sweep.figure_series import picture
@@ -76,7 +76,7 @@ def test_simulated_runs_are_those_of_the_twin() -> None:
     """Mean square of the disagreement, by numpy."""
     what = document(seed=5)
     outcome = evaluate(Job.of("simulate", what))
-    states = simulate(ValidExperiment.parse(what)).values[:-1]
+    states = simulate(Experiment.parse(what)).values[:-1]
     deviations = states - states.mean(axis=1, keepdims=True)
     assert outcome.result["system_error"]["measured"] == pytest.approx(float((deviations**2).sum(axis=1).mean()))
     assert outcome.result["steps"] == 1000

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.sweep.grid import KeyProblemError, Sweep, load_sweep, own_seed, put
 from msg_analysis.sweep.sweep_file import json_schema
 
@@ -90,10 +90,10 @@ def test_bad_ranges_are_named(tmp_path: Path, given: Any) -> None:
 def test_lists_are_values_where_a_key_is_a_list(tmp_path: Path) -> None:
     """One noise gain per agent is one value."""
     sweep = load(tmp_path, over={"noise.process": [1.0, [1, 2, 3], {"line": 1.0, "ring": 2.0}]})
-    assert [ValidExperiment.parse(yaml.safe_load(point.job.document)).noise_gain.shape for point in sweep.points] == [
+    assert [Experiment.parse(yaml.safe_load(point.job.document)).noise_gain.shape for point in sweep.points] == [
         (2, 3, 3)
     ] * 3
-    gains = ValidExperiment.parse(yaml.safe_load(sweep.points[1].job.document)).noise_gain
+    gains = Experiment.parse(yaml.safe_load(sweep.points[1].job.document)).noise_gain
     assert np.diag(gains[0]).tolist() == [1, 2, 3]
 
 
@@ -125,7 +125,7 @@ def test_graphml_is_read_here_so_that_workers_need_no_file(tmp_path: Path) -> No
         point.job for point in load(tmp_path, experiment=EXPERIMENT | {"graphs": graphs}, over={"run.dt": [0.1]}).points
     )
     assert "graphml" not in job.document
-    assert ValidExperiment.parse(yaml.safe_load(job.document)).graph_list[1].adjacency.sum() == 6
+    assert Experiment.parse(yaml.safe_load(job.document)).graph_list[1].adjacency.sum() == 6
 
 
 @pytest.mark.parametrize(

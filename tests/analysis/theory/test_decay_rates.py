@@ -7,13 +7,13 @@ import mpmath
 import numpy as np
 import pytest
 
-from experiments import ValidExperiment, predict
+from experiments import Experiment, predict
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.settling import Rates, asymptotic_rates
 from msg_analysis.theory.transient import MAX_UNKNOWNS, unknowns
 
 
-def network(arcs: list[list[float]], problem: str, time: str = "continuous", **changes: Any) -> ValidExperiment:
+def network(arcs: list[list[float]], problem: str, time: str = "continuous", **changes: Any) -> Experiment:
     """Two graphs with the same arcs."""
     document = {
         "name": "directed",
@@ -27,7 +27,7 @@ def network(arcs: list[list[float]], problem: str, time: str = "continuous", **c
         document |= {"switching": {"transition": [[0.5, 0.5], [0.5, 0.5]]}, "run": {"duration": 100}}
     if problem == "tracking":
         document["leaders"] = {"agents": [1], "gain": 1}
-    return ValidExperiment.parse(document | changes)
+    return Experiment.parse(document | changes)
 
 
 def chain(agents: int) -> list[list[float]]:
@@ -35,7 +35,7 @@ def chain(agents: int) -> list[list[float]]:
     return [[i, i + 1] for i in range(1, agents)]
 
 
-def of_run(experiment: ValidExperiment) -> Rates:
+def of_run(experiment: Experiment) -> Rates:
     return asymptotic_rates(predict(experiment).system)
 
 

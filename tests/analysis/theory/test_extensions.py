@@ -13,7 +13,7 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments import ValidExperiment, line_ring, predict
+from experiments import Experiment, line_ring, predict
 from msg_analysis.errors import InputError
 from msg_analysis.model.step_model import build_step_model
 from msg_analysis.theory.jump_system import emulated, held
@@ -187,7 +187,7 @@ def steady_by_stepping(given):
 @given(seeds)
 def test_steps_with_everything_are_those_of_brute_force(seed):
     given = document(seed)
-    prediction = predict(ValidExperiment.parse(given))
+    prediction = predict(Experiment.parse(given))
     expected = steady_by_stepping(given)
     scale = np.abs(expected).max()
     np.testing.assert_allclose(prediction.emulated.by_mode, expected, rtol=1e-7, atol=1e-8 * scale)
@@ -201,7 +201,7 @@ def test_steps_with_everything_are_those_of_brute_force(seed):
 def test_transient_with_everything_is_that_of_brute_force(seed, steps):
     """From a known start, which a delay takes to have been the same before."""
     given = document(seed)
-    experiment = ValidExperiment.parse(given)
+    experiment = Experiment.parse(given)
     _, law = transition_and_law(given)
     blocks = given["noise"]["delay"] + 1
     x = np.random.default_rng(seed).standard_normal(given["agents"])
@@ -242,7 +242,7 @@ def test_continuous_time_with_noise_by_graph_is_the_papers_equation(seed):
     right = np.concatenate([share * a.ravel() for share, a in zip(law, q, strict=True)])
     solution = (np.linalg.pinv(matrix, rcond=1e-11) @ right).reshape(n, len(eye), len(eye))
     expected = keep @ solution @ keep.T
-    measured = predict(ValidExperiment.parse(given)).continuous.by_mode
+    measured = predict(Experiment.parse(given)).continuous.by_mode
     np.testing.assert_allclose(measured, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
 
 
@@ -273,7 +273,7 @@ def test_two_agents_late(delay):
     entering = np.zeros_like(companion)
     entering[0, 0] = 2.0 * dt  # variance of the noise of x_1 - x_2
     difference = scipy.linalg.solve_discrete_lyapunov(companion, entering)[0, 0]
-    prediction = predict(ValidExperiment.parse(given))
+    prediction = predict(Experiment.parse(given))
     assert prediction.emulated.system_error == pytest.approx(difference / 2, rel=1e-11)
     assert prediction.continuous_moments is None
     assert prediction.static_moments is None
@@ -299,20 +299,20 @@ def complete(dt, **noise):
 
 
 def test_steps_that_delay_makes_unstable_are_refused():
-    assert predict(ValidExperiment.parse(complete(0.4))).emulated.system_error > 0.0
-    assert predict(ValidExperiment.parse(complete(0.33, delay=1))).emulated.system_error > 0.0
+    assert predict(Experiment.parse(complete(0.4))).emulated.system_error > 0.0
+    assert predict(Experiment.parse(complete(0.33, delay=1))).emulated.system_error > 0.0
     with pytest.raises(InputError, match=r"grow without bound.* every dt below 0\.3333 is stable"):
-        predict(ValidExperiment.parse(complete(0.4, delay=1)))
+        predict(Experiment.parse(complete(0.4, delay=1)))
 
 
 @pytest.mark.parametrize("process", [0.0, [[1.0] * 4] * 4])
 def test_noise_that_does_not_show_instability_hides_nothing(process):
     """Without noise, or with the same noise for everybody, nothing grows from agreement; from elsewhere it does."""
-    stable = predict(ValidExperiment.parse(complete(0.4, process=process))).to_json()["emulated"]
+    stable = predict(Experiment.parse(complete(0.4, process=process))).to_json()["emulated"]
     assert stable["system_error"] == 0.0
     assert stable["system_certainty"] is None
     with pytest.raises(InputError, match="without bound"):
-        predict(ValidExperiment.parse(complete(0.4, process=process, delay=1)))
+        predict(Experiment.parse(complete(0.4, process=process, delay=1)))
 
 
 def test_agents_without_errors_have_no_certainty():
@@ -325,7 +325,7 @@ def test_agents_without_errors_have_no_certainty():
         "leaders": {"agents": [1]},
         "noise": {"process": [0.0, 0.0, 1.0], "delay": 2},
     }
-    law = predict(ValidExperiment.parse(given)).to_json()["emulated"]
+    law = predict(Experiment.parse(given)).to_json()["emulated"]
     assert law["node_errors"][:2] == [0.0, 0.0]
     assert law["node_certainty"][:2] == [None, None]
     assert law["node_certainty"][2] > 0.0

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments import ValidExperiment, predict
+from experiments import Experiment, predict
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.theory.graph_indices import error_bounds, graph_indices
 
@@ -64,7 +64,7 @@ def network(random, *, m, n, time, problem, directed=False, noise=1.0, rate=1.0)
     }
     if problem == "tracking":
         document["leaders"] = {"agents": [1], "gain": float(random.choice([0.5, 5.0, np.inf]))}
-    return ValidExperiment.parse(document)
+    return Experiment.parse(document)
 
 
 @MODELS
@@ -107,7 +107,7 @@ def test_lower_bound_is_half_the_trace_of_the_averaged_graph():
 def test_no_bounds_where_they_do_not_hold(directed, noise, reason):
     random = np.random.default_rng(2)
     experiment = network(random, m=4, n=2, time="continuous", problem="consensus", directed=directed)
-    bounds = error_bounds(predict(ValidExperiment.parse(experiment.to_document() | {"noise": noise})))
+    bounds = error_bounds(predict(Experiment.parse(experiment.to_document() | {"noise": noise})))
     assert (bounds.lower, bounds.upper) == (None, None)
     assert reason in bounds.note
 
@@ -123,7 +123,7 @@ def test_in_discrete_time_the_averaged_graph_is_no_lower_bound():
         "noise": {"process": 1.0},
         "run": {"duration": 10},
     }
-    prediction = predict(ValidExperiment.parse(document))
+    prediction = predict(Experiment.parse(document))
     assert prediction.emulated.system_error < 1 / (1 - 0.9**2) - 0.05
     bounds = error_bounds(prediction)
     assert bounds.lower is None

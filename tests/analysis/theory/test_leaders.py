@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory.leaders import (
     LeaderProblem,
     joint_robustness_centrality,
@@ -61,7 +61,7 @@ def stationary(chain: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(np.vstack([chain.T, np.ones(n)]), np.append(np.zeros(n), 1.0), rcond=None)[0]
 
 
-def kronecker_error(experiment: ValidExperiment, leaders: tuple[int, ...], law: str, gain: float = math.inf) -> float:
+def kronecker_error(experiment: Experiment, leaders: tuple[int, ...], law: str, gain: float = math.inf) -> float:
     """E(S) from the full n m^2 equations, written from the definitions."""
     m, laplacians = experiment.agents, [g.laplacian for g in experiment.graph_list]
     n, q = len(laplacians), [f @ f.T for f in experiment.noise_gain]
@@ -97,24 +97,24 @@ def kronecker_error(experiment: ValidExperiment, leaders: tuple[int, ...], law: 
 @given(st.integers(0, 10**6), st.booleans(), st.sampled_from([math.inf, 0.01, 3.0]))
 def test_system_error_against_kronecker_algebra(seed: int, directed: bool, gain: float) -> None:
     leaders = [(0,), (1, 3), (0, 2, 4)][seed % 3]
-    experiment = ValidExperiment.parse(random_document(seed, directed=directed))
-    twin = ValidExperiment.parse(discrete_document(seed, directed=directed))
+    experiment = Experiment.parse(random_document(seed, directed=directed))
+    twin = Experiment.parse(discrete_document(seed, directed=directed))
     for law, model in (("continuous", experiment), ("emulated", experiment), ("discrete", twin)):
         expected = kronecker_error(model, leaders, law, gain)
         assert system_error(model, list(leaders), law=law, gain=gain) == pytest.approx(expected, rel=1e-9)  # type: ignore[arg-type]
 
 
 def test_leaders_of_the_experiment_do_not_count() -> None:
-    consensus = ValidExperiment.parse(random_document(1))
+    consensus = Experiment.parse(random_document(1))
     led = {"problem": "tracking", "leaders": {"agents": [2], "gain": 0.5, "reference": 7.0}}
-    tracking = ValidExperiment.parse(random_document(1) | led)
+    tracking = Experiment.parse(random_document(1) | led)
     assert system_error(tracking, [0, 3]) == system_error(consensus, [0, 3])
     assert joint_robustness_centrality(tracking, [0, 3]) == 1.0 / system_error(consensus, [0, 3])
     assert tracking.leaders.agents == [2]
 
 
 def test_infinite_gain_is_the_limit_of_large_ones() -> None:
-    experiment = ValidExperiment.parse(random_document(2))
+    experiment = Experiment.parse(random_document(2))
     limit = system_error(experiment, [1, 2])
     errors = [system_error(experiment, [1, 2], gain=gain) - limit for gain in (1e3, 1e4, 1e5)]
     assert errors[0] > errors[1] > errors[2] > 0
@@ -125,7 +125,7 @@ def test_infinite_gain_is_the_limit_of_large_ones() -> None:
 def test_single_leader_of_one_graph_is_information_centrality(graph: Any) -> None:
     """E = 1 / (2 IC), Fitch and Leonard; networkx's centrality is one over the sum of the resistances."""
     links = [[i + 1, j + 1] for i, j in graph.edges]
-    experiment = ValidExperiment.parse({"name": "one", "graphs": {"g": {"edges": links}}})
+    experiment = Experiment.parse({"name": "one", "graphs": {"g": {"edges": links}}})
     centrality = nx.information_centrality(graph)
     for agent in graph:
         expected = 2.0 * centrality[agent]
@@ -159,7 +159,7 @@ def best_on_ring(agents: int, count: int) -> float:
 @pytest.mark.parametrize(("agents", "count"), [(9, 1), (10, 2), (11, 3), (9, 4)])
 @pytest.mark.parametrize("kind", ["path", "cycle"])
 def test_optimal_leaders_on_paths_and_rings(kind: str, agents: int, count: int) -> None:
-    experiment = ValidExperiment.parse({"name": kind, "graphs": {"g": {kind: list(range(1, agents + 1))}}})
+    experiment = Experiment.parse({"name": kind, "graphs": {"g": {kind: list(range(1, agents + 1))}}})
     best = (best_on_path if kind == "path" else best_on_ring)(agents, count)
     exhaustive = select_leaders(experiment, count, method="exhaustive")
     assert exhaustive.sets[0][0] == pytest.approx(best, rel=1e-10)
@@ -174,7 +174,7 @@ def test_optimal_leaders_on_paths_and_rings(kind: str, agents: int, count: int) 
 
 def test_optimal_leaders_of_a_longer_path() -> None:
     """Too many sets to try them all; the exact algorithm has the answer."""
-    experiment = ValidExperiment.parse({"name": "path", "graphs": {"g": {"path": list(range(1, 25))}}})
+    experiment = Experiment.parse({"name": "path", "graphs": {"g": {"path": list(range(1, 25))}}})
     selection = select_leaders(experiment, 4)
     best = best_on_path(24, 4)
     assert selection.method == "swap"
@@ -187,7 +187,7 @@ def test_optimal_leaders_of_a_longer_path() -> None:
 def test_monotone_and_supermodular(seed: int, directed: bool, law: str, finite: bool) -> None:
     """Directed and weighted graphs, uneven noise, every law, any gain."""
     document = discrete_document if law == "discrete" else random_document
-    experiment = ValidExperiment.parse(document(seed, directed=directed))
+    experiment = Experiment.parse(document(seed, directed=directed))
     problem = LeaderProblem(experiment, law, 0.7 if finite else math.inf)  # type: ignore[arg-type]
     assert problem.supermodular
     worth = {
@@ -212,7 +212,7 @@ def errors_of(problem: LeaderProblem) -> Callable[..., float]:
 def test_supermodular_with_noise_on_the_air_loss_and_delay(seed: int, directed: bool, delay: int, loss: float) -> None:
     noise = {"process": 0.5, "link": 1.0, "broadcast": 0.7, "loss": loss, "delay": delay}
     problem = LeaderProblem(
-        ValidExperiment.parse(random_document(seed, agents=4, directed=directed, noise=noise)), "emulated"
+        Experiment.parse(random_document(seed, agents=4, directed=directed, noise=noise)), "emulated"
     )
     assert problem.supermodular
     error = errors_of(problem)
@@ -235,7 +235,7 @@ def test_negatively_correlated_noise_breaks_supermodularity_and_gets_no_guarante
     worst = 0.0
     for seed in range(20):
         noise = {"process": random.standard_normal((5, 5)).tolist()}
-        problem = LeaderProblem(ValidExperiment.parse(random_document(seed, noise=noise)), "continuous")
+        problem = LeaderProblem(Experiment.parse(random_document(seed, noise=noise)), "continuous")
         assert not problem.supermodular
         error = errors_of(problem)
         for a, u, v in combinations(range(5), 3):
@@ -245,7 +245,7 @@ def test_negatively_correlated_noise_breaks_supermodularity_and_gets_no_guarante
     graphs = {"a": {"path": [1, 2, 3]}, "b": {"cycle": [1, 2, 3]}}
     document = {"name": "correlated", "graphs": graphs, "noise": {"process": CORRELATED}}
     switching = {"switching": {"generator": [[-1, 1], [1, -1]]}}
-    selection = select_leaders(ValidExperiment.parse(document | switching), 2, method="swap")
+    selection = select_leaders(Experiment.parse(document | switching), 2, method="swap")
     assert selection.bound is None
     assert "negatively correlated" in str(selection.to_json()["note"])
 
@@ -253,9 +253,7 @@ def test_negatively_correlated_noise_breaks_supermodularity_and_gets_no_guarante
 def test_large_steps_get_no_guarantee() -> None:
     """With run.dt * degree > 1 the weights of a step are negative: no walkers."""
     graphs = {"g": {"star": {"center": 1}}}
-    experiment = ValidExperiment.parse(
-        {"name": "star", "agents": 6, "graphs": graphs, "run": {"dt": 0.25, "duration": 10}}
-    )
+    experiment = Experiment.parse({"name": "star", "agents": 6, "graphs": graphs, "run": {"dt": 0.25, "duration": 10}})
     assert not LeaderProblem(experiment, "emulated").supermodular
     assert LeaderProblem(experiment, "continuous").supermodular
     assert LeaderProblem(experiment.with_run(dt=0.2), "emulated").supermodular
@@ -272,7 +270,7 @@ def test_agents_that_hear_nobody_must_lead() -> None:
         "leaders": {"agents": [1, 6]},
         "run": {"dt": 0.1, "duration": 10},
     }
-    experiment = ValidExperiment.parse(document)
+    experiment = Experiment.parse(document)
     assert system_error(experiment, [1, 2]) == math.inf
     assert joint_robustness_centrality(experiment, [1, 2]) == 0.0
     for method in ("exhaustive", "greedy", "swap"):
@@ -285,24 +283,24 @@ def test_agents_that_hear_nobody_must_lead() -> None:
 
 def test_noise_on_the_air_is_looked_at_in_the_steps_law() -> None:
     noise = {"process": 1.0, "link": 0.5, "broadcast": 0.3, "loss": 0.2}
-    experiment = ValidExperiment.parse(random_document(4, noise=noise))
+    experiment = Experiment.parse(random_document(4, noise=noise))
     assert resolve_law(experiment) == "emulated"
     problem = LeaderProblem(experiment, "emulated")
     assert problem.supermodular
-    quiet = ValidExperiment.parse(random_document(4, noise={"process": 1.0}))
+    quiet = Experiment.parse(random_document(4, noise={"process": 1.0}))
     assert problem.system_error(frozenset({0})) > system_error(quiet, [0], law="emulated")
     with pytest.raises(InputError, match=r"--law continuous.*use emulated"):
         resolve_law(experiment, "continuous")
 
 
 def test_limits_and_everybody() -> None:
-    experiment = ValidExperiment.parse(random_document(5))
+    experiment = Experiment.parse(random_document(5))
     assert system_error(experiment, list(range(5))) == 0.0
     assert select_leaders(experiment, 5, gain=2.0).sets[0][1] == (0, 1, 2, 3, 4)
-    path = ValidExperiment.parse({"name": "path", "graphs": {"g": {"path": list(range(1, 61))}}})
+    path = Experiment.parse({"name": "path", "graphs": {"g": {"path": list(range(1, 61))}}})
     with pytest.raises(InputError, match="5461512 sets of 5 leaders: use swap"):
         select_leaders(path, 5, method="exhaustive")
-    experiment = ValidExperiment.parse(random_document(7))
+    experiment = Experiment.parse(random_document(7))
     with pytest.raises(InputError, match=r"run\.dt"):
         select_leaders(experiment, 1, law="emulated", gain=1000.0)
 
@@ -321,13 +319,13 @@ def test_limits_and_everybody() -> None:
     ],
 )
 def test_bad_questions(changes: dict[str, Any], message: str) -> None:
-    experiment = ValidExperiment.parse(random_document(6))
+    experiment = Experiment.parse(random_document(6))
     with pytest.raises(InputError, match=message):
         select_leaders(experiment, **{"count": 2} | changes)
 
 
 def test_document() -> None:
-    document = select_leaders(ValidExperiment.parse(random_document(8)), 2, method="swap", top=3).to_json()
+    document = select_leaders(Experiment.parse(random_document(8)), 2, method="swap", top=3).to_json()
     assert [document[key] for key in ("experiment", "law", "gain", "count", "method")] == [
         *("random", "continuous", "inf", 2, "swap")
     ]

@@ -18,7 +18,7 @@ import pytest
 import scipy.linalg
 from tests.support.switching_systems import LINE_RING, steady_of
 
-from experiments import ValidExperiment, line_ring, predict
+from experiments import Experiment, line_ring, predict
 from msg_analysis.errors import InputError
 from msg_analysis.model.phases import phases
 from msg_analysis.model.step_model import build_run_model, build_step_model
@@ -86,7 +86,7 @@ def parse(case, **run):
         document["switching"] = {"transition": [[0.8, 0.2], [0.4, 0.6]]}
     else:
         document["switching"] = {"generator": [[-2.0, 2.0], [3.0, -3.0]]}
-    return ValidExperiment.parse(document | more)
+    return Experiment.parse(document | more)
 
 
 def loss_of(noise, i, j):
@@ -285,7 +285,7 @@ def test_bursts_as_short_as_those_of_independent_losses(pace, on_loss):
     loss = {"arcs": [[1, 2, 0.2], [2, 3, 0.2], [5, 4, 0.2]]}
     noise = {"loss": loss, "on_loss": on_loss, "broadcast": 0.3, "link": 0.2}
     document = LINE_RING | {"run": LINE_RING["run"] | {"pace": pace}}
-    both = [predict(ValidExperiment.parse(document | {"noise": noise | more})) for more in ({}, {"burst": 1.25})]
+    both = [predict(Experiment.parse(document | {"noise": noise | more})) for more in ({}, {"burst": 1.25})]
     one, other = (found.emulated for found in both)
     np.testing.assert_allclose(one.by_mode, other.by_mode, rtol=1e-10, atol=1e-12)
     assert one.by_mode.shape == (2, 5, 5)
@@ -353,7 +353,7 @@ def test_rates_are_eigenvalues_of_the_whole(case):
 
 
 def test_too_many_values_or_channels_are_refused():
-    many = ValidExperiment.parse(
+    many = Experiment.parse(
         LINE_RING
         | {
             "graphs": {"a": {"complete": True}},
@@ -391,7 +391,7 @@ def test_closed_form_for_two_graphs(case):
         "noise": noise,
         "run": {"dt": 0.3, "duration": 6, "pace": pace},
     }
-    prediction = predict(ValidExperiment.parse(document))
+    prediction = predict(Experiment.parse(document))
     assert graphs is GRAPHS
     found = two_topology(prediction.system)
     np.testing.assert_allclose(found.node_errors, prediction.emulated.node_errors, rtol=1e-9)
@@ -405,9 +405,9 @@ def test_leaders(case, gain):
     run = {"dt": 0.3, "duration": 6, "pace": more.get("pace", "lockstep"), "seed": 3}
     document = {"name": "led", "graphs": graphs, "switching": {"generator": [[-2.0, 2.0], [3.0, -3.0]]}}
     document |= {"noise": noise, "run": run}
-    consensus = ValidExperiment.parse(document)
+    consensus = Experiment.parse(document)
     leaders = {"problem": "tracking", "leaders": {"agents": [3], "gain": gain}}
-    tracking = ValidExperiment.parse(document | leaders)
+    tracking = Experiment.parse(document | leaders)
     found = system_error(consensus, [2], gain=gain)
     assert found == pytest.approx(predict(tracking).emulated.system_error, rel=1e-10)
     brute = Brute(case, tracking)
@@ -434,7 +434,7 @@ LOSSY = HEAVY | {
 
 
 def of(document, **noise):
-    experiment = ValidExperiment.parse(document | {"noise": document["noise"] | noise})
+    experiment = Experiment.parse(document | {"noise": document["noise"] | noise})
     prediction = predict(experiment)
     return build_run_model(experiment, prediction.step), prediction
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from experiments import GOLDEN, ValidExperiment, line_ring, predict
+from experiments import GOLDEN, Experiment, line_ring, predict
 from msg_analysis.errors import NotAvailableError
 from msg_analysis.theory.prediction import stationary_start_factor
 
@@ -36,7 +36,7 @@ def assert_contains(document, golden, path=""):
 
 @pytest.mark.parametrize("name", ["line_ring", "tracking", "discrete", "air"])
 def test_golden(name):
-    document = predict(ValidExperiment.load(GOLDEN / f"{name}.yaml")).to_json()
+    document = predict(Experiment.load(GOLDEN / f"{name}.yaml")).to_json()
     assert_contains(document, json.loads((GOLDEN / f"{name}.predict.json").read_text()))
     json.dumps(document, allow_nan=False)
 
@@ -97,7 +97,7 @@ def test_graphs_that_do_not_keep_agents_together_have_no_static_baseline() -> No
 
 
 def test_start_factor_is_the_symmetric_root_of_the_conditional_covariance():
-    e = ValidExperiment.load(GOLDEN / "tracking.yaml")
+    e = Experiment.load(GOLDEN / "tracking.yaml")
     golden = json.loads((GOLDEN / "tracking.predict.json").read_text())
     for mode in range(3):
         factor = stationary_start_factor(e, mode)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from experiments import ValidExperiment, predict, simulate
+from experiments import Experiment, predict, simulate
 from msg_analysis.errors import InputError
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.time_mean_variance import mean_variance
@@ -15,12 +15,12 @@ from msg_analysis.theory.time_mean_variance import mean_variance
 PATH, RING = {"path": [1, 2, 3]}, {"cycle": [1, 2, 3]}
 
 
-def experiment(graphs: dict[str, Any], rate: float = 0.7, **changes: Any) -> ValidExperiment:
+def experiment(graphs: dict[str, Any], rate: float = 0.7, **changes: Any) -> Experiment:
     names = list(graphs)
     switching = {"rates": {a: {b: rate} for a, b in itertools.pairwise([*names, names[0]])}} if len(names) > 1 else {}
     document: dict[str, Any] = {"name": "net", "graphs": graphs, "noise": {"process": [1.0, 0.5, 2.0]}}
     document |= {"run": {"dt": 0.15, "duration": 30, "replicas": 2}, "switching": switching} | changes
-    return ValidExperiment.parse({key: value for key, value in document.items() if value != {}})
+    return Experiment.parse({key: value for key, value in document.items() if value != {}})
 
 
 def by_brute_force(prediction: Prediction, patterns: list[list[tuple[float, np.ndarray]]]) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from switching_systems import LINE_RING, network, steady_of
 
-from experiments import ValidExperiment, predict
+from experiments import Experiment, predict
 from msg_analysis.errors import InputError
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory import rational_krylov, transient
@@ -79,7 +79,7 @@ def test_steps_are_the_plain_recursion(seed, m, n, kind):
     if kind == "loss":
         document = experiment.to_document()
         document["noise"]["loss"] = 0.2
-        experiment = ValidExperiment.parse(document)
+        experiment = Experiment.parse(document)
     prediction = predict(experiment)
     step = prediction.step
     random = np.random.default_rng(seed)
@@ -114,7 +114,7 @@ def test_steps_are_the_plain_recursion(seed, m, n, kind):
 
 
 def test_stationary_start_stays_and_long_times_are_the_steady_state():
-    experiment = ValidExperiment.parse(LINE_RING)
+    experiment = Experiment.parse(LINE_RING)
     system = systems.continuous(experiment)
     steady = steady_of(system)
     start = start_of(experiment, system, steady)
@@ -138,7 +138,7 @@ def test_stiff_systems(rate, gain):
         "noise": {"process": [1.0, 0.5, 2.0]},
         "run": {"dt": 1e-7, "duration": 1e-5},
     }
-    system = systems.continuous(ValidExperiment.parse(document))
+    system = systems.continuous(Experiment.parse(document))
     eye = np.eye(3)
     n, size = 2, 9
     flow, drift = np.zeros((2, n * size + n, n * size + n))
@@ -187,7 +187,7 @@ def test_sixty_agents_in_continuous_time():
     document = LINE_RING | {
         "graphs": {"line": {"path": list(range(1, m + 1))}, "ring": {"cycle": list(range(1, m + 1))}}
     }
-    experiment = ValidExperiment.parse(document)
+    experiment = Experiment.parse(document)
     system = systems.held(systems.continuous(experiment), 0)
     values = np.linalg.eigvalsh(experiment.graph_list[0].laplacian)[1:]
     times = np.array([0.0, 0.01, 1.0, 30.0, 1e4])
@@ -203,7 +203,7 @@ def test_sixty_agents_in_continuous_time():
 
 
 def test_uniform_grids_of_many_times():
-    system = systems.continuous(ValidExperiment.parse(LINE_RING))
+    system = systems.continuous(Experiment.parse(LINE_RING))
     steady, start = steady_of(system), point_start(system, np.arange(5.0))
     times = 0.1 * np.arange(301)
     found = transient.transient(system, start, times, steady)
@@ -214,7 +214,7 @@ def test_uniform_grids_of_many_times():
 
 @pytest.mark.parametrize("times", [[], [-1.0], [1.0, 0.5], [np.nan]])
 def test_times_that_are_none(times):
-    system = systems.continuous(ValidExperiment.parse(LINE_RING))
+    system = systems.continuous(Experiment.parse(LINE_RING))
     with pytest.raises(InputError, match="ascending"):
         transient.transient(system, point_start(system, np.zeros(5)), np.array(times))
 
@@ -222,7 +222,7 @@ def test_times_that_are_none(times):
 def test_delay_and_loss():
     """The mean after one step is that of W from the start (nobody has older values); the end is the prediction."""
     document = LINE_RING | {"noise": {"process": 1.0, "loss": 0.1, "delay": 2}}
-    experiment = ValidExperiment.parse(document)
+    experiment = Experiment.parse(document)
     prediction = predict(experiment)
     place = np.array([1.0, -2.0, 0.0, 4.0, 0.5])
     start = point_start(prediction.system, place, np.array([1.0, 0.0]))
@@ -235,7 +235,7 @@ def test_delay_and_loss():
 
 
 def test_memory_of_large_systems(monkeypatch):
-    system = systems.continuous(ValidExperiment.parse(LINE_RING))
+    system = systems.continuous(Experiment.parse(LINE_RING))
     monkeypatch.setattr(rational_krylov, "MAX_BYTES", 1.0)
     start, steady = point_start(system, np.zeros(5)), steady_of(system)
     with pytest.raises(InputError, match="GB in continuous time"):
@@ -243,7 +243,7 @@ def test_memory_of_large_systems(monkeypatch):
 
 
 def test_what_is_refused():
-    prediction = predict(ValidExperiment.parse(LINE_RING))
+    prediction = predict(Experiment.parse(LINE_RING))
     system, start = prediction.system, point_start(prediction.system, np.zeros(5))
     with pytest.raises(InputError, match="whole numbers of steps"):
         transient.transient(system, start, np.array([0.5]), prediction.steady)
@@ -258,7 +258,7 @@ def test_what_is_refused():
 @pytest.mark.parametrize("law", ["continuous", "steps"])
 @pytest.mark.parametrize("place", [np.zeros(5), np.array([3.0, 0.0, 0.0, 0.0, -3.0]), np.array([0.5, 0, 0, 0, -0.5])])
 def test_settling_time_is_the_last_crossing(law, place):
-    experiment = ValidExperiment.parse(LINE_RING)
+    experiment = Experiment.parse(LINE_RING)
     system = systems.continuous(experiment) if law == "continuous" else predict(experiment).system
     steady = steady_of(system)
     start = point_start(system, place, np.array([1.0, 0.0]))
@@ -279,7 +279,7 @@ def test_settling_time_is_the_last_crossing(law, place):
 def test_settling_of_one_pair_in_closed_form():
     """Two agents, one edge: the disagreement has variance (1 - exp(-4 t)) / 4, settled at log(20) / 4."""
     document = LINE_RING | {"graphs": {"pair": {"path": [1, 2]}}, "switching": {}}
-    system = systems.continuous(ValidExperiment.parse(document))
+    system = systems.continuous(Experiment.parse(document))
     steady = steady_of(system)
     assert settling_time(system, steady, point_start(system, np.zeros(2))) == pytest.approx(np.log(20) / 4, rel=1e-9)
     rates = asymptotic_rates(system)
@@ -288,7 +288,7 @@ def test_settling_of_one_pair_in_closed_form():
 
 
 def test_settled_from_the_start_and_slow_graphs():
-    experiment = ValidExperiment.parse(LINE_RING)
+    experiment = Experiment.parse(LINE_RING)
     system = systems.continuous(experiment)
     steady = steady_of(system)
     assert settling_time(system, steady, start_of(experiment, system, steady)) == 0.0

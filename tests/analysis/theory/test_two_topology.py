@@ -11,7 +11,7 @@ from digits import DIGITS, exactly, solve
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments import ValidExperiment, predict
+from experiments import Experiment, predict
 from msg_analysis.errors import InputError
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.moments import MomentSolver
@@ -51,7 +51,7 @@ def random_experiment(
         document["switching"] = {"transition": [[1 - q12, q12], [q21, 1 - q21]]}
     if problem == "tracking":
         document["leaders"] = {"agents": [1], "gain": gain}
-    return ValidExperiment.parse(document)
+    return Experiment.parse(document)
 
 
 def with_rate(system, rate):
@@ -201,7 +201,7 @@ def test_what_is_refused():
     document = random_experiment(1, 3).to_document()
     document["graphs"] = {"first": {"edges": [[1, 2]]}, "second": {"edges": [[2, 3]]}}
     with pytest.raises(InputError, match="graph 1 held fixed has no steady error"):
-        two_topology(systems.continuous(ValidExperiment.parse(document)))
+        two_topology(systems.continuous(Experiment.parse(document)))
     system = systems.continuous(random_experiment(1, 3))
     with pytest.raises(InputError, match="1 graphs, expected 2"):
         two_topology(systems.held(system, 0))

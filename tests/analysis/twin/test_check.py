@@ -6,29 +6,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import Trajectory, check, flipped, line_ring, simulate, stored
+from experiments import Run, check, flipped, line_ring, simulate, stored
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import in_file
 from msg_analysis.twin.check import Check
 
 
 @pytest.fixture(scope="module")
-def twin() -> Trajectory:
+def twin() -> Run:
     return simulate(line_ring(run={"seed": 5}))
 
 
 @pytest.fixture(scope="module")
-def noisy() -> Trajectory:
+def noisy() -> Run:
     """Values are published with noise, and messages lost."""
     return simulate(line_ring(noise={"broadcast": 0.2, "loss": 0.3}, run={"seed": 5}))
 
 
-def checked(run: Trajectory, directory: Path, **changes: object) -> Check:
+def checked(run: Run, directory: Path, **changes: object) -> Check:
     """Of a bag of the run with these changes."""
     return check(stored(dataclasses.replace(run, **changes), directory))
 
 
-def test_a_long_run(tmp_path: Path, twin: Trajectory, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_run(tmp_path: Path, twin: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Logged and computed states are in files and compared in pieces, here of ten steps."""
     monkeypatch.setattr(arrays, "LARGE", 1)
     monkeypatch.setattr(arrays, "BLOCK_NUMBERS", 60)
@@ -52,7 +52,7 @@ def test_equal(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("where", [(0, 0, 0), (17, 2, 1), (400, 1, 0)])
-def test_one_bit(twin: Trajectory, tmp_path: Path, where: tuple[int, int, int]) -> None:
+def test_one_bit(twin: Run, tmp_path: Path, where: tuple[int, int, int]) -> None:
     step, agent, replica = where
     changed = flipped(twin.states, *where)
     assert checked(twin, tmp_path, states=changed).difference == (
@@ -61,12 +61,12 @@ def test_one_bit(twin: Trajectory, tmp_path: Path, where: tuple[int, int, int]) 
     )
 
 
-def test_the_first_of_several_is_named(twin: Trajectory, tmp_path: Path) -> None:
+def test_the_first_of_several_is_named(twin: Run, tmp_path: Path) -> None:
     changed = flipped(flipped(flipped(twin.states, 30, 0, 1), 29, 2, 0), 29, 1, 1)
     assert checked(twin, tmp_path, states=changed).difference.startswith("agent 2 at step 29, replica 2:")
 
 
-def test_wrong_graph(twin: Trajectory, tmp_path: Path) -> None:
+def test_wrong_graph(twin: Run, tmp_path: Path) -> None:
     modes, names = twin.modes.copy(), ["line", "ring"]
     modes[40:50] = 1 - modes[40:50]
     expected = f"graph of step 40: logged {names[modes[40]]}, the seed gives {names[twin.modes[40]]}"
@@ -74,7 +74,7 @@ def test_wrong_graph(twin: Trajectory, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("state_step", "first"), [(40, "agent 1"), (41, "graph")])
-def test_state_or_graph_whichever_came_first(twin: Trajectory, tmp_path: Path, state_step: int, first: str) -> None:
+def test_state_or_graph_whichever_came_first(twin: Run, tmp_path: Path, state_step: int, first: str) -> None:
     """x(40) is older than the choice of g(40), x(41) comes out of it."""
     modes = twin.modes.copy()
     modes[40] = 1 - modes[40]
@@ -82,7 +82,7 @@ def test_state_or_graph_whichever_came_first(twin: Trajectory, tmp_path: Path, s
     assert outcome.difference.startswith(first)
 
 
-def test_missing_states_are_counted_and_do_not_differ(twin: Trajectory, noisy: Trajectory, tmp_path: Path) -> None:
+def test_missing_states_are_counted_and_do_not_differ(twin: Run, noisy: Run, tmp_path: Path) -> None:
     states = twin.states.copy()
     states[100:, 1] = np.nan
     outcome = checked(twin, tmp_path, states=states)
@@ -93,12 +93,12 @@ def test_missing_states_are_counted_and_do_not_differ(twin: Trajectory, noisy: T
     assert (outcome.difference, outcome.missing) == (None, 101 + 51)
 
 
-def test_another_seed_differs_at_once(twin: Trajectory, tmp_path: Path) -> None:
+def test_another_seed_differs_at_once(twin: Run, tmp_path: Path) -> None:
     other = simulate(twin.record.experiment.with_run(seed=6))
     assert checked(twin, tmp_path, states=other.states).difference.startswith("agent 1 at step 0")
 
 
-def test_published(noisy: Trajectory, tmp_path: Path) -> None:
+def test_published(noisy: Run, tmp_path: Path) -> None:
     published = noisy.published.copy()
     published[30, 1, 1] = np.nextafter(published[30, 1, 1], 9.0)
     published[31, 0] += 1.0
@@ -108,7 +108,7 @@ def test_published(noisy: Trajectory, tmp_path: Path) -> None:
     )
 
 
-def test_losses(noisy: Trajectory, tmp_path: Path) -> None:
+def test_losses(noisy: Run, tmp_path: Path) -> None:
     """Step 50 leads to x(51). Agent 2 hears agents 1 and 3 in both graphs."""
     lost, states = noisy.lost.copy(), noisy.states.copy()
     lost[50, 1, 1] ^= True

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import Completeness, Trajectory, ValidExperiment, check, flipped, new_record, stored
+from experiments import Completeness, Experiment, Run, check, flipped, new_record, stored
 from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK
 from msg_analysis.arithmetic.update_law import from_payload, to_payload
 from msg_analysis.model.agent_law import agent_law
@@ -31,7 +31,7 @@ DOCUMENT: dict[str, Any] = {
 }
 
 
-def emulate(experiment: ValidExperiment, seed: int) -> Trajectory:
+def emulate(experiment: Experiment, seed: int) -> Run:
     """Agents step late by chance, hear late by chance, learn of the graph late by chance."""
     record, model = new_record(experiment), build_step_model(experiment)
     modes = mode_path(experiment, model.initial)
@@ -69,22 +69,22 @@ def emulate(experiment: ValidExperiment, seed: int) -> Trajectory:
         drive = noise.block(i, k // STEPS_PER_BLOCK)[mode][k % STEPS_PER_BLOCK] + model.offsets[mode, i]
         states[k + 1, i] = total + drive
     count = (steps + 1) * agents
-    return Trajectory(record, states, modes, Completeness(count, count, 0), agent_modes, used=used, made=made)
+    return Run(record, states, modes, Completeness(count, count, 0), agent_modes, used=used, made=made)
 
 
 @pytest.fixture(scope="module")
-def run() -> Trajectory:
-    return emulate(ValidExperiment.parse(DOCUMENT), 1)
+def run() -> Run:
+    return emulate(Experiment.parse(DOCUMENT), 1)
 
 
-def test_equal(run: Trajectory, tmp_path: Path) -> None:
+def test_equal(run: Run, tmp_path: Path) -> None:
     assert (run.agent_modes[1:] != run.modes[:, None]).any()
     outcome = check(stored(run, tmp_path))
     assert (outcome.difference, outcome.missing, outcome.compared) == (None, 0, 4 * 401)
 
 
 @pytest.mark.parametrize("step", [0, 1, 300, 400])
-def test_the_last_bit(run: Trajectory, tmp_path: Path, step: int) -> None:
+def test_the_last_bit(run: Run, tmp_path: Path, step: int) -> None:
     states = flipped(run.states, step, 2, 1)
     difference = check(stored(dataclasses.replace(run, states=states), tmp_path)).difference
     assert difference == (
@@ -93,14 +93,14 @@ def test_the_last_bit(run: Trajectory, tmp_path: Path, step: int) -> None:
     )
 
 
-def test_something_else_used(run: Trajectory, tmp_path: Path) -> None:
+def test_something_else_used(run: Run, tmp_path: Path) -> None:
     used = run.used.copy()
     used[200, 1, 0] -= 1
     difference = check(stored(dataclasses.replace(run, used=used), tmp_path)).difference
     assert difference.startswith("agent 2 at step 201, replica 1: logged")
 
 
-def test_used_before_it_was_made(run: Trajectory, tmp_path: Path) -> None:
+def test_used_before_it_was_made(run: Run, tmp_path: Path) -> None:
     """By agent 2, who hears agent 1 in both graphs, at least."""
     made = run.made.copy()
     sent = run.used[200, 1, 0]
@@ -114,14 +114,14 @@ def test_used_before_it_was_made(run: Trajectory, tmp_path: Path) -> None:
     )
 
 
-def test_another_graph(run: Trajectory, tmp_path: Path) -> None:
+def test_another_graph(run: Run, tmp_path: Path) -> None:
     modes = run.modes.copy()
     modes[100:] = 1 - modes[100:]
     difference = check(stored(dataclasses.replace(run, modes=modes), tmp_path)).difference
     assert difference.startswith("graph of step 100: logged ")
 
 
-def test_gaps(run: Trajectory, tmp_path: Path) -> None:
+def test_gaps(run: Run, tmp_path: Path) -> None:
     """What cannot be computed for want of something is missing, not different; what comes after it is checked."""
     states = run.states.copy()
     states[50, 1] = np.nan
@@ -133,10 +133,10 @@ def test_gaps(run: Trajectory, tmp_path: Path) -> None:
     assert difference.startswith("agent 4 at step 390, replica 1")
 
 
-def test_each_step_is_that_of_the_agent(run: Trajectory) -> None:
+def test_each_step_is_that_of_the_agent(run: Run) -> None:
     """Whatever was logged: any states, graphs and values used, old or lost, some missing, with noise on the air."""
     noise = {"process": 1.0, "broadcast": 0.2, "link": 0.3, "loss": 0.2}
-    record = new_record(ValidExperiment.parse(DOCUMENT | {"noise": noise}))
+    record = new_record(Experiment.parse(DOCUMENT | {"noise": noise}))
     random, (count, m, replicas) = np.random.default_rng(7), run.states.shape
     states, published = random.normal(size=(2, count, m, replicas))
     states[random.random((count, m)) < 0.05] = np.nan

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from links_by_hand import assert_by_hand
 
-from experiments import Trajectory, ValidExperiment, check, claimed, predict, simulate, stored
+from experiments import Experiment, Run, check, claimed, predict, simulate, stored
 from msg_analysis.model.agent_law import agent_law
 from msg_analysis.model.phases import phases
 from msg_analysis.model.reception import LOST
@@ -55,7 +55,7 @@ LAWS: dict[str, dict[str, Any]] = {
 PACES = ("lockstep", "realtime")
 
 
-def experiment(law: str, air: str, pace: str = "lockstep", **run: Any) -> ValidExperiment:
+def experiment(law: str, air: str, pace: str = "lockstep", **run: Any) -> Experiment:
     document: dict[str, Any] = {
         "name": "links",
         "agents": 4,
@@ -67,11 +67,11 @@ def experiment(law: str, air: str, pace: str = "lockstep", **run: Any) -> ValidE
     dt = 1.0 if discrete else 0.05
     times = {"dt": dt, "duration": 340 * dt, "replicas": 2, "seed": 5, "pace": pace, "start": [1.0, -2.0, 0.5, 3.0]}
     noise = {"process": document.pop("process", 0.5), **AIRS[air]}
-    return ValidExperiment.parse(document | {"switching": chain, "noise": noise, "run": times | run})
+    return Experiment.parse(document | {"switching": chain, "noise": noise, "run": times | run})
 
 
 @functools.cache
-def run(law: str, air: str, pace: str = "lockstep") -> Trajectory:
+def run(law: str, air: str, pace: str = "lockstep") -> Run:
     """Of the twin; made once for all tests that only look at it."""
     return simulate(experiment(law, air, pace))
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import Observation, ValidExperiment, check, compare, flipped, line_ring, new_record, simulate, stored
+from experiments import Experiment, Observation, check, compare, flipped, line_ring, new_record, simulate, stored
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import in_file
 from msg_analysis.model.graph_path import mode_path
@@ -35,7 +35,7 @@ RUNS: dict[str, dict[str, Any]] = {
 }
 
 
-def experiment(case: str, steps: int, replicas: int = 2) -> ValidExperiment:
+def experiment(case: str, steps: int, replicas: int = 2) -> Experiment:
     changes = RUNS[case]
     run = {"duration": 0.05 * steps, "replicas": replicas, "seed": 5} | changes.get("run", {})
     return line_ring(5, **changes | {"run": run})

@@ -13,7 +13,7 @@ import yaml
 from processors import another_processor
 
 import experiments
-from experiments import RunRecord, ValidExperiment, new_record, read_bag, simulate, write_trajectory
+from experiments import Experiment, RunRecord, new_record, read_bag, simulate, write_trajectory
 from msg_analysis.errors import InputError
 from msg_analysis.twin import simulate as twin_start
 
@@ -38,9 +38,9 @@ CASES: dict[str, dict[str, Any]] = {
 WRITE = """
 import sys
 from pathlib import Path
-from experiments import ValidExperiment, simulate, write_trajectory
+from experiments import Experiment, simulate, write_trajectory
 for file in map(Path, sys.argv[1:]):
-    write_trajectory(simulate(ValidExperiment.load(file)), file.with_suffix(""))
+    write_trajectory(simulate(Experiment.load(file)), file.with_suffix(""))
 """
 
 
@@ -57,7 +57,7 @@ def test_a_run_is_the_same_on_another_processor(tmp_path: Path) -> None:
     environment = os.environ | other | {"PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", WRITE, *files], env=environment, check=True)
     for file in files:
-        theirs, ours = read_bag(file.with_suffix("")), simulate(ValidExperiment.load(file))
+        theirs, ours = read_bag(file.with_suffix("")), simulate(Experiment.load(file))
         assert np.array_equal(theirs.states, ours.states), file.stem
         assert np.array_equal(theirs.modes, ours.modes), file.stem
         again = simulate(theirs.record.experiment, record=theirs.record)
@@ -72,7 +72,7 @@ def test_a_long_past_is_replaced_by_a_rounded_start(tmp_path: Path, monkeypatch:
     environment = os.environ | other | {"PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", code, file], env=environment, check=True)
     monkeypatch.setattr(twin_start, "MAX_PAST", 0)
-    start = new_record(ValidExperiment.load(file)).start
+    start = new_record(Experiment.load(file)).start
     assert np.array_equal(read_bag(file.with_suffix("")).record.start, start)
     assert (start[2] == 2.0).all()  # the grounded leader
     assert len(np.unique(start)) == 1 + 5 * 2
@@ -80,7 +80,7 @@ def test_a_long_past_is_replaced_by_a_rounded_start(tmp_path: Path, monkeypatch:
 
 @pytest.mark.parametrize("case", ["discrete", "discrete tracking", "a protocol"])
 def test_the_record_carries_the_matrices(case: str, tmp_path: Path) -> None:
-    record = new_record(ValidExperiment.parse(document(CASES[case])))
+    record = new_record(Experiment.parse(document(CASES[case])))
     write_trajectory(simulate(record.experiment, record=record), tmp_path / "bag")
     again = read_bag(tmp_path / "bag").record
     assert np.array_equal(again.matrices.weights, record.matrices.weights)
@@ -94,7 +94,7 @@ def test_the_record_carries_the_matrices(case: str, tmp_path: Path) -> None:
 
 def test_what_follows_from_the_experiment_is_not_in_the_record() -> None:
     """So a record that is changed by hand, as in the tutorial, is a run of the changed experiment."""
-    record = new_record(ValidExperiment.parse(document(CASES["consensus"])))
+    record = new_record(Experiment.parse(document(CASES["consensus"])))
     assert "step" not in json.loads(record.to_json())
     louder = json.loads(record.to_json())
     louder["experiment"]["noise"]["process"] = 2.0
@@ -115,12 +115,12 @@ def test_what_follows_from_the_experiment_is_not_in_the_record() -> None:
     ],
 )
 def test_wrong_matrices(change: dict[str, Any], complaint: str) -> None:
-    text = json.loads(new_record(ValidExperiment.parse(document(CASES["discrete"]))).to_json()) | {"step": change}
+    text = json.loads(new_record(Experiment.parse(document(CASES["discrete"]))).to_json()) | {"step": change}
     with pytest.raises(InputError, match=complaint):
         RunRecord.from_json(json.dumps(text), "here")
 
 
 def test_a_grounded_leader_starts_on_the_reference() -> None:
-    record = new_record(ValidExperiment.parse(document(CASES["grounded"])))
+    record = new_record(Experiment.parse(document(CASES["grounded"])))
     assert (record.start[2] == 2.0).all()
     assert len(np.unique(record.start)) == 1 + 5 * 2

@@ -7,7 +7,7 @@ import pytest
 import scipy.stats
 from tests.analysis.twin.test_links import LAWS, experiment
 
-from experiments import Trajectory, ValidExperiment, line_ring, new_record, predict, simulate
+from experiments import Experiment, Run, line_ring, new_record, predict, simulate
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.step_model import build_step_model
 
@@ -82,15 +82,15 @@ def test_another_agent_changes_nobody_elses_noise() -> None:
         "name": "large",
         "graphs": {"a": {"arcs": [[1, 2], [2, 1], [2, 3]]}, "b": {"arcs": [[1, 2], [2, 1], [3, 4]]}},
     }
-    two = simulate(ValidExperiment.parse(small | {"run": run}))
-    four = simulate(ValidExperiment.parse(large | {"run": run | {"start": [1.0, 2.0, 0.0, 0.0]}}))
+    two = simulate(Experiment.parse(small | {"run": run}))
+    four = simulate(Experiment.parse(large | {"run": run | {"start": [1.0, 2.0, 0.0, 0.0]}}))
     assert np.array_equal(two.states, four.states[:, :2])
 
 
 def test_the_air_depends_on_nothing_else() -> None:
     """Other replicas, weights, process noise, another agent: the same messages are lost, in the same steps."""
 
-    def flown(agents: int = 3, **changes: Any) -> Trajectory:
+    def flown(agents: int = 3, **changes: Any) -> Run:
         graphs = {key: {"path": list(range(1, agents + 1))} for key in "ab"}
         run = {"dt": 0.05, "replicas": 1, "seed": 5, "start": "zero"} | changes.pop("run", {})
         return simulate(line_ring(agents, **{"graphs": graphs, "noise": AIR} | changes, run=run))

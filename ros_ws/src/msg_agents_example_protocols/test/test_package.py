@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from ament_index_python.packages import get_package_share_directory
 
-from msg_analysis.experiment.experiment import ValidExperiment
+from msg_analysis.experiment.experiment import Experiment
 
 EXPERIMENTS = Path(get_package_share_directory("msg_agents_example_protocols")) / "experiments"
 
@@ -19,4 +19,4 @@ EXPERIMENTS = Path(get_package_share_directory("msg_agents_example_protocols")) 
 @pytest.mark.parametrize("name", ["metropolis", "saturated", "integral_action"])
 def test_protocol(name: str) -> None:
     assert name in entry_points(group="msg_agents.protocols").names
-    ValidExperiment.load(EXPERIMENTS / f"{name}.yaml").require_available()
+    Experiment.load(EXPERIMENTS / f"{name}.yaml").require_available()
