@@ -16,8 +16,8 @@ from click.testing import CliRunner
 from pages import EXPERIMENTS, PAGES, PRINTING, ROOT, Shown, blocks, console, experiments, missing, typed
 
 from msg_agents.cli.main import main as agents
-from msg_analysis.api import Experiment
 from msg_analysis.cli.main import main as analysis
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import simulate
 
 PROGRAMS: dict[str, click.Group] = {"msg-agents": agents, "msg-analysis": analysis}
@@ -121,7 +121,7 @@ def compared(document: str) -> str:
     run = simulate(Experiment.parse(json.loads(document)))
     Path("twin").mkdir()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("msg_analysis.api.read_trajectory", lambda bag: run)
+        patch.setattr("msg_analysis.inference.pool.read_bag", lambda bag: run)
         return printed("msg-analysis compare twin")
 
 

@@ -28,7 +28,7 @@ from typing import Any
 PROGRAMS = {"msg-analysis": "msg_analysis.cli.main", "msg-agents": "msg_agents.cli.main"}
 PREPARED = (
     *PROGRAMS.values(),
-    "msg_analysis.api",
+    "msg_analysis.experiment.experiment",
     "msg_analysis.cli.console",
     "msg_analysis.common.text",
     "msg_analysis.report.documents",

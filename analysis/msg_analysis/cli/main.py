@@ -48,7 +48,7 @@ def main() -> None:
 @json_option
 def predict(experiment: Path, as_json: bool) -> None:
     """Predict the steady errors of EXPERIMENT, exactly."""
-    from msg_analysis.api import Experiment
+    from msg_analysis.experiment.experiment import Experiment
 
     document = Experiment.load(experiment).predict().to_json()
     if as_json:
@@ -78,7 +78,7 @@ def simulate(
     as_json: bool,
 ) -> None:
     """Simulate EXPERIMENT without ROS, write its bag and print the name of the bag."""
-    from msg_analysis.api import Experiment
+    from msg_analysis.experiment.experiment import Experiment
 
     loaded = Experiment.load(experiment)
     directory = out or Path(f"{loaded.name}_twin")
@@ -144,12 +144,12 @@ def leaders(
 
     The leaders that EXPERIMENT names are shown beside them.
     """
-    from msg_analysis.api import Experiment
     from msg_analysis.cli.console import SolveProgress
+    from msg_analysis.experiment.experiment import Experiment
 
     loaded = Experiment.load(experiment)
     with SolveProgress(loaded.name) as progress:
-        selection = loaded.select_leaders(
+        selection = loaded.leaders(
             count,
             method=method,  # type: ignore[arg-type]  # click has checked it
             law=law,  # type: ignore[arg-type]

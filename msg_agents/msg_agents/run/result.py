@@ -264,7 +264,6 @@ def conclude(result: RunResult, report: ReportWhen = "always") -> None:
         file = result.bag / REPORT_FILE
         write_report(
             comparison,
-            result.trajectory,
             file,
             restarts=result.restarts,
             strangers=result.strangers,

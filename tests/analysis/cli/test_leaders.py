@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from msg_analysis.api import Experiment
 from msg_analysis.cli import console
 from msg_analysis.cli import main as cli
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.paper import examples
 
 ROOT = Path(__file__).parents[3]

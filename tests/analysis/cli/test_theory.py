@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from msg_analysis import Experiment, Run, read_bag
+from msg_analysis import Experiment, read_bag
 from msg_analysis.cli import main as cli
 from msg_analysis.theory.prediction import predict
 
@@ -227,7 +227,7 @@ def test_spectrum_of_a_wrong_run(bag, tmp_path):
     """States that are 10 % too large: exit code 1."""
     run = read_bag(bag)
     wrong = tmp_path / "wrong"
-    Run.of(dataclasses.replace(run, states=1.1 * run.states)).save(wrong)
+    dataclasses.replace(run, states=1.1 * run.states).save(wrong)
     result = call("spectrum", wrong)
     assert result.exit_code == 1
     assert "The log disagrees with the predicted autocovariance" in result.stdout
@@ -244,7 +244,7 @@ def test_spectrum_of_runs_that_are_not_tested(tmp_path):
     states = Experiment.load(LINE_RING).with_run(duration=20).simulate()
     broken = states.states.copy()
     broken[150, 2] = np.nan
-    Run.of(dataclasses.replace(states, states=broken)).save(tmp_path / "torn")
+    dataclasses.replace(states, states=broken).save(tmp_path / "torn")
     result = call("spectrum", tmp_path / "torn", "--json")
     assert result.exit_code == 3
     assert json.loads(result.stdout)["log"]["steps"] == 149

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from msg_analysis.api import Experiment, Run, write_report
+from msg_analysis import Experiment, Run, write_report
 from msg_analysis.cli.main import main
 from msg_analysis.common.text import agent_name, agent_text, with_names
 from msg_analysis.sweep.grid import axis_name, column_words, load_sweep
@@ -71,7 +71,7 @@ def test_every_command(run: Run, tmp_path: Path) -> None:
 
 def test_notebooks_and_report(run: Run, tmp_path: Path) -> None:
     comparison = run.compare()
-    selection = run.experiment.select_leaders(1)
+    selection = run.experiment.leaders(1)
     prediction = run.experiment.predict()
     shown = (comparison, prediction, selection, prediction.emulated, prediction.continuous, prediction.static)
     for text in (one._repr_markdown_() for one in shown):
@@ -85,7 +85,7 @@ def test_notebooks_and_report(run: Run, tmp_path: Path) -> None:
 
 def test_stages_of_a_search(run: Run) -> None:
     stages: list[str] = []
-    run.experiment.select_leaders(2, method="swap", watch=lambda stage, *_: stages.append(stage))
+    run.experiment.leaders(2, method="swap", watch=lambda stage, *_: stages.append(stage))
     assert any(stage.startswith("greedy after agent ") for stage in stages)
     assert not any(character.isdigit() for stage in stages if "agent" in stage for character in stage)
 

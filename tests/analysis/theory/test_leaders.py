@@ -113,8 +113,8 @@ def test_leaders_of_the_experiment_do_not_count() -> None:
     tracking = Experiment.parse(random_document(1) | led)
     assert system_error(tracking, [0, 3]) == system_error(consensus, [0, 3])
     assert joint_robustness_centrality(tracking, [0, 3]) == 1.0 / system_error(consensus, [0, 3])
-    assert tracking.leaders is not None
-    assert tracking.leaders.agents == [2]
+    assert tracking.spec.leaders is not None
+    assert tracking.spec.leaders.agents == [2]
 
 
 def test_infinite_gain_is_the_limit_of_large_ones() -> None:
