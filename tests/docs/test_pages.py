@@ -149,6 +149,6 @@ def test_python_runs(name: str, workplace: Path, capsys: pytest.CaptureFixture[s
     shutil.copytree("line_ring_twin", "torn_bag")
     printed("msg-analysis export line_ring_twin --parquet --out line_ring_export")
     for block in blocks(ROOT / f"docs/{name}.md", "python"):
-        if "import conclude, run_network" not in block:  # tests/integration/test_python.py runs that
+        if "import run_network" not in block:  # tests/integration/test_python.py runs that
             exec(compile(block, name, "exec"), {})
     assert ("agrees" in capsys.readouterr().out) == (name not in {"leaders", "commands"})
