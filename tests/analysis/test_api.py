@@ -147,7 +147,7 @@ def test_transient(experiment: Experiment) -> None:
 def test_select_leaders(experiment: Experiment) -> None:
     selection = experiment.leaders(1)
     error, agents = selection.sets[0]
-    assert agents == (2,)  # from 0: the middle of the line
+    assert agents == (3,)  # the middle of the line
     assert selection.bound == error
 
 
@@ -203,7 +203,7 @@ def test_every_object_has_a_table_for_notebooks(experiment: Experiment, run: Run
 
 def test_plots(experiment: Experiment, run: Run) -> None:
     """What is drawn: numbers of the run, its comparison, its prediction; notebooks show it as PNG."""
-    figure = run.plot([4, 0], replica=3)
+    figure = run.plot([5, 1], replica=4)
     axes, band = figure.axes
     assert [line.get_label() for line in axes.lines] == ["agent 5", "agent 1"]
     assert np.array_equal(axes.lines[0].get_ydata(), run.states[:, 4, 3])
@@ -221,8 +221,8 @@ def test_plots(experiment: Experiment, run: Run) -> None:
     assert below.get_xlabel() == "agent"
     for each in (figure, comparison.plot(), prediction.plot()):
         assert each._repr_png_().startswith(b"\x89PNG")
-    for agents, replica in (([5], 0), ([], 0), (None, 16)):
-        with pytest.raises(InputError, match=r"agents: |replica: 16"):
+    for agents, replica in (([6], 1), ([0], 1), ([], 1), (None, 0), (None, 17)):
+        with pytest.raises(InputError, match=r"agents: |replica: (0|17)"):
             run.plot(agents, replica=replica)
 
 

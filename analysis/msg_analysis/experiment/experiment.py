@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.common.text import markdown_table, number_text
-from msg_analysis.errors import NotAvailableError
+from msg_analysis.common.text import listed, markdown_table, number_text
+from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment import graph_sources, loading, protocols, validation
 from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.graphs import Graph
@@ -141,7 +141,8 @@ class Experiment:
         Parameters
         ----------
         mapping
-            the document, as a YAML or JSON reader gives it
+            the document, as a YAML or JSON reader gives it; numbers of numpy, arrays, tuples and matrices of
+            scipy.sparse may stand for numbers and lists, and matrices and graphs of networkx for graphs
         source
             where it came from, for messages
         directory
@@ -221,9 +222,138 @@ class Experiment:
         ExperimentError
             the new document is not valid; names every mistake
         """
+        return self._with("run", changes)
+
+    def with_noise(self, **changes: Any) -> Self:
+        """The same experiment with other values of ``noise``, checked again.
+
+        Parameters
+        ----------
+        changes
+            keys of ``noise`` (process, loss, delay, ...) and their new values
+
+        Raises
+        ------
+        ExperimentError
+            the new document is not valid; names every mistake
+        """
+        return self._with("noise", changes)
+
+    def with_leaders(self, *agents: int | str, **changes: Any) -> Self:
+        """The same experiment with other leaders, checked again; without any argument, consensus.
+
+        Parameters
+        ----------
+        agents
+            the leaders, by number from 1 or name; none: those that there are
+        changes
+            ``gain`` and ``reference``; those that are not given stay
+
+        Raises
+        ------
+        ExperimentError
+            the new document is not valid; names every mistake
+        """
+        if not agents and not changes:
+            document = self.to_document() | {"problem": "consensus"}
+            document.pop("leaders", None)
+            return self.parse(document, source=self.source)
+        given = {"agents": list(agents), **changes} if agents else changes
+        return self._with("leaders", given, problem="tracking")
+
+    def with_graphs(self, graphs: Mapping[str, Any], *, switching: Mapping[str, Any] | None = None) -> Self:
+        """The same experiment with other graphs of the same agents, checked again.
+
+        Parameters
+        ----------
+        graphs
+            by name: as in a document, arrays, matrices of scipy.sparse or graphs of networkx
+        switching
+            section ``switching``; None: that of this experiment; {}: of a single graph
+
+        Raises
+        ------
+        ExperimentError
+            the new document is not valid; names every mistake
+        """
+        document = self.to_document() | {"graphs": graphs}
+        return self.parse(document if switching is None else document | {"switching": switching}, source=self.source)
+
+    def with_switching(self, **changes: Any) -> Self:
+        """The same experiment with other values of ``switching``, checked again.
+
+        Parameters
+        ----------
+        changes
+            keys of ``switching`` and their new values; of ``generator``, ``rates`` and ``transition``, a new one
+            replaces the one that there is
+
+        Raises
+        ------
+        ExperimentError
+            the new document is not valid; names every mistake
+        """
+        kinds = dict.fromkeys(("generator", "rates", "transition"))
+        if "generator" in changes or "transition" in changes:
+            kinds["scale"] = 1.0
+        return self._with("switching", (kinds if kinds.keys() & changes.keys() else {}) | changes)
+
+    def with_values(self, values: Mapping[str, Any]) -> Self:
+        """The same experiment with other values at any keys, checked again.
+
+        Parameters
+        ----------
+        values
+            by dotted key, as in sweep files: ``{"noise.process": 2.0, "switching.scale": 0.5}``
+
+        Raises
+        ------
+        ExperimentError
+            a key leads nowhere, or the new document is not valid; names every mistake
+        """
+        from msg_analysis.sweep.grid import KeyProblemError, put
+
         document = self.to_document()
-        document["run"].update(changes)
+        try:
+            for key, value in values.items():
+                document = put(document, key, value)
+        except KeyProblemError as error:
+            raise ExperimentError(self.source, [str(error).removeprefix("over.")]) from None
         return self.parse(document, source=self.source)
+
+    def _with(self, section: str, changes: Mapping[str, Any], **more: Any) -> Self:
+        """The same with other keys in a section, and ``more`` of the document; None removes a key."""
+        document = self.to_document() | more
+        values = {**document.get(section, {}), **changes}
+        document[section] = {key: value for key, value in values.items() if value is not None}
+        return self.parse(document, source=self.source)
+
+    def indices(self, agents: Iterable[int | str]) -> list[int]:
+        """Where agents are in arrays: ``run.states[:, experiment.indices(["north"])]``.
+
+        Parameters
+        ----------
+        agents
+            by number from 1, or by name
+
+        Returns
+        -------
+        list
+            of indices from 0
+
+        Raises
+        ------
+        InputError
+            there is no such agent
+        """
+        found = []
+        for agent in agents:
+            number = (self.names or []).index(agent) + 1 if agent in (self.names or []) else agent
+            if isinstance(number, str) or number != int(number) or not 1 <= number <= self.agents:
+                names = f", or one of the names {listed(self.names)}" if self.names else ""
+                raise InputError(f"agents: {show(agent)}: expected numbers from 1 to {self.agents}{names}")
+            found.append(int(number) - 1)
+        return found
 
     def predict(self) -> Prediction:
         """The exact steady second moments; see :func:`msg_analysis.theory.prediction.predict`.
@@ -410,7 +540,7 @@ class Experiment:
         Returns
         -------
         Selection
-            ``sets``: (system error, agents from 0), best first; ``present``: that of the experiment's own leaders
+            ``sets``: (system error, agents from 1), best first; ``present``: that of the experiment's own leaders
 
         Raises
         ------

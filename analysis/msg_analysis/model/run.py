@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ import numpy as np
 
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray, pieces, release
 from msg_analysis.common.text import markdown_table
+from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.reception import LOST, NOTHING
 from msg_analysis.model.run_record import RunRecord
@@ -188,15 +189,15 @@ class Run:
 
         return data_frame(self, table)
 
-    def plot(self, agents: Sequence[int] | None = None, *, replica: int = 0) -> Figure:
+    def plot(self, agents: Iterable[int | str] | None = None, *, replica: int = 1) -> Figure:
         """Draw the states of agents over time, and the graph of every step.
 
         Parameters
         ----------
         agents
-            indices from 0; None: the first eight
+            by number from 1 or name; None: the first eight
         replica
-            from 0
+            number from 1
 
         Returns
         -------
@@ -210,7 +211,9 @@ class Run:
         """
         from msg_analysis.report.figures import run_figure
 
-        return run_figure(self, agents, replica)
+        if not 1 <= replica <= self.experiment.run.replicas:
+            raise InputError(f"replica: {replica}: expected a number from 1 to {self.experiment.run.replicas}")
+        return run_figure(self, None if agents is None else self.experiment.indices(agents), replica - 1)
 
     def save(self, directory: str | Path, storage: Storage | None = None) -> Path:
         """Write the run as a bag with the topics and the layout of a network's.

@@ -40,7 +40,7 @@ def test_predictions_rates_and_leaders() -> None:
     for side, each in (("a", a), ("b", b)):
         error, agents = each.leaders(1).sets[0]
         best = found["leaders"][side]["best"]
-        assert (best["agents"], best["system_error"], best["gain"]) == ([agents[0] + 1], error, "inf")
+        assert (best["agents"], best["system_error"], best["gain"]) == (list(agents), error, "inf")
         assert found["leaders"][side]["agents"] is None
     json.dumps(found, allow_nan=False)
 
