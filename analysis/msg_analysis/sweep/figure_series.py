@@ -86,7 +86,7 @@ def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None, along:
         if column is None:  # nothing but failures
             names["value"] = wanted
         else:
-            raise InputError(f"--column {wanted}: not a column of numbers: expected one of {_offer(rows)}")
+            raise InputError(f"column {wanted}: not a column of numbers: expected one of {_offer(rows)}")
     several = several_values(sweep)
     along = along or next(iter(several), sweep.keys[0])
     others = [key for key in several if key != along] if sweep.spec.combine == "grid" else []

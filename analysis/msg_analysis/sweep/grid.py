@@ -239,7 +239,7 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
     lines = _spec_problems(spec)
     if lines:
         raise ExperimentError(str(path), lines)
-    return _plan(path, spec, base, directory, checked)
+    return points_of(path, spec, base, directory, checked)
 
 
 def _spec_problems(spec: SweepSpec) -> list[str]:
@@ -271,7 +271,7 @@ def _combinations(spec: SweepSpec) -> Iterator[dict[str, Any]]:
         yield dict(zip(spec.over, values, strict=True))
 
 
-def _plan(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
+def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
     combinations = list(_combinations(spec))
     wrong: dict[str, list[int]] = {}  # line: indices of the combinations that have it
     points: list[Point] = []
