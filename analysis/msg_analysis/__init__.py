@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from msg_analysis.inference.pool import compare
     from msg_analysis.model.run import Run
     from msg_analysis.report.page import write_report
-    from msg_analysis.sweep.in_python import Sweep, sweep
+    from msg_analysis.sweeps.in_python import Sweep, sweep
     from msg_analysis.theory.leaders import Selection
     from msg_analysis.theory.prediction import Moments, Prediction
     from msg_analysis.theory.spectrum import Spectrum
@@ -37,7 +37,7 @@ _MODULES = {
     "inference.pool": ("compare",),
     "model.run": ("Run",),
     "report.page": ("write_report",),
-    "sweep.in_python": ("Sweep", "sweep"),
+    "sweeps.in_python": ("Sweep", "sweep"),
     "theory.leaders": ("Selection",),
     "theory.prediction": ("Moments", "Prediction"),
     "theory.spectrum": ("Spectrum",),

@@ -38,12 +38,11 @@ def assert_agrees(*runs: Run | str | Path, level: float = 0.001) -> Comparison:
     """
     comparison = compare(*runs, level=level)
     if comparison.verdict != "agrees":
-        rejected = ", ".join(
-            f"{test.name} (adjusted p {test.p_adjusted:.3g})" for test in comparison.tests if test.rejected
-        )
-        causes = "; ".join(cause.words for cause in comparison.blame)
-        reason = (
-            comparison.unpredicted or rejected or f"{comparison.trajectory.completeness.missing} states are missing"
-        )
-        raise AssertionError(f"{comparison!r}: {'; '.join(filter(None, (reason, causes)))}")
+        rejected = [f"{test.name} (adjusted p {test.p_adjusted:.3g})" for test in comparison.tests if test.rejected]
+        missing = f"{comparison.trajectory.completeness.missing} states are missing"
+        reasons = [
+            comparison.unpredicted or ", ".join(rejected) or missing,
+            *(cause.words for cause in comparison.blame),
+        ]
+        raise AssertionError(f"{comparison!r}: {'; '.join(reasons)}")
     return comparison

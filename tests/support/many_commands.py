@@ -50,7 +50,7 @@ BY_COMMAND = {  # what takes long to import, and no other command needs
     "sweep": (
         "msg_analysis.report.sweep_figure",
         "msg_analysis.report.list_pages",
-        "msg_analysis.sweep.results",
+        "msg_analysis.sweeps.results",
     ),
 }
 CODE = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); import many_commands; many_commands.main()"

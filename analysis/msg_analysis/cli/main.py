@@ -34,7 +34,7 @@ from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
     from msg_analysis.bags.mcap_chunks import Compression
-    from msg_analysis.sweep.results import OtherSoftware
+    from msg_analysis.sweeps.results import OtherSoftware
 
 
 @click.group(cls=CommandGroup)
@@ -325,7 +325,7 @@ main.add_command(sweep.sweep)
 def schema(what: str) -> None:
     """Print the JSON Schema of experiment files, or of sweep files, for editors."""
     if what == "sweep":
-        from msg_analysis.sweep.sweep_file import json_schema
+        from msg_analysis.sweeps.sweep_file import json_schema
     else:
         from msg_analysis.experiment.experiment import json_schema
 

@@ -311,7 +311,7 @@ class Experiment:
         ExperimentError
             a key leads nowhere, or the new document is not valid; names every mistake
         """
-        from msg_analysis.sweep.grid import KeyProblemError, put
+        from msg_analysis.sweeps.grid import KeyProblemError, put
 
         document = self.to_document()
         try:

@@ -14,7 +14,7 @@ from msg_analysis import Experiment
 from msg_analysis.cli.main import main
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.examples import find, names, shows, text_of
-from msg_analysis.sweep.grid import load_sweep
+from msg_analysis.sweeps.grid import load_sweep
 
 OWN = {"name": "own", "graphs": {"line": {"path": [1, 2]}}}
 

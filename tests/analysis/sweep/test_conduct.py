@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 
 from msg_analysis.errors import InputError
-from msg_analysis.sweep import results as conducting
-from msg_analysis.sweep.figure_series import picture
-from msg_analysis.sweep.points import DONE, FAILED, Job, Outcome, evaluate
-from msg_analysis.sweep.results import JOURNAL, OutcomeStore, arrow_table, conduct, judge_sweep, rows_of
-from msg_analysis.sweep.workers import Lost, Workers
+from msg_analysis.sweeps import results as conducting
+from msg_analysis.sweeps.figure_series import picture
+from msg_analysis.sweeps.points import DONE, FAILED, Job, Outcome, evaluate
+from msg_analysis.sweeps.results import JOURNAL, OutcomeStore, arrow_table, conduct, judge_sweep, rows_of
+from msg_analysis.sweeps.workers import Lost, Workers
 from msg_analysis.twin.simulate import simulate
 
 
@@ -69,7 +69,7 @@ def test_ctrl_c_while_an_outcome_is_written(tmp_path: Path, monkeypatch: pytest.
         signal.raise_signal(signal.SIGINT)
         return written(descriptor, data)
 
-    monkeypatch.setattr("msg_analysis.sweep.results.os.write", write)
+    monkeypatch.setattr("msg_analysis.sweeps.results.os.write", write)
     with OutcomeStore.open(tmp_path) as store:
         with pytest.raises(KeyboardInterrupt):
             conduct([Job.of("predict", document(rate)) for rate in (0.5, 1.0)], store)
@@ -203,7 +203,7 @@ def test_what_kills_its_workers_is_given_up_and_the_others_are_done() -> None:
 def test_columns_and_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import yaml
 
-    from msg_analysis.sweep.grid import load_sweep
+    from msg_analysis.sweeps.grid import load_sweep
 
     in_this_process(monkeypatch)
     over = {"noise.process": [1.0, [1, 2, 1, 1, 1]], "switching.generator": [[[-1, 1], [1, -1]], [[-9, 9], [9, -9]]]}

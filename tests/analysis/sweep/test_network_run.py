@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from msg_analysis.errors import InputError
-from msg_analysis.sweep.points import Job, NetworkOptions, NetworkStoppedError, run_network
+from msg_analysis.sweeps.points import Job, NetworkOptions, NetworkStoppedError, run_network
 
 DOCUMENT = {"name": "two", "graphs": {"link": {"path": [1, 2]}}}
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from msg_analysis.errors import InputError
-from msg_analysis.sweep.points import DONE, Outcome
-from msg_analysis.sweep.results import JOURNAL, OutcomeStore
+from msg_analysis.sweeps.points import DONE, Outcome
+from msg_analysis.sweeps.results import JOURNAL, OutcomeStore
 
 
 def outcome(name: str, value: float = 1.0) -> Outcome:
@@ -53,7 +53,7 @@ def test_lines_that_are_none_are_counted(tmp_path: Path, line: bytes) -> None:
 
 
 def test_one_writer_at_a_time(tmp_path: Path) -> None:
-    code = f"from msg_analysis.sweep.results import OutcomeStore; OutcomeStore.open({str(tmp_path)!r})"
+    code = f"from msg_analysis.sweeps.results import OutcomeStore; OutcomeStore.open({str(tmp_path)!r})"
     with OutcomeStore.open(tmp_path):
         with pytest.raises(InputError, match="another sweep is writing"):
             OutcomeStore.open(tmp_path)

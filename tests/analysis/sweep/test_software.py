@@ -8,12 +8,12 @@ import sys
 from pathlib import Path
 
 import msg_analysis
-from msg_analysis.sweep.points import source_digest, source_files
+from msg_analysis.sweeps.points import source_digest, source_files
 
 PACKAGE = Path(msg_analysis.__file__).parent
 JOBS = """
 import sys
-from msg_analysis.sweep.jobs import evaluate, network_run
+from msg_analysis.sweeps.jobs import evaluate, network_run
 from msg_analysis.theory import prediction
 from msg_analysis.inference.verdict import compare
 from msg_analysis.twin import simulate

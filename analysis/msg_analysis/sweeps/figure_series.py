@@ -16,8 +16,8 @@ from typing import Any
 from msg_analysis.common.text import HALF_WIDTH_95
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.problems import show
-from msg_analysis.sweep.grid import Sweep, key_words
-from msg_analysis.sweep.results import Row, column_names, is_number
+from msg_analysis.sweeps.grid import Sweep, key_words
+from msg_analysis.sweeps.results import Row, column_names, is_number
 
 DEFAULT_COLUMN = "system_error"
 

@@ -30,8 +30,8 @@ from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import other_kind, read_yaml
 from msg_analysis.experiment.problems import ExperimentError, problem, show, translate
-from msg_analysis.sweep.points import Job, JobKind
-from msg_analysis.sweep.sweep_file import MOST_POINTS, SweepSpec
+from msg_analysis.sweeps.points import Job, JobKind
+from msg_analysis.sweeps.sweep_file import MOST_POINTS, SweepSpec
 
 _PART = re.compile(r"([^\[\]]+)|\[(\d+)\]")
 
@@ -272,6 +272,7 @@ def _combinations(spec: SweepSpec) -> Iterator[dict[str, Any]]:
 
 
 def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
+    """The sweep of a document; every point is checked. ExperimentError: all mistakes, with their points."""
     combinations = list(_combinations(spec))
     wrong: dict[str, list[int]] = {}  # line: indices of the combinations that have it
     points: list[Point] = []

@@ -17,10 +17,10 @@ from pydantic import ValidationError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import plain
 from msg_analysis.experiment.problems import ExperimentError, translate
-from msg_analysis.sweep import grid
-from msg_analysis.sweep.points import JobKind, evaluate, options
-from msg_analysis.sweep.results import Judgement, OutcomeStore, Row, arrow_table, conduct, judge_sweep, rows_of
-from msg_analysis.sweep.sweep_file import SweepSpec
+from msg_analysis.sweeps import grid
+from msg_analysis.sweeps.points import JobKind, evaluate, options
+from msg_analysis.sweeps.results import Judgement, OutcomeStore, Row, arrow_table, conduct, judge_sweep, rows_of
+from msg_analysis.sweeps.sweep_file import SweepSpec
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,10 +47,8 @@ class Sweep:
 
     def __repr__(self) -> str:
         verdict = f"; {self.judgement.verdict}" if self.judgement.verdict else ""
-        keys = ", ".join(self.points.keys)
-        return (
-            f"<Sweep of {self.points.experiment!r} over {keys}: {len(self.rows)} points, {self.points.kind}{verdict}>"
-        )
+        what = f"{', '.join(self.points.keys)}: {len(self.rows)} points, {self.points.kind}"
+        return f"<Sweep of {self.points.experiment!r} over {what}{verdict}>"
 
     def to_dataframe(self) -> pd.DataFrame:
         """The points as a data frame of pandas, a row each.
@@ -92,7 +90,7 @@ class Sweep:
 
         from msg_analysis.report.figures import STYLE
         from msg_analysis.report.sweep_figure import draw
-        from msg_analysis.sweep.figure_series import picture
+        from msg_analysis.sweeps.figure_series import picture
 
         with mpl.rc_context(STYLE):
             return draw(picture(self.points, self.rows, column), f"{self.points.experiment}: {self.points.kind}")
