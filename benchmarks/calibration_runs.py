@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import msg_analysis
-from msg_analysis.sweep.workers import Lost, Workers
+from msg_analysis.sweeps.workers import Lost, Workers
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ("model", "theory", "twin", "inference")

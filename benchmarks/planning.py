@@ -21,9 +21,9 @@ from typing import Any
 import any_time
 import numpy as np
 
-from msg_analysis.api import Experiment
 from msg_analysis.common.resources import count_cores
 from msg_analysis.common.text import percent
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.fault_power import Fault, fault_powers
 from msg_analysis.inference.observation import Observation

@@ -24,9 +24,9 @@ from typing import Any
 import networkx as nx
 import numpy as np
 
-from msg_analysis.sweep.grid import load_sweep
-from msg_analysis.sweep.points import Outcome, evaluate
-from msg_analysis.sweep.workers import Workers
+from msg_analysis.sweeps.grid import load_sweep
+from msg_analysis.sweeps.points import Outcome, evaluate
+from msg_analysis.sweeps.workers import Workers
 
 AGENTS, GRAPHS = 50, 3
 

@@ -5,7 +5,7 @@
 
     from msg_analysis import Experiment, compare, read_bag
 
-The names are those of ``msg_analysis.api``. Each is imported on first access: a program loads only what it uses.
+Each name is imported on first access: a program loads only what it uses.
 """
 
 from __future__ import annotations
@@ -13,23 +13,37 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from msg_analysis.api import (
-        BagError,
-        Comparison,
-        Experiment,
-        ExperimentError,
-        InputError,
-        Moments,
-        NotAvailableError,
-        Prediction,
-        Run,
-        Selection,
-        Transient,
-        compare,
-        read_bag,
-        write_report,
-    )
+    from msg_analysis.bags.reading import read_bag
     from msg_analysis.common.version import __version__ as __version__
+    from msg_analysis.errors import BagError, InputError, NotAvailableError
+    from msg_analysis.experiment.experiment import Experiment
+    from msg_analysis.experiment.problems import ExperimentError
+    from msg_analysis.inference.comparison import Comparison
+    from msg_analysis.inference.pool import compare
+    from msg_analysis.model.run import Run
+    from msg_analysis.report.page import write_report
+    from msg_analysis.sweeps.in_python import Sweep, sweep
+    from msg_analysis.theory.leaders import Selection
+    from msg_analysis.theory.prediction import Moments, Prediction
+    from msg_analysis.theory.spectrum import Spectrum
+    from msg_analysis.theory.transient import Transient
+
+_MODULES = {
+    "bags.reading": ("read_bag",),
+    "errors": ("BagError", "InputError", "NotAvailableError"),
+    "experiment.experiment": ("Experiment",),
+    "experiment.problems": ("ExperimentError",),
+    "inference.comparison": ("Comparison",),
+    "inference.pool": ("compare",),
+    "model.run": ("Run",),
+    "report.page": ("write_report",),
+    "sweeps.in_python": ("Sweep", "sweep"),
+    "theory.leaders": ("Selection",),
+    "theory.prediction": ("Moments", "Prediction"),
+    "theory.spectrum": ("Spectrum",),
+    "theory.transient": ("Transient",),
+}
+_PLACES = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [
     "BagError",
@@ -42,23 +56,24 @@ __all__ = [
     "Prediction",
     "Run",
     "Selection",
+    "Spectrum",
+    "Sweep",
     "Transient",
     "compare",
     "read_bag",
+    "sweep",
     "write_report",
 ]
 
 
 def __getattr__(name: str) -> Any:
+    from importlib import import_module
+
     if name == "__version__":
-        from msg_analysis.common import version
-
-        return version.__version__
-    if name not in __all__:
+        return import_module("msg_analysis.common.version").__version__
+    if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from msg_analysis import api
-
-    return getattr(api, name)
+    return getattr(import_module(f"msg_analysis.{_PLACES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -9,7 +9,7 @@ import signal
 from enum import IntEnum
 
 
-class InputError(Exception):
+class InputError(ValueError):
     """Bad input. The message names the key or file, the value, what was expected and what to do. Exit code 2."""
 
 

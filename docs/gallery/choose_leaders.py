@@ -16,10 +16,10 @@ experiment = Experiment.parse(
 )
 best = []
 for count in range(1, 5):
-    selection = experiment.select_leaders(count)
+    selection = experiment.leaders(count)
     error, leaders = selection.sets[0]
     best.append(error)
-    print(f"{count}: agents {', '.join(str(i + 1) for i in leaders)}, system error {error:.3f}")
+    print(f"{count}: agents {', '.join(map(str, leaders))}, system error {error:.3f}")
 
 figure, axes = plt.subplots(figsize=(6, 3), layout="constrained")
 axes.plot(range(1, 5), best, marker="o")

@@ -3,9 +3,7 @@
 
 """ROS 2 networks of agents under Markov-switching graphs.
 
-    from msg_agents import run_network
-
-The public names are imported at their first use.
+from msg_agents import run_network
 """
 
 from __future__ import annotations
@@ -13,32 +11,66 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from msg_agents.run.result import RunResult, conclude
-    from msg_agents.run.runner import run_network
+    from pathlib import Path
+
+    from msg_analysis import Experiment, Run
 
     __version__: str
 
-__all__ = ["RunResult", "conclude", "run_network"]
+__all__ = ["run_network"]
+
+
+def run_network(experiment: str | Path | Experiment, out: str | Path = "runs", **options: Any) -> Run:
+    """Run an experiment as a network of ROS 2 processes, as ``msg-agents run`` does, and read its bag.
+
+    To be called from the main thread, since it handles signals.
+
+    Parameters
+    ----------
+    experiment
+        the experiment, the path of its file, or the name of an example
+    out
+        directory in which the new bag is made
+    **options
+        those of :func:`msg_agents.run.runner.run_network`, such as ``domain`` and ``restarts``
+
+    Returns
+    -------
+    Run
+        as ``read_bag`` gives it; ``run.network`` has what only the network knows: ``bag``, ``restarts``, ``failures``,
+        ``wall_time``, ``rate``, ``strangers`` and more. A process that failed leaves states that are missing
+
+    Raises
+    ------
+    NotAvailableError, InputError
+        the experiment cannot be run, no domain is free, or a right is missing; nothing was started
+    BagError
+        nothing was recorded, or the bag cannot be read
+    KeyboardInterrupt
+        a signal has ended the run; its bag is kept
+    """
+    from dataclasses import replace
+    from pathlib import Path
+
+    from msg_agents.run.runner import run_network as run
+    from msg_analysis import BagError, Experiment
+
+    if not isinstance(experiment, Experiment):
+        experiment = Experiment.load(experiment)
+    result = run(experiment, Path(out), **options)
+    if result.interrupted:
+        raise KeyboardInterrupt(result.failures[0])
+    if result.trajectory is None:
+        raise BagError("; ".join(result.failures) or f"{result.bag}: no run was recorded")
+    return replace(result.trajectory, network=result)
 
 
 def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        return _version()
-    if name not in __all__:
+    if name != "__version__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from msg_agents.run import result, runner
-
-    return getattr(runner if name == "run_network" else result, name)
-
-
-def _version() -> str:
     from importlib.metadata import PackageNotFoundError, version
 
     try:
         return version("msg_agents")
     except PackageNotFoundError:  # run from a source tree, not installed
         return "0.0.0"
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})

@@ -13,8 +13,8 @@ import pytest
 from click.testing import CliRunner
 from programs import COMMANDS, PROGRAMS, command_of
 
-from msg_analysis.api import Experiment
 from msg_analysis.experiment.examples import names
+from msg_analysis.experiment.experiment import Experiment
 
 BIN = Path(sys.executable).parent
 PAIR = {

@@ -18,7 +18,16 @@ from programs import COMMANDS, PROGRAMS, command_of, context_of
 DOCS = Path(__file__).parents[2] / "docs"
 HEAVY = (
     *("numpy", "scipy", "networkx", "pydantic", "matplotlib", "rich", "jinja2", "yaml", "mcap", "zstandard", "lz4"),
-    *("rclpy", "dask", "distributed", "pyarrow", "bokeh", "pandas", "msg_analysis.api", "msg_agents.run.runner"),
+    *(
+        "rclpy",
+        "dask",
+        "distributed",
+        "pyarrow",
+        "bokeh",
+        "pandas",
+        "msg_analysis.experiment.experiment",
+        "msg_agents.run.runner",
+    ),
 )
 METAVARS = {  # of options that are called the same, wherever they are
     "--seed": {"N"},

@@ -19,7 +19,7 @@ import many_commands
 import pytest
 from programs import COMMANDS, command_of, without_progress
 
-from msg_analysis.api import Experiment
+from msg_analysis.experiment.experiment import Experiment
 
 ROOT = Path(__file__).parents[2]
 LINE_RING = ROOT / "tests/data/golden/line_ring.yaml"

@@ -16,7 +16,6 @@ from click.testing import CliRunner
 from pages import EXPERIMENTS, PAGES, PRINTING, ROOT, Shown, blocks, console, experiments, missing, typed
 
 from msg_agents.cli.main import main as agents
-from msg_analysis.api import Experiment
 from msg_analysis.cli.main import main as analysis
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import simulate
@@ -122,7 +121,7 @@ def compared(document: str) -> str:
     run = simulate(Experiment.parse(json.loads(document)))
     Path("twin").mkdir()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("msg_analysis.api.read_trajectory", lambda bag: run)
+        patch.setattr("msg_analysis.inference.pool.read_bag", lambda bag: run)
         return printed("msg-analysis compare twin")
 
 
@@ -150,6 +149,6 @@ def test_python_runs(name: str, workplace: Path, capsys: pytest.CaptureFixture[s
     shutil.copytree("line_ring_twin", "torn_bag")
     printed("msg-analysis export line_ring_twin --parquet --out line_ring_export")
     for block in blocks(ROOT / f"docs/{name}.md", "python"):
-        if "import conclude, run_network" not in block:  # tests/integration/test_python.py runs that
+        if "import run_network" not in block:  # tests/integration/test_python.py runs that
             exec(compile(block, name, "exec"), {})
     assert ("agrees" in capsys.readouterr().out) == (name not in {"leaders", "commands"})

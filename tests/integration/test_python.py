@@ -40,7 +40,7 @@ def test_what_the_page_says(tmp_path: Path) -> None:
 SEVERAL = """
 import os, sys
 from pathlib import Path
-from msg_agents import run_network
+from msg_agents.run.runner import run_network
 from msg_analysis import Experiment, read_bag
 from msg_analysis.twin.check import check
 

@@ -26,7 +26,7 @@ from typing import Any
 PROGRAMS = {"msg-analysis": "msg_analysis.cli.main", "msg-agents": "msg_agents.cli.main"}
 PREPARED = (
     *PROGRAMS.values(),
-    "msg_analysis.api",
+    "msg_analysis.experiment.experiment",
     "msg_analysis.cli.console",
     "msg_analysis.common.text",
     "msg_analysis.report.documents",
@@ -48,7 +48,7 @@ BY_COMMAND = {  # what takes long to import, and no other command needs
     "sweep": (
         "msg_analysis.report.sweep_figure",
         "msg_analysis.report.list_pages",
-        "msg_analysis.sweep.results",
+        "msg_analysis.sweeps.results",
     ),
 }
 CODE = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); import many_commands; many_commands.main()"

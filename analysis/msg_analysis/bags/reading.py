@@ -53,10 +53,21 @@ MOST_RECORDS = 100  # different run records that a bag may have: reading each ta
 
 
 def read_bag(path: str | Path, inventory: Inventory | None = None) -> Run:
-    """The run of a bag: of a directory or of one of its files; torn files are read up to the tear.
+    """The run in a bag of msg-agents, the twin or ``ros2 bag``; torn and damaged bags as far as possible.
 
-    ``inventory`` is filled with what the files hold, even if no run can be made of it. BagError: no bag, no run record,
-    or several runs; InputError: the run record is not valid.
+    Parameters
+    ----------
+    path
+        directory of a bag, or one of its files (.mcap, .db3)
+    inventory
+        filled with what the files hold, even if no run can be made of it
+
+    Raises
+    ------
+    BagError
+        not a bag, a bag without the run record, or with several runs
+    InputError
+        the run record in it is not valid
     """
     path = Path(path)
     contents = _Contents(path)

@@ -34,7 +34,7 @@ from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
     from msg_analysis.bags.mcap_chunks import Compression
-    from msg_analysis.sweep.results import OtherSoftware
+    from msg_analysis.sweeps.results import OtherSoftware
 
 
 @click.group(cls=CommandGroup)
@@ -48,7 +48,7 @@ def main() -> None:
 @json_option
 def predict(experiment: Path, as_json: bool) -> None:
     """Predict the steady errors of EXPERIMENT, exactly."""
-    from msg_analysis.api import Experiment
+    from msg_analysis.experiment.experiment import Experiment
 
     document = Experiment.load(experiment).predict().to_json()
     if as_json:
@@ -78,7 +78,7 @@ def simulate(
     as_json: bool,
 ) -> None:
     """Simulate EXPERIMENT without ROS, write its bag and print the name of the bag."""
-    from msg_analysis.api import Experiment
+    from msg_analysis.experiment.experiment import Experiment
 
     loaded = Experiment.load(experiment)
     directory = out or Path(f"{loaded.name}_twin")
@@ -144,12 +144,12 @@ def leaders(
 
     The leaders that EXPERIMENT names are shown beside them.
     """
-    from msg_analysis.api import Experiment
     from msg_analysis.cli.console import SolveProgress
+    from msg_analysis.experiment.experiment import Experiment
 
     loaded = Experiment.load(experiment)
     with SolveProgress(loaded.name) as progress:
-        selection = loaded.select_leaders(
+        selection = loaded.leaders(
             count,
             method=method,  # type: ignore[arg-type]  # click has checked it
             law=law,  # type: ignore[arg-type]
@@ -325,7 +325,7 @@ main.add_command(sweep.sweep)
 def schema(what: str) -> None:
     """Print the JSON Schema of experiment files, or of sweep files, for editors."""
     if what == "sweep":
-        from msg_analysis.sweep.sweep_file import json_schema
+        from msg_analysis.sweeps.sweep_file import json_schema
     else:
         from msg_analysis.experiment.experiment import json_schema
 

@@ -180,14 +180,16 @@ def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, level
 
     Exit code 0: agrees, 1: disagrees, 3: data incomplete, no verdict.
     """
-    from msg_analysis import api
     from msg_analysis.cli.console import WorkProgress
+    from msg_analysis.inference.pool import compare as compare_runs
 
     require_place(report)
     with WorkProgress() as progress, watched(progress):
-        comparison = api.compare(*bags, level=level)
+        comparison = compare_runs(*bags, level=level)
         if report:
-            api.write_report(comparison, report)
+            from msg_analysis.report.page import write_report
+
+            write_report(comparison, report)
     if as_json:
         print_json(comparison.to_json())
     else:

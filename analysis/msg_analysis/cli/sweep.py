@@ -17,11 +17,11 @@ from msg_analysis.cli.console import complain, examples, print_json, print_text,
 from msg_analysis.cli.options import PATH, YAML, json_option
 from msg_analysis.common.text import finite, print_note
 from msg_analysis.errors import ExitCode, InputError, killed_by
-from msg_analysis.sweep.points import require_libraries
+from msg_analysis.sweeps.points import require_libraries
 
 if TYPE_CHECKING:
-    from msg_analysis.sweep.points import Job
-    from msg_analysis.sweep.results import Conducted, OtherSoftware, OutcomeStore
+    from msg_analysis.sweeps.points import Job
+    from msg_analysis.sweeps.results import Conducted, OtherSoftware, OutcomeStore
 
 
 other_software = click.option(
@@ -81,8 +81,8 @@ def sweep(
         raise InputError("--workers: not together with --scheduler, which has workers of its own: give one of them")
     require_libraries()
     from msg_analysis.cli.console import SweepProgress
-    from msg_analysis.sweep.grid import load_sweep
-    from msg_analysis.sweep.workers import warm_up
+    from msg_analysis.sweeps.grid import load_sweep
+    from msg_analysis.sweeps.workers import warm_up
 
     with SweepProgress("checking the points") as checking:
 
@@ -95,9 +95,9 @@ def sweep(
     from msg_analysis.report.list_pages import write_sweep_page
     from msg_analysis.report.sweep_figure import write_figure
     from msg_analysis.report.tables import describe_sweep, print_sweep, summary
-    from msg_analysis.sweep.figure_series import picture
-    from msg_analysis.sweep.points import options
-    from msg_analysis.sweep.results import OutcomeStore, judge_sweep, rows_of, write_tables
+    from msg_analysis.sweeps.figure_series import picture
+    from msg_analysis.sweeps.points import options
+    from msg_analysis.sweeps.results import OutcomeStore, judge_sweep, rows_of, write_tables
 
     directory = out or Path("sweeps") / plan.name
     network = options(directory, keep_bags, workers or 1) if plan.kind == "network" else None
@@ -140,7 +140,7 @@ class _EndedBySignal(KeyboardInterrupt):
 
 
 def _end(number: int, _: object) -> None:
-    from msg_analysis.sweep.workers import ENDING
+    from msg_analysis.sweeps.workers import ENDING
 
     for each in ENDING:
         signal.signal(each, signal.SIG_IGN)
@@ -150,8 +150,8 @@ def _end(number: int, _: object) -> None:
 def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: OutcomeStore, **how: Any) -> Conducted:
     """Do all jobs, with progress on stderr; if interrupted, say what is kept and exit."""
     from msg_analysis.cli.console import SweepProgress
-    from msg_analysis.sweep.results import conduct
-    from msg_analysis.sweep.workers import ENDING, WorkersLostError
+    from msg_analysis.sweeps.results import conduct
+    from msg_analysis.sweeps.workers import ENDING, WorkersLostError
 
     if store.damaged:
         print_note(f"{store.directory}: {store.damaged} lines cannot be read: their points are computed again")
@@ -185,8 +185,8 @@ def emulate(
 ) -> int:
     """``msg-analysis figures --emulate``: run the networks, write the figures; returns the exit code."""
     from msg_analysis.paper.figures import disagreeing, measured, runs_of, summary, write_figures
-    from msg_analysis.sweep.points import FAILED, options
-    from msg_analysis.sweep.results import OutcomeStore
+    from msg_analysis.sweeps.points import FAILED, options
+    from msg_analysis.sweeps.results import OutcomeStore
 
     require_libraries()
     runs = [run for number in numbers for run in runs_of(number)]

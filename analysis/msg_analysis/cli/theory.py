@@ -152,7 +152,7 @@ def plan(
     experiment: Path, precision: str, budget: str | None, speed: float | None, level: float, as_json: bool
 ) -> None:
     """Plan runs of EXPERIMENT: length, replicas and time for a precision, and power for faults; nothing is run."""
-    from msg_analysis.api import Experiment
+    from msg_analysis.experiment.experiment import Experiment
 
     document = (
         Experiment.load(experiment)
@@ -211,8 +211,8 @@ def spectrum(context: click.Context, source: Path, figure: Path | None, level: f
 
     Exit code 0: predicted, or agrees, 1: disagrees, 3: data incomplete.
     """
-    from msg_analysis.api import Experiment
     from msg_analysis.errors import ExitCode
+    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report.documents import measure_spectrum, predicted_spectrum
 
     require_place(figure)

@@ -5,27 +5,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.common.text import markdown_table, number_text
-from msg_analysis.errors import NotAvailableError
+from msg_analysis.common.text import listed, markdown_table, number_text
+from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment import graph_sources, loading, protocols, validation
+from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.loading import Sections, other_kind, read_yaml
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
 from msg_analysis.experiment.network_spec import NoiseSpec, SwitchingSpec
 from msg_analysis.experiment.problems import ExperimentError, problem, show
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
-from msg_analysis.experiment.spec import ExperimentSpec, LeadersSpec, Purpose, RunSpec
+from msg_analysis.experiment.spec import ExperimentSpec, Purpose, RunSpec
 from msg_analysis.protocol import Network
 
-__all__ = ["ExperimentError", "Experiment", "json_schema"]
+if TYPE_CHECKING:
+    from msg_analysis.inference.sample_size import RunPlan
+    from msg_analysis.model.run import Run
+    from msg_analysis.model.run_record import RunRecord
+    from msg_analysis.theory.leader_search import SearchProgress
+    from msg_analysis.theory.leaders import SearchMethod, Selection, SelectionLaw
+    from msg_analysis.theory.prediction import Prediction
+    from msg_analysis.theory.spectrum import Spectrum
+    from msg_analysis.theory.transient import Transient, TransientLaw
+
+__all__ = ["Experiment", "ExperimentError", "json_schema"]
 
 MOST_STATES = 512
 """Of graph and links together, in a prediction with losses in bursts."""
@@ -97,21 +109,22 @@ class Experiment:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read an experiment file (YAML, of which JSON is a part).
+        """Read an experiment file (YAML, of which JSON is a part), or an example that is installed with this package.
 
         Parameters
         ----------
         path
-            of the file; paths in it are relative to its directory
+            of the file, or the name of an example, such as ``line_ring``; a file of that name in the current
+            directory, with or without ``.yaml``, wins. Paths in a file are relative to its directory
 
         Raises
         ------
         InputError
-            the file cannot be read or is not YAML
+            there is neither a file nor an example, the file cannot be read, or it is not YAML
         ExperimentError
             the experiment is not valid; names every mistake
         """
-        path = Path(path)
+        path = find(path)
         return cls.parse(read_yaml(path), source=str(path), directory=path.parent)
 
     @classmethod
@@ -128,7 +141,8 @@ class Experiment:
         Parameters
         ----------
         mapping
-            the document, as a YAML or JSON reader gives it
+            the document, as a YAML or JSON reader gives it; numbers of numpy, arrays, tuples and matrices of
+            scipy.sparse may stand for numbers and lists, and matrices and graphs of networkx for graphs
         source
             where it came from, for messages
         directory
@@ -208,9 +222,338 @@ class Experiment:
         ExperimentError
             the new document is not valid; names every mistake
         """
+        return self._with("run", changes)
+
+    def with_noise(self, **changes: Any) -> Self:
+        """The same experiment with other values of ``noise``, checked again.
+
+        Parameters
+        ----------
+        changes
+            keys of ``noise`` (process, loss, delay, ...) and their new values
+
+        Raises
+        ------
+        ExperimentError
+            the new document is not valid; names every mistake
+        """
+        return self._with("noise", changes)
+
+    def with_leaders(self, *agents: int | str, **changes: Any) -> Self:
+        """The same experiment with other leaders, checked again; without any argument, consensus.
+
+        Parameters
+        ----------
+        agents
+            the leaders, by number from 1 or name; none: those that there are
+        changes
+            ``gain`` and ``reference``; those that are not given stay
+
+        Raises
+        ------
+        ExperimentError
+            the new document is not valid; names every mistake
+        """
+        if not agents and not changes:
+            document = self.to_document() | {"problem": "consensus"}
+            document.pop("leaders", None)
+            return self.parse(document, source=self.source)
+        given = {"agents": list(agents), **changes} if agents else changes
+        return self._with("leaders", given, problem="tracking")
+
+    def with_graphs(self, graphs: Mapping[str, Any], *, switching: Mapping[str, Any] | None = None) -> Self:
+        """The same experiment with other graphs of the same agents, checked again.
+
+        Parameters
+        ----------
+        graphs
+            by name: as in a document, arrays, matrices of scipy.sparse or graphs of networkx
+        switching
+            section ``switching``; None: that of this experiment; {}: of a single graph
+
+        Raises
+        ------
+        ExperimentError
+            the new document is not valid; names every mistake
+        """
+        document = self.to_document() | {"graphs": graphs}
+        return self.parse(document if switching is None else document | {"switching": switching}, source=self.source)
+
+    def with_switching(self, **changes: Any) -> Self:
+        """The same experiment with other values of ``switching``, checked again.
+
+        Parameters
+        ----------
+        changes
+            keys of ``switching`` and their new values; of ``generator``, ``rates`` and ``transition``, a new one
+            replaces the one that there is
+
+        Raises
+        ------
+        ExperimentError
+            the new document is not valid; names every mistake
+        """
+        kinds = dict.fromkeys(("generator", "rates", "transition"))
+        if "generator" in changes or "transition" in changes:
+            kinds["scale"] = 1.0
+        return self._with("switching", (kinds if kinds.keys() & changes.keys() else {}) | changes)
+
+    def with_values(self, values: Mapping[str, Any]) -> Self:
+        """The same experiment with other values at any keys, checked again.
+
+        Parameters
+        ----------
+        values
+            by dotted key, as in sweep files: ``{"noise.process": 2.0, "switching.scale": 0.5}``
+
+        Raises
+        ------
+        ExperimentError
+            a key leads nowhere, or the new document is not valid; names every mistake
+        """
+        from msg_analysis.sweeps.grid import KeyProblemError, put
+
         document = self.to_document()
-        document["run"].update(changes)
+        try:
+            for key, value in values.items():
+                document = put(document, key, value)
+        except KeyProblemError as error:
+            raise ExperimentError(self.source, [str(error).removeprefix("over.")]) from None
         return self.parse(document, source=self.source)
+
+    def _with(self, section: str, changes: Mapping[str, Any], **more: Any) -> Self:
+        """The same with other keys in a section, and ``more`` of the document; None removes a key."""
+        document = self.to_document() | more
+        values = {**document.get(section, {}), **changes}
+        document[section] = {key: value for key, value in values.items() if value is not None}
+        return self.parse(document, source=self.source)
+
+    def indices(self, agents: Iterable[int | str]) -> list[int]:
+        """Where agents are in arrays: ``run.states[:, experiment.indices(["north"])]``.
+
+        Parameters
+        ----------
+        agents
+            by number from 1, or by name
+
+        Returns
+        -------
+        list
+            of indices from 0
+
+        Raises
+        ------
+        InputError
+            there is no such agent
+        """
+        found = []
+        for agent in agents:
+            number = (self.names or []).index(agent) + 1 if agent in (self.names or []) else agent
+            if isinstance(number, str) or number != int(number) or not 1 <= number <= self.agents:
+                names = f", or one of the names {listed(self.names)}" if self.names else ""
+                raise InputError(f"agents: {show(agent)}: expected numbers from 1 to {self.agents}{names}")
+            found.append(int(number) - 1)
+        return found
+
+    def predict(self) -> Prediction:
+        """The exact steady second moments; see :func:`msg_analysis.theory.prediction.predict`.
+
+        Returns
+        -------
+        Prediction
+            ``emulated`` (the steps of the run), ``continuous`` (the paper's law) and ``static`` (each graph held
+            fixed); the last two are None where they do not exist. Each has ``system_error``, ``node_errors`` (m,),
+            ``node_certainty`` (m,) and ``covariance`` (m, m)
+
+        Raises
+        ------
+        NotAvailableError
+            the experiment asks for something that cannot be predicted
+        InputError
+            too large, or without finite steady errors
+        """
+        from msg_analysis.theory.prediction import predict
+
+        self.require_available("predict")
+        return predict(self)
+
+    def transient(self, times: ArrayLike, *, law: TransientLaw = "emulated", unreduced: bool = False) -> Transient:
+        """The exact moments over time from the experiment's own start.
+
+        Parameters
+        ----------
+        times
+            (T,) ascending, >= 0 [units of simulated time]; multiples of ``run.dt`` in the emulated law
+        law
+            "emulated" (the steps of the run) or "continuous" (the paper's)
+        unreduced
+            consensus only: moments of the states themselves, which grow without bound, not of the disagreement
+
+        Returns
+        -------
+        Transient
+            ``times`` as given, ``system_error`` (T,), ``node_errors`` (T, m), ``mean`` (T, m)
+
+        Raises
+        ------
+        NotAvailableError
+            the experiment asks for something that cannot be predicted
+        InputError
+            invalid times, a law or ``unreduced`` that does not exist here, too large, or no finite steady errors
+        """
+        from msg_analysis.theory.transient import solve_transient
+
+        self.require_available("predict")
+        given = np.asarray(times, dtype=float)
+        return replace(solve_transient(self, given, law=law, unreduced=unreduced).course, times=given)
+
+    def simulate(
+        self, *, seed: int | None = None, duration: float | None = None, record: RunRecord | None = None
+    ) -> Run:
+        """Run the experiment without ROS: the offline twin of a network.
+
+        Parameters
+        ----------
+        seed
+            replaces ``run.seed``
+        duration
+            replaces ``run.duration`` [units of simulated time]
+        record
+            of a run to repeat; its experiment, seed and duration are then used instead of these. By default a new run
+
+        Returns
+        -------
+        Run
+            equal, to the last bit, to a network run in lockstep; in real time, to one with ideal timers and no delay
+
+        Raises
+        ------
+        ExperimentError
+            the seed or the duration is not valid
+        NotAvailableError
+            the experiment asks for something that runs do not have yet
+        InputError
+            the stationary start cannot be computed: too large, or no finite steady errors
+        """
+        from msg_analysis.twin.simulate import simulate
+
+        changes = {key: value for key, value in {"seed": seed, "duration": duration}.items() if value is not None}
+        experiment = self.with_run(**changes) if changes else self
+        experiment.require_available()
+        return simulate(experiment, record=record)
+
+    def plan(
+        self, precision: float = 0.01, *, seconds: float | None = None, rate: float | None = None, level: float = 0.01
+    ) -> RunPlan:
+        """What runs will show, before any run: length and replicas for a precision, time, power for faults.
+
+        Parameters
+        ----------
+        precision
+            half-width of the 95 % interval of the system error that is sought, relative to the predicted error; above
+            0, below 1
+        seconds
+            time budget [s] for which the best number of replicas is sought; None: none
+        rate
+            steps per second of a run in lockstep, such as ``msg-agents run`` prints; None: not known, or in real time,
+            where the clock says it
+        level
+            probability of a false "disagrees", all tests together; above 0, at most 0.5
+
+        Returns
+        -------
+        RunPlan
+            ``precision`` (standard error of any length, and the reverse), ``powers`` (one per fault), ``to_json()``
+
+        Raises
+        ------
+        NotAvailableError
+            the experiment asks for something that cannot be predicted
+        InputError
+            an argument that is not valid, a system error of 0, or one whose variance is not finite
+        """
+        from msg_analysis.inference.sample_size import plan
+
+        return plan(self.predict(), precision, seconds=seconds, rate=rate, level=level)
+
+    def spectrum(self, lags: ArrayLike | None = None, frequencies: ArrayLike | None = None) -> Spectrum:
+        """Autocovariance and spectral density of the errors in the steady state, exactly.
+
+        Parameters
+        ----------
+        lags
+            (L,) ascending, >= 0 [steps]; None: up to 200, from 0 to where 1 % of lag 0 is left
+        frequencies
+            (F,) ascending, from 0 to 1 / (2 dt) [cycles per unit of simulated time]; None: 200, equally spaced on a
+            logarithmic axis
+
+        Returns
+        -------
+        Spectrum
+            ``covariances`` (L, m, m), ``system_autocovariance`` (L,), ``system_density`` (F,), ``node_densities``
+            (F, m)
+
+        Raises
+        ------
+        NotAvailableError
+            the experiment asks for something that cannot be predicted
+        InputError
+            lags or frequencies that are not valid, too large, or without finite steady errors
+        """
+        from msg_analysis.theory.spectrum import spectrum
+
+        wanted = None if lags is None else np.asarray(lags, dtype=np.int64)
+        where = None if frequencies is None else np.asarray(frequencies, dtype=float)
+        return spectrum(self.predict(), wanted, where)
+
+    def leaders(
+        self,
+        count: int | None = None,
+        *,
+        method: SearchMethod = "auto",
+        law: SelectionLaw | None = None,
+        gain: float | None = None,
+        top: int = 10,
+        watch: SearchProgress | None = None,
+    ) -> Selection:
+        """The sets of leaders with the least system error, and that of the experiment's own leaders.
+
+        At infinite gain these are the sets of largest joint robustness centrality.
+
+        Parameters
+        ----------
+        count
+            number of leaders; None: as many as the experiment has
+        method
+            "exhaustive" (every set), "greedy" or "swap" (good sets), or "auto": exhaustive up to 1000 sets, else swap
+        law
+            "continuous" (the paper's), "emulated" (the steps of the run) or "discrete"; by default the paper's where
+            there is one, else that of the steps
+        gain
+            pull of the leaders [1 / unit of simulated time]; inf holds them at the reference; None: that of the
+            experiment's leaders, inf in consensus
+        top
+            most sets in the result
+        watch
+            called during the search with its stage, evaluations done, of how many, and the least system error so far
+
+        Returns
+        -------
+        Selection
+            ``sets``: (system error, agents from 1), best first; ``present``: that of the experiment's own leaders
+
+        Raises
+        ------
+        NotAvailableError
+            the experiment asks for something that cannot be predicted
+        InputError
+            an impossible count, gain or law; no count in consensus; too many sets; no set that reaches all agents
+        """
+        from msg_analysis.theory.leader_search import ignore
+        from msg_analysis.theory.leaders import select_leaders
+
+        self.require_available("predict")
+        return select_leaders(self, count, method=method, law=law, gain=gain, top=top, watch=watch or ignore)
 
     def unavailable(self, purpose: Purpose = "run") -> list[str]:
         """What the experiment asks for that this version cannot do, one line each.
@@ -303,11 +646,6 @@ class Experiment:
         return self.spec.noise
 
     @property
-    def leaders(self) -> LeadersSpec | None:
-        """Section ``leaders``; None in consensus."""
-        return self.spec.leaders
-
-    @property
     def run(self) -> RunSpec:
         """Section ``run``."""
         return self.spec.run
@@ -332,12 +670,12 @@ class Experiment:
     @property
     def leader_gains(self) -> FloatArray:
         """(m,) kappa; 0 for followers, inf for grounded leaders."""
-        return validation.leader_gains(self.leaders, self.agents)
+        return validation.leader_gains(self.spec.leaders, self.agents)
 
     @property
     def reference(self) -> float:
         """The value that tracking agents should reach; 0 for consensus."""
-        return self.leaders.reference if self.leaders else 0.0
+        return self.spec.leaders.reference if self.spec.leaders else 0.0
 
     @property
     def steps(self) -> int:

@@ -174,6 +174,26 @@ def _csv_row(key: str, place: str, head: Sequence[str], row: Sequence[str]) -> t
     return cells["source"], cells["target"], weight, kind == "undirected"
 
 
+def read_matrix(key: str, file: Path) -> list[list[float]]:
+    """The rows of a matrix in a file, .csv or .npy; ``key`` is for the GraphError."""
+    content = io.BytesIO(_content(key, file))
+    try:
+        if file.suffix == ".npy":
+            matrix = np.load(content, allow_pickle=False)
+        else:
+            matrix = np.loadtxt(io.TextIOWrapper(content, encoding="utf-8-sig"), delimiter=",", ndmin=2)
+        matrix = np.asarray(matrix, dtype=float)
+    except (ValueError, TypeError, EOFError) as error:
+        reason = " ".join(str(error).split())
+        raise GraphError(problem(key, str(file), f"expected a matrix of numbers ({reason})", "correct it")) from None
+    if matrix.ndim != 2 or len(matrix) < 2 or not np.isfinite(matrix).all() or matrix.min() < 0.0:
+        shape = " x ".join(map(str, matrix.shape))
+        wanted = "expected a square matrix of finite numbers >= 0"
+        raise GraphError(problem(key, f"{file}: {shape}", wanted, "row i has the weights with which agent i listens"))
+    rows: list[list[float]] = matrix.tolist()
+    return rows
+
+
 def from_adjacency(key: str, rows: Sequence[Sequence[float]]) -> GraphSpec:
     """A matrix whose row i has the weights with which agent i listens; edges where it is symmetric, else arcs."""
     if any(len(row) != len(rows) for row in rows):
@@ -218,21 +238,49 @@ def as_spec(graph: ForeignGraph, numbers: Mapping[str, int]) -> GraphSpec:
     return _spec(links, directed=graph.directed)
 
 
+def named_agents(spec: GraphSpec) -> list[str]:
+    """Names that stand in a graph for numbers of agents, in their order."""
+    labels: Iterable[object] = spec.path or spec.cycle or ()
+    if spec.star:
+        labels = [spec.star.center]
+    elif spec.edges or spec.arcs:
+        labels = (end for link in spec.edges or spec.arcs or [] for end in link[:2])
+    return [label for label in labels if isinstance(label, str)]
+
+
+def with_numbers(spec: GraphSpec, numbers: Mapping[str, int]) -> GraphSpec:
+    """The graph with numbers of agents instead of their names."""
+
+    def number(agent: Any) -> Any:
+        return numbers.get(agent, agent)
+
+    changes: dict[str, Any] = {}
+    for kind in spec.kinds:
+        value = getattr(spec, kind)
+        if kind in ("path", "cycle"):
+            changes[kind] = list(map(number, value))
+        elif kind in ("edges", "arcs"):
+            changes[kind] = [(number(i), number(j), weight) for i, j, weight in value]
+        elif kind == "star":
+            changes[kind] = value.model_copy(update={"center": number(value.center)})
+    return spec.model_copy(update=changes)
+
+
 def largest_label(spec: GraphSpec) -> int:
     """Largest agent number that the graph mentions; 0 where it mentions none."""
     if spec.path or spec.cycle:
-        return max(spec.path or spec.cycle or [0])
+        return max(map(int, spec.path or spec.cycle or [0]))
     if spec.star:
         return spec.star.center
     if spec.grid:
         return spec.grid[0] * spec.grid[1]
-    return max((label for link in spec.edges or spec.arcs or [] for label in link[:2]), default=0)
+    return max((int(end) for link in spec.edges or spec.arcs or [] for end in link[:2]), default=0)
 
 
 def links(spec: GraphSpec, agents: int) -> list[Link]:
     """(i, j, weight), agents from 1, of every edge (``arcs``: arc i -> j). Not for files: see ``graph_sources``."""
     if spec.edges is not None or spec.arcs is not None:
-        return list(spec.edges or spec.arcs or [])
+        return [(int(i), int(j), weight) for i, j, weight in spec.edges or spec.arcs or []]
     pairs: list[tuple[int, int]]
     if spec.path is not None:
         pairs = list(pairwise(spec.path))
@@ -247,7 +295,8 @@ def links(spec: GraphSpec, agents: int) -> list[Link]:
         pairs = [(int(i), int(j)) for i, j in (*beside, *below)]
     else:
         pairs = list(combinations(range(1, agents + 1), 2))
-    return [(i, j, 1.0) for i, j in pairs]
+    weight = 1.0 if spec.weight is None else spec.weight
+    return [(i, j, weight) for i, j in pairs]
 
 
 def link_problems(key: str, spec: GraphSpec, agents: int, names: Sequence[str] | None = None) -> list[str]:

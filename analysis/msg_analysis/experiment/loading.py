@@ -12,6 +12,7 @@ from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
@@ -24,7 +25,7 @@ from msg_analysis.experiment.graph_sources import ForeignGraph, GraphError, is_n
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
 from msg_analysis.experiment.network_spec import GraphSpec, NoiseSpec
-from msg_analysis.experiment.problems import problem, show, translate
+from msg_analysis.experiment.problems import WEIGHT, problem, show, translate
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
 from msg_analysis.experiment.spec import ExperimentSpec, RunSpec
 
@@ -218,6 +219,40 @@ def _section(key: str, mapping: Mapping[Any, Any]) -> Any:
     return ExperimentSpec.model_fields[key].get_default(call_default_factory=True, validated_data={})
 
 
+_PLAIN = {str, int, float, bool, type(None)}
+_OWN_WEIGHTS = ("path", "cycle", "star", "grid", "complete")  # kinds of graphs that a ``weight`` may stand beside
+
+
+def plain(value: Any) -> Any:
+    """A document with lists and numbers in place of arrays, matrices of scipy.sparse, numbers of numpy and tuples."""
+    if type(value) in _PLAIN:
+        return value
+    if isinstance(value, list | tuple | range):
+        return list(value) if all(type(each) in _PLAIN for each in value) else [plain(each) for each in value]
+    if isinstance(value, Mapping):
+        return {key: plain(each) for key, each in value.items()}
+    if isinstance(value, Path):
+        return str(value)
+    return _rows(value) if _is_array(value) else value
+
+
+def _is_array(value: object) -> bool:
+    return hasattr(value, "toarray") or hasattr(value, "__array__")
+
+
+def _rows(value: Any) -> Any:
+    return np.asarray(value.toarray() if hasattr(value, "toarray") else value).tolist()
+
+
+def _plain_document(mapping: Mapping[Any, Any]) -> dict[Any, Any]:
+    """The document, in which a graph that is an array is one that has this ``adjacency``."""
+    graphs = mapping.get("graphs")
+    if isinstance(graphs, Mapping):
+        made = {name: {"adjacency": graph} if _is_array(graph) else graph for name, graph in graphs.items()}
+        mapping = {**mapping, "graphs": made}
+    return {key: plain(each) for key, each in mapping.items()}
+
+
 def _graphs_of_networkx(mapping: Mapping[Any, Any]) -> tuple[dict[str, Any], Mapping[Any, Any]]:
     """The graphs of networkx in a document, by name, and the document with empty graphs in their places."""
     graphs = mapping.get("graphs")
@@ -237,7 +272,7 @@ class Sections:
 
     def __init__(self, mapping: Mapping[Any, Any], recorded: ProtocolInfo | None = None) -> None:
         self.problems: list[str] = []
-        self._networkx, mapping = _graphs_of_networkx(mapping)
+        self._networkx, mapping = _graphs_of_networkx(_plain_document(mapping))
         self._foreign: dict[str, ForeignGraph] = {}  # read, but not numbered yet
         self._named_by_files = False
         self.keys: dict[str, str] = {}  # of the graphs, for messages
@@ -263,10 +298,12 @@ class Sections:
 
     def resolve(self, directory: Path) -> None:
         """Check what several keys say together; paths in the document are relative to ``directory``."""
-        time, run = self.values["time"], self.values["run"]
+        time = self.values["time"]
         self._find_protocol()
         self._count_agents(directory)
         self._name_leaders()
+        self._name_start()
+        run = self.values["run"]
         leaders = self.values["leaders"]
         leaders_good = self.values["problem"] is not None and "leaders" in self.known
         if leaders_good:
@@ -328,6 +365,9 @@ class Sections:
                 wanted = f"expected one of {', '.join(GraphSpec.model_fields)}"
                 self.problems.append(problem(f"graphs.{name}", given, wanted, "give exactly one"))
                 continue
+            if spec.weight is not None and spec.kinds[0] not in _OWN_WEIGHTS:
+                wanted = f"expected with {', '.join(_OWN_WEIGHTS)} only"
+                self.problems.append(problem(f"graphs.{name}.weight", spec.weight, wanted, WEIGHT))
             self.keys[name] = key = f"graphs.{name}" if name in self._networkx else f"graphs.{name}.{spec.kinds[0]}"
             try:
                 self._read(name, key, spec, directory)
@@ -358,7 +398,10 @@ class Sections:
         elif spec.csv is not None:
             self._foreign[name] = graph_sources.read_csv(key, directory / spec.csv)
         elif spec.adjacency is not None:
-            self.values["graphs"][name] = graph_sources.from_adjacency(key, spec.adjacency)
+            rows = spec.adjacency
+            if isinstance(rows, str):
+                rows = graph_sources.read_matrix(key, directory / rows)
+            self.values["graphs"][name] = graph_sources.from_adjacency(key, rows)
 
     def _number_nodes(self, graphs: dict[str, GraphSpec]) -> bool:
         """Numbers instead of nodes in ``graphs``, and the names of the agents; False where these have mistakes."""
@@ -367,19 +410,26 @@ class Sections:
         if twice:
             self.problems.append(problem("names", show(twice[0]), "expected different names", "rename one"))
             return False
-        if not self._foreign:
+        named = {
+            name: ForeignGraph(nodes, [], directed=False)
+            for name, spec in graphs.items()
+            if name not in self._foreign and (nodes := graph_sources.named_agents(spec))
+        }
+        if not self._foreign and not named:
             return True
+        sources = {name: graph for name in graphs if (graph := self._foreign.get(name) or named.get(name))}
         try:
-            numbers, names = graph_sources.numbered(self._foreign.values(), given)
+            numbers, names = graph_sources.numbered(sources.values(), given)
         except KeyError as error:
             wanted = f"expected one of the names {listed(given or [])}"
-            place = next(self.keys[name] for name, graph in self._foreign.items() if error.args[0] in graph.nodes)
+            place = next(self.keys[name] for name, graph in sources.items() if error.args[0] in graph.nodes)
             self.problems.append(
                 problem(place, f"node {show(error.args[0])}", wanted, "correct it, or add it to `names`")
             )
             return False
         graphs |= {name: graph_sources.as_spec(graph, numbers) for name, graph in self._foreign.items()}
-        self._named_by_files = given is None
+        graphs |= {name: graph_sources.with_numbers(graphs[name], numbers) for name in named}
+        self._named_by_files = given is None and bool(self._foreign)
         self.values["names"] = names
         return True
 
@@ -400,6 +450,23 @@ class Sections:
         self.values["leaders"] = leaders.model_copy(update={"agents": known})
         if unknown:
             self.known.discard("leaders")
+
+    def _name_start(self) -> None:
+        """One number for each agent in ``run.start`` in place of numbers by agent; 0 for those that are not there."""
+        run, names = self.values["run"], self.values["names"] or []
+        if self.agents is None or run is None or not isinstance(run.start, dict):
+            return
+        values = [0.0] * self.agents
+        for agent, value in run.start.items():
+            number = names.index(agent) + 1 if agent in names else agent
+            if isinstance(number, str) or number > self.agents:
+                wanted = (
+                    f"expected one of the names {listed(names)}" if names else f"expected agents 1 to {self.agents}"
+                )
+                self.problems.append(problem("run.start", show(agent), wanted, "correct it"))
+            else:
+                values[number - 1] = value
+        self.values["run"] = run.model_copy(update={"start": values})
 
     def _resolve_losses(self, noise: NoiseSpec, time: Time) -> None:
         """Numbers instead of names in ``noise.loss``, and the probability of every link."""

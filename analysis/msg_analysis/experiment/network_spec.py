@@ -34,6 +34,14 @@ Probability = Annotated[Number, Field(ge=0, lt=1)]
 Matrix = list[list[Number]]
 
 
+def _agent(value: object, number: ValidatorFunctionWrapHandler) -> Any:
+    """A number, or the name of an agent, which becomes its number once the names are known."""
+    return value if isinstance(value, str) and re.match(NAME_PATTERN, value) else number(value)
+
+
+Agent = Annotated[Label, WrapValidator(_agent, json_schema_input_type=Label | AgentName)]
+
+
 def expected(text: str) -> PydanticCustomError:
     """The error of a value that is not what ``text`` says, such as "a number > 0"."""
     return PydanticCustomError("expected", "{text}", {"text": text})
@@ -56,24 +64,28 @@ class Section(BaseModel):
 
 
 Link = tuple[int, int, float]
+WrittenLink = tuple[int | str, int | str, float]  # with names of agents, too
 
 
-def _link(value: object) -> Link:
-    wanted = expected("[agent, agent] or [agent, agent, weight], agents from 1, the weight a number > 0")
+def is_agent(value: object) -> bool:
+    """Whether it is the number of an agent, or may be its name."""
+    return is_count(value) or (isinstance(value, str) and re.match(NAME_PATTERN, value) is not None)
+
+
+def _link(value: object) -> WrittenLink:
+    wanted = expected(
+        "[agent, agent] or [agent, agent, weight], agents by number from 1 or name, the weight a number > 0"
+    )
     if not isinstance(value, list | tuple) or len(value) not in (2, 3):
         raise wanted
     first, second = value[:2]
     for label in (first, second):
-        if not is_count(label):
+        if not is_agent(label):
             raise wanted
     weight = value[2] if len(value) == 3 else 1.0
     if not is_number(weight) or weight <= 0:
         raise expected("a weight > 0 as the third entry")
     return (first, second, float(weight))
-
-
-def _rows(value: object) -> object:
-    return value.tolist() if hasattr(value, "tolist") else value  # an array of numpy
 
 
 def _grid(value: object) -> object:
@@ -83,27 +95,37 @@ def _grid(value: object) -> object:
     return value
 
 
-Links = list[
-    Annotated[
-        Link,
-        BeforeValidator(_link, json_schema_input_type=tuple[Label, Label] | tuple[Label, Label, Positive]),
-    ]
-]
+_End = Label | AgentName
+_WrittenLinks = tuple[_End, _End] | tuple[_End, _End, Positive]
+Links = list[Annotated[WrittenLink, BeforeValidator(_link, json_schema_input_type=_WrittenLinks)]]
 
 
 class Star(Section):
     """A star: every agent is connected with the centre."""
 
-    center: Label = Field(description="the agent in the middle", examples=[1])
+    center: Agent = Field(description="the agent in the middle", examples=[1])
+
+
+def _matrix(value: object, rows: ValidatorFunctionWrapHandler) -> Any:
+    """The rows of a matrix, or the name of a file with them."""
+    if isinstance(value, str):
+        if value.endswith(MATRIX_FILES):
+            return value
+        raise expected("a square matrix, or a file .csv or .npy with one")
+    return rows(value)
+
+
+MATRIX_FILES = (".csv", ".npy")
+Rows = Annotated[list[list[NonNegative]], Field(min_length=2)]
 
 
 class GraphSpec(Section):
-    """One graph, given in one of these ways. Agents are numbered from 1."""
+    """One graph, given in one of these ways. Agents are numbered from 1, or have names."""
 
-    model_config = ConfigDict(json_schema_extra={"minProperties": 1, "maxProperties": 1})
+    model_config = ConfigDict(json_schema_extra={"minProperties": 1, "maxProperties": 2})
 
-    path: list[Label] | None = Field(None, min_length=2, description="agents along a line", examples=[[1, 2, 3]])
-    cycle: list[Label] | None = Field(None, min_length=3, description="agents around a ring", examples=[[1, 2, 3]])
+    path: list[Agent] | None = Field(None, min_length=2, description="agents along a line", examples=[[1, 2, 3]])
+    cycle: list[Agent] | None = Field(None, min_length=3, description="agents around a ring", examples=[[1, 2, 3]])
     edges: Links | None = Field(
         None,
         description="undirected: [i, j] or [i, j, weight], weight 1 by default",
@@ -133,17 +155,21 @@ class GraphSpec(Section):
         "target listens to source; nodes as with graphml; type directed (default) or undirected",
         examples=["edges.csv"],
     )
-    adjacency: Annotated[list[list[NonNegative]], BeforeValidator(_rows)] | None = Field(
+    adjacency: Annotated[Rows, WrapValidator(_matrix, json_schema_input_type=Rows | str)] | None = Field(
         None,
-        min_length=2,
-        description="square matrix: row i has the weights with which agent i listens to the others, 0: not at all",
+        description="square matrix: row i has the weights with which agent i listens to the others, 0: not at all; or "
+        "a file with it, .csv or .npy, relative to the experiment file",
         examples=[[[0, 1], [1, 0]]],
+    )
+    weight: Positive | None = Field(
+        None, description="of all links of path, cycle, star, grid or complete; 1 by default", examples=[0.5]
     )
 
     @property
     def kinds(self) -> list[str]:
         """Ways in which this graph is given (one, in a valid file)."""
-        return [key for key in type(self).model_fields if getattr(self, key) is not None]
+        given = [key for key in type(self).model_fields if getattr(self, key) is not None]
+        return [key for key in given if key != "weight"]
 
 
 class SwitchingSpec(Section):
@@ -177,9 +203,8 @@ def _lossy_link(value: object) -> tuple[int | str, int | str, float]:
     if not isinstance(value, list | tuple) or len(value) != 3:
         raise wanted
     first, second, probability = value
-    for agent in (first, second):
-        if not (is_count(agent) or (isinstance(agent, str) and re.match(NAME_PATTERN, agent))):
-            raise wanted
+    if not (is_agent(first) and is_agent(second)):
+        raise wanted
     if not is_number(probability) or not 0 <= probability < 1:
         raise wanted
     return (first, second, float(probability))
@@ -228,7 +253,7 @@ def _noise_gain(value: object) -> NoiseGain:
 LossyLinks = list[
     Annotated[
         tuple[int | str, int | str, float],
-        BeforeValidator(_lossy_link, json_schema_input_type=tuple[Label | AgentName, Label | AgentName, Probability]),
+        BeforeValidator(_lossy_link, json_schema_input_type=tuple[_End, _End, Probability]),
     ]
 ]
 

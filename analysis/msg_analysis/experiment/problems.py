@@ -147,11 +147,11 @@ def _meant(location: Sequence[int | str], model: type[BaseModel], root: type[Bas
 
 
 _LISTENS = "`arcs: [[1, 2]]`: agent 2 listens to agent 1"
-_WEIGHT = "give it as the third entry of a link, for example `edges: [[1, 2, 0.5]]`"
+WEIGHT = "give it as the third entry of a link, for example `edges: [[1, 2, 0.5]]`"
 _OF_GRAPHS = {
     **dict.fromkeys(("directed", "digraph", "is_directed"), f"for a directed graph give {_LISTENS}"),
     "undirected": "remove it: `edges` have no direction",
-    **dict.fromkeys(("weight", "weights"), _WEIGHT),
+    "weights": WEIGHT,
     **dict.fromkeys(("links", "edge_list"), "did you mean `edges`, or `arcs` for a directed graph?"),
     **dict.fromkeys(("nodes", "vertices", "agents"), "give the number of agents as `agents`, beside `graphs`"),
     "matrix": "did you mean `adjacency`?",

@@ -11,35 +11,36 @@ Only what one value can tell by itself is checked here; what needs several keys 
 from __future__ import annotations
 
 import math
-import re
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator
 
 from msg_analysis.experiment.network_spec import (
-    NAME_PATTERN,
+    Agent,
     AgentName,
     Count,
     GraphName,
     GraphSpec,
-    Label,
     NoiseSpec,
     Number,
     Positive,
     Section,
     SwitchingSpec,
     expected,
+    is_agent,
     is_count,
     is_number,
 )
 
 
-def _start(value: object) -> str | list[float]:
+def _start(value: object) -> str | list[float] | dict[int | str, float]:
     if isinstance(value, str) and value in ("stationary", "zero"):
         return value
     if isinstance(value, list) and all(is_number(entry) for entry in value):
         return [float(entry) for entry in value]
-    raise expected("'stationary', 'zero' or a list of one finite number per agent")
+    if isinstance(value, dict) and value and all(map(is_agent, value)) and all(map(is_number, value.values())):
+        return {agent: float(entry) for agent, entry in value.items()}
+    raise expected("'stationary', 'zero' or a list of one finite number per agent, or numbers by agent")
 
 
 def _processes(value: object) -> str | int:
@@ -58,17 +59,10 @@ def _gain(value: object) -> float:
     raise expected("a number > 0, or inf for leaders held at the reference")
 
 
-def _leader(value: object, number: ValidatorFunctionWrapHandler) -> Any:
-    """A number, or the name of an agent, which becomes its number once the names are known."""
-    return value if isinstance(value, str) and re.match(NAME_PATTERN, value) else number(value)
-
-
 class LeadersSpec(Section):
     """The agents that know the reference (tracking only)."""
 
-    agents: list[Annotated[Label, WrapValidator(_leader, json_schema_input_type=Label | AgentName)]] = Field(
-        min_length=1, description="the leaders, by number or name", examples=[[3]]
-    )
+    agents: list[Agent] = Field(min_length=1, description="the leaders, by number or name", examples=[[3]])
     gain: Annotated[
         float,
         PlainValidator(_gain, json_schema_input_type=Positive | Literal["inf"]),
@@ -99,9 +93,15 @@ class RunSpec(Section):
         0, description="of everything random in the run", examples=[7]
     )
     start: Annotated[
-        str | list[float],
-        PlainValidator(_start, json_schema_input_type=Literal["stationary", "zero"] | list[Number]),
-    ] = Field("stationary", description="'stationary', 'zero' or one value per agent", examples=["stationary"])
+        str | list[float] | dict[int | str, float],
+        PlainValidator(
+            _start, json_schema_input_type=Literal["stationary", "zero"] | list[Number] | dict[AgentName, Number]
+        ),
+    ] = Field(
+        "stationary",
+        description="'stationary', 'zero', one value per agent, or values by agent (others 0)",
+        examples=["stationary"],
+    )
     pace: Literal["lockstep", "realtime"] = Field(
         "lockstep",
         description="lockstep: as fast as it goes, deterministic; realtime: every agent on its own timer",

@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -41,6 +41,9 @@ from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import step_law
 from msg_analysis.theory.fourth_moments import FourthMoment
 from msg_analysis.theory.prediction import SHOWN_AGENTS, Prediction
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Keys of an experiment that do not change its law
 MAY_DIFFER = {"name", "names", "run.seed", "run.duration", "run.processes", "run.speed"}
@@ -341,6 +344,18 @@ class Comparison:
     def exit_code(self) -> int:
         """0 agrees or unpredicted, 1 disagrees, 3 incomplete."""
         return EXIT_CODES[self.verdict]
+
+    def plot(self) -> Figure:
+        """Draw the system error up to each time and the agents' errors, with 95 % intervals, beside the prediction.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            notebooks show it; ``figure.savefig("comparison.png")`` writes it
+        """
+        from msg_analysis.report.figures import comparison_figure
+
+        return comparison_figure(self)
 
     @property
     def _law(self) -> str:

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from msg_analysis.bags.reading import read_bag
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import verdict
@@ -22,6 +24,43 @@ from msg_analysis.inference.statistics import chi2_tail
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.prediction import Prediction, predict
+
+
+def compare(*runs: Run | str | Path, level: float = 0.01) -> Comparison:
+    """Compare a run, or several of one experiment, with what theory predicts.
+
+    Parameters
+    ----------
+    *runs
+        runs, or paths of their bags, which are read one after the other; several runs need different seeds and get one
+        verdict together
+    level
+        probability of a false "disagrees", all tests together; above 0, at most 0.5
+
+    Returns
+    -------
+    Comparison
+        ``verdict``, ``system_error``, ``node_errors``, ``covariance``, ``tests``, ``blame`` and more
+
+    Raises
+    ------
+    InputError
+        no run, an invalid level, runs that do not belong together, or no prediction (too large, or without finite
+        steady errors)
+    BagError
+        a path without a readable run
+    """
+    if not runs:
+        raise InputError("no run: give at least one, or the path of its bag")
+    if not 0.0 < level <= 0.5:
+        raise InputError(f"level: {level:g}: expected a probability above 0, at most 0.5")
+    if len(runs) == 1:
+        return verdict.compare(_read(runs[0]), level=level)
+    absent = [str(path) for path in runs if not isinstance(path, Run) and not Path(path).exists()]
+    if absent:
+        raise InputError(f"{', '.join(absent)}: not found: expected bags, {len(runs)} were given")
+    named = ((_name(run, place), _read(run)) for place, run in enumerate(runs, start=1))
+    return compare_pooled(named, level=level)
 
 
 def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> Comparison:
@@ -157,3 +196,11 @@ def _pool(members: list[Member]) -> Pool:
     mean = float(precision @ deviation / precision.sum())
     chi2 = float(precision @ (deviation - mean) ** 2)
     return Pool(tuple(members), chi2, len(z) - 1, float(chi2_tail(chi2, len(z) - 1)))
+
+
+def _read(run: Run | str | Path) -> Run:
+    return run if isinstance(run, Run) else read_bag(run)
+
+
+def _name(run: Run | str | Path, place: int) -> str:
+    return f"run {place}" if isinstance(run, Run) else str(run)

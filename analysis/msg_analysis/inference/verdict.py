@@ -34,7 +34,7 @@ MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
 
 
 def compare(trajectory: Run, *, level: float = 0.01) -> Comparison:
-    """Compare a run, or its complete beginning, with what theory predicts for it; see ``api.compare``.
+    """Compare a run, or its complete beginning, with what theory predicts for it.
 
     Every test assumes exactly the law that the record says was run; the probability of any false rejection in the
     family is at most ``level`` (Holm). A test with nothing to test (no noise, one graph, no loss) is left out. In real

@@ -5,16 +5,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray, pieces, release
 from msg_analysis.common.text import markdown_table
+from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.reception import LOST, NOTHING
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import Wiring
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from msg_analysis.bags.mcap_chunks import Storage
+    from msg_analysis.inference.comparison import Comparison
+    from msg_analysis.report.export import Table
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +102,9 @@ class Run:
     made
         (N + 1, m) in real time: simulated time [ns] at which the state was made, later than that of every value used
         for it; 0 for x(0), -1 where missing. None in lockstep
+    network
+        of a run that ``msg_agents.run_network`` gives: what only the network knows, such as the directory of the
+        ``bag``, ``restarts``, ``failures`` and ``wall_time``; else None
     """
 
     record: RunRecord
@@ -101,6 +116,7 @@ class Run:
     lost: BoolArray | None = None
     used: IntArray | None = None
     made: IntArray | None = None
+    network: Any = None
 
     def __repr__(self) -> str:
         experiment, count = self.record.experiment, self.completeness
@@ -108,7 +124,122 @@ class Run:
         last = len(self.states) - 1
         states = f"x(0..{last}) of {experiment.agents} agents" if last >= 0 else "no states kept"
         replicas = f"{experiment.run.replicas} replicas, seed {experiment.run.seed}"
-        return f"<{type(self).__name__} of {experiment.name!r}: {states}, {replicas}; {whole}>"
+        return f"<Run of {experiment.name!r}: {states}, {replicas}; {whole}>"
+
+    def _repr_markdown_(self) -> str:
+        experiment, count = self.record.experiment, self.completeness
+        rows = [
+            ("agents", str(experiment.agents)),
+            ("replicas", str(experiment.run.replicas)),
+            ("steps", f"{experiment.steps} of {experiment.step_length:g}"),
+            ("seed", str(experiment.run.seed)),
+            ("states", f"{count.received} of {count.expected}"),
+            ("steps without a graph", str(count.missing_modes)),
+        ]
+        return f"**Run of {experiment.name}**, {experiment.run.pace}\n\n" + markdown_table(("", ""), rows)
+
+    @property
+    def experiment(self) -> Experiment:
+        """The experiment that was run."""
+        return self.record.experiment
+
+    @property
+    def times(self) -> FloatArray:
+        """(N + 1,) simulated time of the states x(0), ..., x(N) [units of simulated time]."""
+        return np.asarray(np.arange(len(self.states)) * self.record.experiment.step_length, dtype=float)
+
+    def compare(self, *, level: float = 0.01) -> Comparison:
+        """Compare the run with its prediction; see :func:`compare`.
+
+        Parameters
+        ----------
+        level
+            probability of a false "disagrees", all tests together; above 0, at most 0.5
+
+        Raises
+        ------
+        InputError
+            an invalid level, or no prediction (too large, or without finite steady errors)
+        """
+        from msg_analysis.inference.pool import compare
+
+        return compare(self, level=level)
+
+    def to_dataframe(self, table: Table = "states") -> pd.DataFrame:
+        """The run as a data frame of pandas, with the columns of ``msg-analysis export``.
+
+        Parameters
+        ----------
+        table
+            "states" (a row per state and replica), "graphs" (a row per step) or "errors" (a row per x(k))
+
+        Returns
+        -------
+        pandas.DataFrame
+            agents, graphs and replicas count from 1, as in files; what is missing is NaN
+
+        Raises
+        ------
+        NotAvailableError
+            pandas is not installed
+        InputError
+            there is no such table
+        """
+        from msg_analysis.report.export import data_frame
+
+        return data_frame(self, table)
+
+    def plot(self, agents: Iterable[int | str] | None = None, *, replica: int = 1) -> Figure:
+        """Draw the states of agents over time, and the graph of every step.
+
+        Parameters
+        ----------
+        agents
+            by number from 1 or name; None: the first eight
+        replica
+            number from 1
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            notebooks show it; ``figure.savefig("run.png")`` writes it
+
+        Raises
+        ------
+        InputError
+            there is no such agent or replica
+        """
+        from msg_analysis.report.figures import run_figure
+
+        if not 1 <= replica <= self.experiment.run.replicas:
+            raise InputError(f"replica: {replica}: expected a number from 1 to {self.experiment.run.replicas}")
+        return run_figure(self, None if agents is None else self.experiment.indices(agents), replica - 1)
+
+    def save(self, directory: str | Path, storage: Storage | None = None) -> Path:
+        """Write the run as a bag with the topics and the layout of a network's.
+
+        Parameters
+        ----------
+        directory
+            of the bag; must not exist
+        storage
+            compression and size of its files; None: the default
+
+        Returns
+        -------
+        Path
+            the directory
+
+        Raises
+        ------
+        BagError
+            the directory exists or cannot be written
+        """
+        from msg_analysis.bags.mcap_chunks import DEFAULT_STORAGE
+        from msg_analysis.bags.run_writer import write_trajectory
+
+        write_trajectory(self, directory, storage or DEFAULT_STORAGE)
+        return Path(directory)
 
     def release(self) -> None:
         """Give the memory of a long run, whose arrays are in files, back to the system: after every part of it."""

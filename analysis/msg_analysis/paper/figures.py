@@ -38,8 +38,8 @@ from msg_analysis.report.figures import (
     draw_graph,
     rendered,
 )
-from msg_analysis.sweep.grid import own_seed
-from msg_analysis.sweep.points import DONE, Job, Outcome
+from msg_analysis.sweeps.grid import own_seed
+from msg_analysis.sweeps.points import DONE, Job, Outcome
 
 DT = 0.025
 """Simulated time of a step: its errors are about 2 % above those of continuous time."""

@@ -91,7 +91,7 @@ _WEIGHTS = 5  # different line widths
 def graph_drawings(experiment: Experiment, accused: Accused = NOBODY) -> list[Markup]:
     """The first ``MOST_GRAPHS`` graphs, each agent at the same place in all of them; leaders are squares."""
     where = _scaled(places(experiment.graph_list), experiment.agents)
-    leaders = set(experiment.leaders.agents) if experiment.leaders else set()
+    leaders = set(experiment.spec.leaders.agents) if experiment.spec.leaders else set()
     return [
         _graph(graph, where, graph_variable(mode), leaders, accused, experiment.names)
         for mode, graph in enumerate(experiment.graph_list[:MOST_GRAPHS])

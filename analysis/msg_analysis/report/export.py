@@ -185,16 +185,21 @@ def _known(known: BoolArray) -> pa.Buffer | None:
 Table = Literal["states", "graphs", "errors"]
 
 
+def require_pandas() -> None:
+    """NotAvailableError where pandas, which pyarrow needs for data frames, is not installed."""
+    try:
+        import pandas  # noqa: F401
+    except ImportError:
+        raise NotAvailableError(
+            "to_dataframe: pandas is not installed: expected it for data frames: pip install pandas"
+        ) from None
+
+
 def data_frame(trajectory: Run, table: Table) -> pd.DataFrame:
     """One of the tables of a run. InputError: no such table; NotAvailableError: pandas is not installed."""
     import pyarrow as pa
 
-    try:
-        import pandas  # noqa: F401  pyarrow needs it below
-    except ImportError as error:
-        raise NotAvailableError(
-            "to_dataframe: pandas is not installed: expected it for data frames: pip install pandas"
-        ) from error
+    require_pandas()
     found = {each.name: each for each in run_tables(trajectory)}
     if table not in found:
         raise InputError(f"to_dataframe: {table!r}: expected one of {', '.join(found)}")

@@ -178,20 +178,47 @@ _NODE_TEST = "error of agent "  # beginning of the names of the tests of the nod
 
 def write_report(
     comparison: Comparison,
-    trajectory: Run,
-    path: str | Path,
+    file: str | Path,
     *,
     restarts: Sequence[str] = (),
     strangers: Sequence[Mapping[str, Any]] = (),
     events: Sequence[Mapping[str, Any]] = (),
     wall_time: float | None = None,
     channel: Mapping[str, Any] | None = None,
-) -> None:
-    """Write the report of a comparison, whole or not at all; InputError if that fails. Arguments as in ``render``."""
-    path = Path(path)
+) -> Path:
+    """Write a comparison as one self-contained HTML page, whole or not at all.
+
+    Parameters
+    ----------
+    comparison
+        of one run or of several
+    file
+        path of the page; replaced if it exists
+    restarts
+        what the network reported: a line per process that was restarted
+    strangers
+        ``node``, ``topic``, ``reason`` and ``count`` per kind of refused message
+    events
+        ``kind`` ("killed", "back" or "refused"), ``step`` and ``words`` per event
+    wall_time
+        duration of the run [s]
+    channel
+        hosts and packets of each pair of them, as in result.json
+
+    Returns
+    -------
+    Path
+        the file
+
+    Raises
+    ------
+    InputError
+        the file cannot be written
+    """
+    path = Path(file)
     html = render(
         comparison,
-        trajectory,
+        comparison.trajectory,
         restarts=restarts,
         strangers=strangers,
         events=events,
@@ -202,6 +229,7 @@ def write_report(
         write_whole(path, html.encode())
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}): choose another place") from error
+    return path
 
 
 def render(

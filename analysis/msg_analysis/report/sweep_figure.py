@@ -18,9 +18,9 @@ from matplotlib.lines import Line2D
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.files import write_whole
 from msg_analysis.experiment.problems import show
-from msg_analysis.report.figures import BLACK, DARK_GREY, MODE_COLOURS, STYLE, plain, rendered, shifted
-from msg_analysis.sweep.figure_series import Picture, Place, Series
-from msg_analysis.sweep.grid import axis_name, column_words
+from msg_analysis.report.figures import BLACK, DARK_GREY, MODE_COLOURS, STYLE, NotebookFigure, plain, rendered, shifted
+from msg_analysis.sweeps.figure_series import Picture, Place, Series
+from msg_analysis.sweeps.grid import axis_name, column_words
 from msg_analysis.theory.prediction import LAW_NAMES
 
 FORMATS = ("svg", "png")
@@ -38,9 +38,9 @@ def write_figure(picture: Picture, title: str, directory: Path) -> list[Path]:
         return [write_whole(directory / f"figure.{name}", rendered(figure, name, _DPI)) for name in FORMATS]
 
 
-def draw(picture: Picture, title: str) -> Figure:
+def draw(picture: Picture, title: str) -> NotebookFigure:
     """The figure; the caller sets the style."""
-    figure = Figure(figsize=_SIZE, layout="constrained")
+    figure = NotebookFigure(figsize=_SIZE, layout="constrained")
     axes = figure.subplots()
     labels = list(dict.fromkeys(show(place.x) for series in picture.series for place in series.places))
     numbers = picture.numeric

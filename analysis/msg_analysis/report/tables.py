@@ -21,11 +21,11 @@ from msg_analysis.common.text import agent_name, counted, half_width_text, liste
 from msg_analysis.experiment.loading import amount
 from msg_analysis.report.wording import gaps
 from msg_analysis.runs import RunEntry
-from msg_analysis.sweep.figure_series import Picture, value_text
-from msg_analysis.sweep.grid import Sweep
-from msg_analysis.sweep.points import FAILED
-from msg_analysis.sweep.results import Conducted, Judgement
-from msg_analysis.sweep.results import Row as SweepRow
+from msg_analysis.sweeps.figure_series import Picture, value_text
+from msg_analysis.sweeps.grid import Sweep
+from msg_analysis.sweeps.points import FAILED
+from msg_analysis.sweeps.results import Conducted, Judgement
+from msg_analysis.sweeps.results import Row as SweepRow
 
 Row = TypeVar("Row")
 

@@ -40,7 +40,7 @@ def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
 
 
 def _task(experiment: Experiment) -> str:
-    agents, leaders = experiment.agents, experiment.leaders
+    agents, leaders = experiment.agents, experiment.spec.leaders
     if experiment.protocol:
         info = experiment.protocol.info
         kind = "linear" if info.linear else "not linear, so there is no prediction"

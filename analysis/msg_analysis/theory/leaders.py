@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, get_args
@@ -115,7 +116,7 @@ class LeaderProblem:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Selection:
-    """Result of a leader selection; agents count from 0.
+    """Result of a leader selection; agents count from 1.
 
     Attributes
     ----------
@@ -153,7 +154,7 @@ class Selection:
         return markdown_table(("leaders", "system error"), rows)
 
     def _named(self, agents: tuple[int, ...]) -> str:
-        return ", ".join(agent_name(agent + 1, self.problem.experiment.names) for agent in agents)
+        return ", ".join(agent_name(agent, self.problem.experiment.names) for agent in agents)
 
     def to_json(self) -> dict[str, Any]:
         """The document of ``msg-analysis leaders --json``; agents count from 1."""
@@ -168,17 +169,16 @@ class Selection:
             "method": self.method,
             "sets": [
                 {
-                    "agents": [agent + 1 for agent in agents],
+                    "agents": list(agents),
                     "system_error": error,
                     "joint_centrality": 1.0 / error if error > 0.0 else None,
                 }
                 for error, agents in self.sets
             ],
-            "order": [agent + 1 for agent in self.order],
+            "order": list(self.order),
             "evaluations": self.evaluations,
             "bound": {"system_error": self.bound, "gap": gap},
-            "present": self.present
-            and {"agents": [agent + 1 for agent in self.present[1]], "system_error": self.present[0]},
+            "present": self.present and {"agents": list(self.present[1]), "system_error": self.present[0]},
             "supermodular": self.problem.supermodular,
             "note": self.problem.doubt,
         }
@@ -198,13 +198,13 @@ def resolve_law(experiment: Experiment, law: SelectionLaw | None = None) -> Sele
         reason = "discrete time" if experiment.time == "discrete" else "continuous time"
         if law == "continuous" and experiment.time == "continuous":
             reason += " with a protocol, noise on the air, loss or delay, which belong to steps"
-        raise InputError(f"--law {law}: {experiment.source} is in {reason}: use {' or '.join(possible)}")
+        raise InputError(f"law {law}: {experiment.source} is in {reason}: use {' or '.join(possible)}")
     return law
 
 
 @few_blas_threads
 def system_error(
-    experiment: Experiment, agents: list[int], *, law: SelectionLaw | None = None, gain: float = math.inf
+    experiment: Experiment, agents: Iterable[int | str], *, law: SelectionLaw | None = None, gain: float = math.inf
 ) -> float:
     """E(S) with the given agents as leaders; inf where S does not reach all agents.
 
@@ -213,7 +213,7 @@ def system_error(
     experiment
         consensus or tracking; its own leaders are ignored
     agents
-        the leaders S, from 0
+        the leaders S, by number from 1 or name
     law
         "continuous", "emulated" or "discrete"; None for the paper's where the experiment has it, else that of its steps
     gain
@@ -224,10 +224,14 @@ def system_error(
     InputError
         the experiment does not have this law, or E(S) cannot be computed
     """
-    return LeaderProblem(experiment, resolve_law(experiment, law), gain).system_error(frozenset(agents))
+    return LeaderProblem(experiment, resolve_law(experiment, law), gain).system_error(
+        frozenset(experiment.indices(agents))
+    )
 
 
-def joint_robustness_centrality(experiment: Experiment, agents: list[int], *, law: SelectionLaw | None = None) -> float:
+def joint_robustness_centrality(
+    experiment: Experiment, agents: Iterable[int | str], *, law: SelectionLaw | None = None
+) -> float:
     """1/E(S) in the exact limit of infinite gain (the paper's definition, Section 4); inf where E(S) is 0.
 
     Parameters
@@ -310,9 +314,14 @@ def select_leaders(
     )
     if chosen_method == "exhaustive" or count == 1:  # a single leader: all of them were evaluated
         bound = found[0][0]
-    result = [(error, tuple(sorted(agents))) for error, agents in found]
-    present = (problem.system_error(frozenset(leading)), leading) if leading else None
-    return Selection(problem, chosen_method, result, tuple(order), search.evaluations, bound, present)
+    result = [(error, _numbers(sorted(agents))) for error, agents in found]
+    present = (problem.system_error(frozenset(leading)), _numbers(leading)) if leading else None
+    return Selection(problem, chosen_method, result, _numbers(order), search.evaluations, bound, present)
+
+
+def _numbers(agents: Iterable[int]) -> tuple[int, ...]:
+    """Numbers from 1 of agents from 0."""
+    return tuple(int(agent) + 1 for agent in agents)
 
 
 def _check(condition: bool, complaint: str) -> None:

@@ -31,6 +31,8 @@ from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from msg_analysis.experiment.experiment import Experiment
 
 
@@ -208,6 +210,18 @@ class Prediction:
         ]
         rows += [("...", *("" for _ in laws))] * (shown < self.experiment.agents)
         return "Mean-square error in the steady state\n\n" + markdown_table(("", *laws), rows)
+
+    def plot(self) -> Figure:
+        """Draw the agents' errors in the steady state, by every law that there is.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            notebooks show it; ``figure.savefig("prediction.png")`` writes it
+        """
+        from msg_analysis.report.figures import prediction_figure
+
+        return prediction_figure(self)
 
     @property
     def system(self) -> JumpSystem:

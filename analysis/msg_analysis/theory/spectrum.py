@@ -16,16 +16,19 @@ so R(l) = S B^l q(0) with S the sum over the graphs, and the density needs no su
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.linalg
 
 from msg_analysis.common.arrays import FloatArray, IntArray
-from msg_analysis.common.text import number_text
+from msg_analysis.common.text import markdown_table, number_text
 from msg_analysis.errors import InputError
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.prediction import Prediction
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MAX_SIZE = 600  # graphs times coordinates, of the resolvent
 FADED = 0.01  # of the autocovariance at lag 0: where the default lags end
@@ -63,6 +66,12 @@ class Spectrum:
         last = number_text(float(self.times[-1]))
         return f"<Spectrum of {self.prediction.experiment.name!r}: {len(self.lags)} lags up to {last}>"
 
+    def _repr_markdown_(self) -> str:
+        shown = np.unique(np.linspace(0, len(self.lags) - 1, 11).round().astype(int)).tolist()
+        covariance = self.system_autocovariance
+        rows = [(number_text(float(self.times[i])), number_text(float(covariance[i]))) for i in shown]
+        return markdown_table(("lag", "autocovariance of the system"), rows)
+
     @property
     def times(self) -> FloatArray:
         """(L,) the lags [units of simulated time]."""
@@ -82,6 +91,18 @@ class Spectrum:
     def system_density(self) -> FloatArray:
         """(F,) the sum over the agents; its integral from 0 to 1 / (2 dt) is the system error."""
         return np.asarray(self.node_densities.sum(axis=1))
+
+    def plot(self) -> Figure:
+        """Draw the autocovariance over the lag, and the density over the frequency.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            notebooks show it; ``figure.savefig("spectrum.png")`` writes it
+        """
+        from msg_analysis.report.figures import spectrum_figure
+
+        return spectrum_figure(self)
 
     def to_json(self) -> dict[str, Any]:
         """The keys of ``msg-analysis spectrum --json`` that are predicted."""

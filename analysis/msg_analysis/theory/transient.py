@@ -164,7 +164,7 @@ def solve_transient(
         found = transient(system, start_of(experiment, system, steady), _steps(times, unit), steady)
         return SolvedTransient(found, system, steady, unit)
     if experiment.problem != "consensus":
-        raise InputError("--unreduced: expected problem: consensus (tracking has no reduction): leave it out")
+        raise InputError("unreduced: expected problem: consensus (tracking has no reduction): leave it out")
     if unit is None:
         whole = unreduced_consensus(experiment)
     else:
@@ -352,13 +352,13 @@ def _system(experiment: Experiment, law: TransientLaw) -> tuple[JumpSystem, floa
     if law == "emulated":
         return systems.emulated(build_run_model(experiment), experiment.problem), experiment.step_length
     if experiment.time == "discrete":
-        raise InputError("--law continuous: expected an experiment in continuous time: leave --law out")
+        raise InputError("law continuous: expected an experiment in continuous time: leave it out")
     noise = experiment.noise
     if experiment.protocol:
-        raise InputError(f"--law continuous: {experiment.protocol.info} has steps only: leave --law out")
+        raise InputError(f"law continuous: {experiment.protocol.info} has steps only: leave it out")
     if noise.steps_only:
         raise InputError(
-            "--law continuous: noise.broadcast, link, loss and delay belong to steps, expected 0: leave --law out"
+            "law continuous: noise.broadcast, link, loss and delay belong to steps, expected 0: leave it out"
         )
     return systems.continuous(experiment), None
 
@@ -371,6 +371,6 @@ def _steps(times: FloatArray, unit: float | None) -> FloatArray:
     wrong = np.abs(times - steps * unit) > 1e-9 * np.maximum(np.abs(times), unit)
     if wrong.any():
         raise InputError(
-            f"--times: {times[wrong][0]:g} is not a multiple of the step {unit:g}: correct it, or use --law continuous"
+            f"times: {times[wrong][0]:g} is not a multiple of the step {unit:g}: correct it, or use the law continuous"
         )
     return np.asarray(steps)

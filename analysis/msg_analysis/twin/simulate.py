@@ -326,7 +326,7 @@ def new_record(experiment: Experiment, run: uuid.UUID | None = None) -> RunRecor
 
 
 def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Run:
-    """Run an experiment without ROS, or repeat the run of a record (then its experiment is used); see ``api``.
+    """Run an experiment without ROS, or repeat the run of a record (then its experiment is used).
 
     The states equal those of a network run to the last bit: in lockstep, or with ideal timers and no latency.
     """

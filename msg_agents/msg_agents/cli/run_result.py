@@ -15,14 +15,11 @@ import click
 
 from msg_agents.terminal import Interruption
 from msg_analysis.cli.console import complain, print_json, result_console
-from msg_analysis.common.files import RESULT_FILE, write_whole
 from msg_analysis.common.resources import watched
-from msg_analysis.common.text import json_text
 from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
     from msg_agents.run.result import ReportWhen, RunResult
-    from msg_analysis.experiment.experiment import Experiment
 
 
 def finish(
@@ -54,15 +51,10 @@ def finish(
             complain(result.failures[0], "failed:")
     say(_ending(result), result.report)
     _show(result, as_json)
-    if _incomplete(result) or (analyse and result.bag is not None and result.comparison is None):
+    if result.incomplete or (analyse and result.bag is not None and result.comparison is None):
         sys.exit(ExitCode.INCOMPLETE)
     if result.comparison is not None:
         sys.exit(result.comparison.exit_code)
-
-
-def _incomplete(result: RunResult) -> bool:
-    """Whether a process failed, or states are missing."""
-    return bool(result.failures) or (result.trajectory is not None and not result.trajectory.completeness.complete)
 
 
 def _ending(result: RunResult) -> dict[str, Any]:
@@ -78,27 +70,10 @@ def _ending(result: RunResult) -> dict[str, Any]:
 
 
 def _show(result: RunResult, as_json: bool) -> None:
-    """Print the result on stdout; with a comparison, also write result.json into the bag's directory."""
-    document: dict[str, Any] = {"verdict": "incomplete" if _incomplete(result) else None}  # None: nothing to judge
-    if result.comparison is not None:
-        document = dict(result.comparison.to_json())
-    elif result.interrupted:
-        document |= _without_comparison(result.experiment)
-    document |= {
-        "bag": str(result.bag) if result.recorded else None,
-        "report": str(result.report) if result.report else None,
-        "rate": result.rate,
-        "wall_time": result.wall_time,
-        "restarts": result.restarts,
-        "events": result.events,
-        "strangers": result.strangers,
-        "failures": result.failures,
-        "clocks": result.clocks,
-        "channel": result.channel,
-        "until": result.until,
-    }
-    if result.bag is not None and (result.comparison is not None or (result.interrupted and result.recorded)):
-        write_whole(result.bag / RESULT_FILE, json_text(document, 1).encode() + b"\n")
+    """Print the result on stdout; of an interrupted run, also write result.json."""
+    document = result.to_json()
+    if result.interrupted:
+        result.write()
     if as_json:
         print_json(document)
         return
@@ -118,16 +93,3 @@ def _show(result: RunResult, as_json: bool) -> None:
             click.echo(f"To compare what it holds with the prediction: msg-analysis compare {document['bag']}")
     if result.rate:
         click.echo(f"{result.rate:.0f} steps/s over {result.wall_time:.1f} s")
-
-
-def _without_comparison(experiment: Experiment) -> dict[str, Any]:
-    """What `msg-analysis tabulate` reads of a result, without numbers."""
-    from msg_analysis.inference.estimates import Estimate
-
-    return {
-        "experiment": experiment.name,
-        "leaders": (experiment.leader_gains.nonzero()[0] + 1).tolist(),
-        "seed": experiment.run.seed,
-        "simulated_time": 0.0,
-        "system_error": Estimate().to_json(),
-    }

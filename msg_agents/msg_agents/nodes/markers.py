@@ -116,7 +116,7 @@ class Markers(Watcher):
         values = [None if state is None else float(state.state[self._replica]) for state in states]
         known = [value for value in values if value is not None]
         experiment = self.record.experiment
-        middle = experiment.reference if experiment.leaders else sum(known) / max(1, len(known))
+        middle = experiment.reference if experiment.spec.leaders else sum(known) / max(1, len(known))
         square = sum((value - middle) ** 2 for value in known) / max(1, len(known))
         self._square += (square - self._square) * (FADING if self._square else 1.0)
         full = FULL_COLOUR * math.sqrt(self._square) or 1.0

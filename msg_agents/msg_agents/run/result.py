@@ -19,7 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from msg_analysis.common.files import REPORT_FILE
+from msg_analysis.common.files import REPORT_FILE, RESULT_FILE, write_whole
+from msg_analysis.common.text import json_text
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run import Run
 
@@ -216,6 +217,37 @@ class RunResult:
             return False
         return self.bag is not None and any(self.bag.glob("*.mcap"))
 
+    @property
+    def incomplete(self) -> bool:
+        """Whether a process failed, or states are missing."""
+        return bool(self.failures) or (self.trajectory is not None and not self.trajectory.completeness.complete)
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of result.json and of ``msg-agents run --json``."""
+        document: dict[str, Any] = {"verdict": "incomplete" if self.incomplete else None}  # None: nothing to judge
+        if self.comparison is not None:
+            document = dict(self.comparison.to_json())
+        elif self.interrupted:
+            document |= _without_comparison(self.experiment)
+        return document | {
+            "bag": str(self.bag) if self.recorded else None,
+            "report": str(self.report) if self.report else None,
+            "rate": self.rate,
+            "wall_time": self.wall_time,
+            "restarts": self.restarts,
+            "events": self.events,
+            "strangers": self.strangers,
+            "failures": self.failures,
+            "clocks": self.clocks,
+            "channel": self.channel,
+            "until": self.until,
+        }
+
+    def write(self) -> None:
+        """Write result.json into the bag, if there is a comparison, or an interrupted run that left a bag."""
+        if self.bag is not None and (self.comparison is not None or (self.interrupted and self.recorded)):
+            write_whole(self.bag / RESULT_FILE, json_text(self.to_json(), 1).encode() + b"\n")
+
     def interrupt(self, by: int, during: str) -> None:
         """Note that a signal has ended the run or the comparison.
 
@@ -231,8 +263,21 @@ class RunResult:
         self.failures.insert(0, f"stopped by {name} {during}".rstrip())
 
 
+def _without_comparison(experiment: Experiment) -> dict[str, Any]:
+    """What `msg-analysis tabulate` reads of a result, without numbers."""
+    from msg_analysis.inference.estimates import Estimate
+
+    return {
+        "experiment": experiment.name,
+        "leaders": (experiment.leader_gains.nonzero()[0] + 1).tolist(),
+        "seed": experiment.run.seed,
+        "simulated_time": 0.0,
+        "system_error": Estimate().to_json(),
+    }
+
+
 def conclude(result: RunResult, report: ReportWhen = "always") -> None:
-    """Compare the bag of a run with its prediction, and write report.html into the bag.
+    """Compare the bag of a run with its prediction, and write report.html and result.json into the bag.
 
     Does nothing if there is no bag, or it was not read.
 
@@ -264,7 +309,6 @@ def conclude(result: RunResult, report: ReportWhen = "always") -> None:
         file = result.bag / REPORT_FILE
         write_report(
             comparison,
-            result.trajectory,
             file,
             restarts=result.restarts,
             strangers=result.strangers,
@@ -274,3 +318,4 @@ def conclude(result: RunResult, report: ReportWhen = "always") -> None:
         )
         result.report = file
     result.comparison = comparison
+    result.write()

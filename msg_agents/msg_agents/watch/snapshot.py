@@ -211,8 +211,8 @@ def run_description(experiment: Experiment) -> dict[str, Any]:
         "silent": max(SILENT, 5 * experiment.step_length / experiment.run.speed)
         if experiment.run.pace == "realtime"
         else SILENT,
-        "leaders": list(experiment.leaders.agents) if experiment.leaders else [],
-        "reference": experiment.reference if experiment.leaders else None,
+        "leaders": list(experiment.spec.leaders.agents) if experiment.spec.leaders else [],
+        "reference": experiment.reference if experiment.spec.leaders else None,
         "graphs": [
             {
                 "name": graph.name,

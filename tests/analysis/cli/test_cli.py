@@ -158,7 +158,7 @@ def test_compare(bag: Path) -> None:
 def test_the_exit_code_is_the_verdict(
     verdict: str, code: int, bag: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from msg_analysis import api
+    from msg_analysis.inference import pool
 
     class Comparison:
         exit_code = code
@@ -166,7 +166,7 @@ def test_the_exit_code_is_the_verdict(
         def to_json(self) -> dict[str, Any]:
             return {"verdict": verdict, "z": math.nan, "interval": (math.inf, 1.0)}
 
-    monkeypatch.setattr(api, "compare", lambda _, level: Comparison())
+    monkeypatch.setattr(pool, "compare", lambda _, level: Comparison())
     result = call("compare", bag, "--json")
     assert result.exit_code == code
     assert json.loads(result.stdout) == {"verdict": verdict, "z": None, "interval": [None, 1.0]}

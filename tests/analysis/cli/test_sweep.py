@@ -18,7 +18,7 @@ from click.testing import CliRunner
 
 from experiments import Experiment, compare, simulate
 from msg_analysis.cli.main import main
-from msg_analysis.sweep.workers import ENDING
+from msg_analysis.sweeps.workers import ENDING
 
 Call = Callable[..., tuple[int, str, str]]
 PROGRAM = Path(sys.executable).with_name("msg-analysis")
@@ -168,7 +168,7 @@ def test_failures_are_told_and_the_exit_code_says_so(tmp_path: Path, here: Call)
 def test_bad_usage(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, here: Call, arguments: list[str], words: str
 ) -> None:
-    monkeypatch.setattr("msg_analysis.sweep.workers._CONNECT", 0.2)
+    monkeypatch.setattr("msg_analysis.sweeps.workers._CONNECT", 0.2)
     monkeypatch.chdir(tmp_path)
     code, _, stderr = here(file(tmp_path, over={"run.dt": [0.05]}), *arguments)
     assert code == 2
@@ -178,7 +178,7 @@ def test_bad_usage(
 
 def test_without_msg_agents_networks_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from msg_analysis.errors import InputError
-    from msg_analysis.sweep import points
+    from msg_analysis.sweeps import points
 
     monkeypatch.setattr(points.sys, "executable", str(tmp_path / "python"))
     monkeypatch.setenv("PATH", str(tmp_path))

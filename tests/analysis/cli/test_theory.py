@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from experiments import GOLDEN, Experiment, predict
-from msg_analysis import Experiment, Run, read_bag
+from msg_analysis import read_bag
 from msg_analysis.cli import console
 from msg_analysis.cli import main as cli
 from msg_analysis.paper import examples
@@ -216,7 +216,7 @@ def test_spectrum_of_a_wrong_run(bag, tmp_path):
     """States that are 10 % too large: exit code 1."""
     run = read_bag(bag)
     wrong = tmp_path / "wrong"
-    Run.of(dataclasses.replace(run, states=1.1 * run.states)).save(wrong)
+    dataclasses.replace(run, states=1.1 * run.states).save(wrong)
     result = call("spectrum", wrong)
     assert result.exit_code == 1
     assert "The log disagrees with the predicted autocovariance" in result.stdout
@@ -233,7 +233,7 @@ def test_spectrum_of_runs_that_are_not_tested(tmp_path):
     states = Experiment.load(LINE_RING).with_run(duration=20).simulate()
     broken = states.states.copy()
     broken[150, 2] = np.nan
-    Run.of(dataclasses.replace(states, states=broken)).save(tmp_path / "torn")
+    dataclasses.replace(states, states=broken).save(tmp_path / "torn")
     result = call("spectrum", tmp_path / "torn", "--json")
     assert result.exit_code == 3
     assert json.loads(result.stdout)["log"]["steps"] == 149

@@ -26,8 +26,7 @@ from msg_analysis.experiment.examples import (
     shows,
     text_of,
 )
-from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.sweep.grid import load_sweep
+from msg_analysis.sweeps.grid import load_sweep
 
 OWN = {"name": "own", "graphs": {"line": {"path": [1, 2]}}}
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from experiments import Experiment, RunRecord
-from msg_analysis.api import Experiment
 from msg_analysis.experiment.experiment import ExperimentError
 from msg_analysis.inference.comparison import law_identity
 
@@ -121,8 +120,8 @@ def test_whole_numbers_are_numbers() -> None:
 def test_leaders_by_name() -> None:
     tracking = {"problem": "tracking", "leaders": {"agents": ["Kiel", 1]}}
     experiment = parsed({"net": towns(False)}, **tracking)
-    assert experiment.leaders
-    assert experiment.leaders.agents == [3, 1]
+    assert experiment.spec.leaders
+    assert experiment.spec.leaders.agents == [3, 1]
     tracking["leaders"] = {"agents": ["Köln"]}
     (line,) = mistakes({"net": towns(False)}, **tracking)
     assert line == 'leaders.agents: "Köln": expected one of the names Ulm, Bonn, Kiel, Jena: correct it'
@@ -132,7 +131,7 @@ def test_leaders_by_name() -> None:
 
 def test_names_change_no_number() -> None:
     """Not of a run, of its law, or of its record, in which they are."""
-    named = Experiment.of(parsed({"net": towns(False)}, run={"duration": 1, "replicas": 2}))
+    named = parsed({"net": towns(False)}, run={"duration": 1, "replicas": 2})
     document = named.to_document()
     assert document.pop("names") == TOWNS
     plain = Experiment.parse(document)

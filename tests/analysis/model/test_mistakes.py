@@ -85,7 +85,10 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
     ),
     (
         {"graphs.ring": {"edges": [[1, 2]], "weight": 0.5}},
-        ["graphs.ring.weight: unknown key", "as the third entry of a link, for example `edges: [[1, 2, 0.5]]`"],
+        [
+            "graphs.ring.weight: 0.5: expected with path, cycle, star, grid, complete only",
+            "as the third entry of a link, for example `edges: [[1, 2, 0.5]]`",
+        ],
     ),
     ({"graphs.ring": {"links": [[1, 2]]}}, ["graphs.ring.links: unknown key", "did you mean `edges`, or `arcs`"]),
     ({"graphs.ring": {"nodes": 3}}, ["graphs.ring.nodes: unknown key", "as `agents`, beside `graphs`"]),

@@ -123,7 +123,7 @@ def test_commands_about_linear_ones() -> None:
     assert all(fact["holds"] for fact in facts["facts"])
     assert facts["bounds"]["upper"] is None
     assert describe_transient(what, np.array([0.0, 1.0]))["system_error"][1] > 0
-    with pytest.raises(InputError, match=r"--law continuous: protocol metropolis \(msg_agents_example_protocols 0"):
+    with pytest.raises(InputError, match=r"law continuous: protocol metropolis \(msg_agents_example_protocols 0"):
         describe_transient(what, np.array([0.0]), law="continuous")
     selection = select_leaders(what, 1)
     assert selection.problem.law == "emulated"
@@ -136,7 +136,7 @@ def test_commands_about_linear_ones() -> None:
         a = w[np.ix_(follow, follow)]
         error = np.trace(scipy.linalg.solve_discrete_lyapunov(a, 0.1 * np.eye(2)))
         sets = {agents: value for value, agents in select_leaders(alone, 1).sets}
-        assert sets[(agent,)] == pytest.approx(error, rel=1e-10)
+        assert sets[(agent + 1,)] == pytest.approx(error, rel=1e-10)
     explained = describe_experiment(what)
     assert explained["protocol"]["name"] == "metropolis"
     assert explained["protocol"]["parameters"] == {"laziness": 0.0}

@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from msg_analysis.api import Experiment, InputError, NotAvailableError, Run, read_bag
+from msg_analysis import Experiment, InputError, NotAvailableError, Run, read_bag
 from msg_analysis.cli.main import main
 from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE
 from msg_analysis.report import export as export_files

@@ -105,7 +105,7 @@ def _comparison(trajectory: Run) -> Comparison:
 
 
 def _page(comparison: Comparison, path: Path) -> Page:
-    write_report(comparison, comparison.trajectory, path)
+    write_report(comparison, path)
     return _checked(path.read_text(encoding="utf-8"))
 
 
@@ -182,7 +182,7 @@ def test_what_became_of_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     stranger = {"node": "agent_1", "topic": "<b>graph", "reason": "other run", "count": 1234}
     path = tmp_path / "report.html"
     restarts = ["agent_2: killed by SIGKILL after step 7, started again"]
-    write_report(comparison, comparison.trajectory, path, restarts=restarts, strangers=[stranger])
+    write_report(comparison, path, restarts=restarts, strangers=[stranger])
     page = Page(path.read_text(encoding="utf-8"))
     for words in (*restarts, "<b>graph", "other run", "1234"):
         assert words in page.text
@@ -204,7 +204,7 @@ def test_replaces_and_leaves_nothing_half_written(tmp_path: Path, monkeypatch: p
     (tmp_path / "report.html").write_text("old")
     _page(comparison, tmp_path / "report.html")
     with pytest.raises(InputError, match="cannot be written"):
-        write_report(comparison, comparison.trajectory, tmp_path / "nowhere" / "report.html")
+        write_report(comparison, tmp_path / "nowhere" / "report.html")
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
 
 
@@ -216,7 +216,7 @@ def in_real_time(nanoseconds: int) -> Comparison:
 
 def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     comparison = in_real_time(150_000_000)
-    write_report(comparison, comparison.trajectory, tmp_path / "report.html")
+    write_report(comparison, tmp_path / "report.html")
     page = Page((tmp_path / "report.html").read_text())
     assert "The run agrees with the prediction; 100 % of the deadlines were missed." in page.text
     for text in (
@@ -231,7 +231,7 @@ def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert _plots(page) == 16
     without_figures(monkeypatch)
     on_time = in_real_time(0)
-    write_report(on_time, on_time.trajectory, tmp_path / "report.html")
+    write_report(on_time, tmp_path / "report.html")
     text = Page((tmp_path / "report.html").read_text()).text
     assert "The run agrees with the prediction." in text
     assert "600 of 600 (0 %)" not in text

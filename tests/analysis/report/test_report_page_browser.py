@@ -76,7 +76,7 @@ def reports(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., tuple[Pat
     def made(agents: int, **run: Any) -> tuple[Path, Run]:
         path, trajectory = tmp_path_factory.mktemp("reports") / "report.html", _trajectory(agents, **run)
         events = [KILLED] if len(trajectory.modes) > KILLED["step"] else []
-        write_report(compare(trajectory), trajectory, path, events=events)
+        write_report(compare(trajectory), path, events=events)
         return path, trajectory
 
     return made
@@ -148,7 +148,7 @@ def test_agents_by_name(tab: Tab, tmp_path: Path) -> None:
     names = ["Bad Ems", "<b>Ulm</b>", "$$x$$", "Kiel", "1"]
     trajectory = simulate(Experiment.parse(_document(5) | {"names": names}))
     path = tmp_path / "report.html"
-    write_report(compare(trajectory), trajectory, path)
+    write_report(compare(trajectory), path)
     page, log = _open(tab, path)
     _check(page, log, path)
     page.fill("#agents", "Kiel, Bad Ems ,3; 1")
@@ -174,7 +174,7 @@ def kinds(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Any], Path]:
     @functools.cache
     def made(make: Any) -> Path:
         path = tmp_path_factory.mktemp("kinds") / "report.html"
-        write_report(*make(), path)
+        write_report(make()[0], path)
         return path
 
     return made

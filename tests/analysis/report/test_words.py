@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from experiments import Run, RunRecord, compare, line_ring, new_record, simulate
-from msg_analysis.api import Experiment, Run, write_report
+from experiments import Experiment, Run, RunRecord, compare, line_ring, new_record, simulate
+from msg_analysis import write_report
 from msg_analysis.cli.main import main
 from msg_analysis.common.text import agent_name, agent_text, with_names
 from msg_analysis.errors import InputError
 from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.report.page import page_title, run_facts
 from msg_analysis.report.wording import furthest, order_statements, sentence
-from msg_analysis.sweep.grid import axis_name, column_words, load_sweep
+from msg_analysis.sweeps.grid import axis_name, column_words, load_sweep
 
 AGENTS = ["agent 1", "agent 2", "agent 3"]
 
@@ -169,7 +169,7 @@ def test_every_command(named_run: Run, tmp_path: Path) -> None:
 
 def test_notebooks_and_report(named_run: Run, tmp_path: Path) -> None:
     comparison = named_run.compare()
-    selection = named_run.experiment.select_leaders(1)
+    selection = named_run.experiment.leaders(1)
     prediction = named_run.experiment.predict()
     shown = (comparison, prediction, selection, prediction.emulated, prediction.continuous, prediction.static)
     for text in (one._repr_markdown_() for one in shown):
@@ -183,7 +183,7 @@ def test_notebooks_and_report(named_run: Run, tmp_path: Path) -> None:
 
 def test_stages_of_a_search(named_run: Run) -> None:
     stages: list[str] = []
-    named_run.experiment.select_leaders(2, method="swap", watch=lambda stage, *_: stages.append(stage))
+    named_run.experiment.leaders(2, method="swap", watch=lambda stage, *_: stages.append(stage))
     assert any(stage.startswith("greedy after agent ") for stage in stages)
     assert not any(character.isdigit() for stage in stages if "agent" in stage for character in stage)
 

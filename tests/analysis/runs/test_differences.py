@@ -161,9 +161,9 @@ def test_predictions_rates_and_leaders() -> None:
         assert (pair["a"], pair["b"]) == (rates[0][key], rates[1][key])
     assert found["rates"]["graph"]["relative"] == pytest.approx(4.0)
     for side, each in (("a", a), ("b", b)):
-        error, agents = each.select_leaders(1).sets[0]
+        error, agents = each.leaders(1).sets[0]
         best = found["leaders"][side]["best"]
-        assert (best["agents"], best["system_error"], best["gain"]) == ([agents[0] + 1], error, "inf")
+        assert (best["agents"], best["system_error"], best["gain"]) == (list(agents), error, "inf")
         assert found["leaders"][side]["agents"] is None
     json.dumps(found, allow_nan=False)
 
@@ -173,7 +173,7 @@ def test_one_with_leaders_and_one_without() -> None:
     led = four(problem="tracking", leaders={"agents": [1, 4], "gain": 2.0})
     found = experiment_difference(four(), led)["leaders"]
     assert found["b"]["agents"] == [1, 4]
-    assert found["b"]["system_error"] == led.select_leaders().present[0]  # type: ignore[index]
+    assert found["b"]["system_error"] == led.leaders().present[0]  # type: ignore[index]
     assert [len(found[side]["best"]["agents"]) for side in "ab"] == [2, 2]
     assert [found[side]["best"]["gain"] for side in "ab"] == [2.0, 2.0]
 

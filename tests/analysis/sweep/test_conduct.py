@@ -15,12 +15,12 @@ import yaml
 import experiments
 from experiments import Experiment, simulate
 from msg_analysis.errors import InputError
-from msg_analysis.sweep import results as conducting
-from msg_analysis.sweep.figure_series import picture
-from msg_analysis.sweep.grid import load_sweep
-from msg_analysis.sweep.points import DONE, FAILED, Job, Outcome, evaluate
-from msg_analysis.sweep.results import JOURNAL, OutcomeStore, arrow_table, conduct, judge_sweep, rows_of
-from msg_analysis.sweep.workers import Lost, Workers
+from msg_analysis.sweeps import results as conducting
+from msg_analysis.sweeps.figure_series import picture
+from msg_analysis.sweeps.grid import load_sweep
+from msg_analysis.sweeps.points import DONE, FAILED, Job, Outcome, evaluate
+from msg_analysis.sweeps.results import JOURNAL, OutcomeStore, arrow_table, conduct, judge_sweep, rows_of
+from msg_analysis.sweeps.workers import Lost, Workers
 
 
 def document(rate: float = 1.0, **run: Any) -> dict[str, Any]:
@@ -65,7 +65,7 @@ def test_ctrl_c_while_an_outcome_is_written(tmp_path: Path, monkeypatch: pytest.
         signal.raise_signal(signal.SIGINT)
         return written(descriptor, data)
 
-    monkeypatch.setattr("msg_analysis.sweep.results.os.write", write)
+    monkeypatch.setattr("msg_analysis.sweeps.results.os.write", write)
     with OutcomeStore.open(tmp_path) as store:
         with pytest.raises(KeyboardInterrupt):
             conduct([Job.of("predict", document(rate)) for rate in (0.5, 1.0)], store)

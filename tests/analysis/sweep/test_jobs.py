@@ -10,7 +10,7 @@ import pytest
 
 import msg_analysis
 from msg_analysis.errors import InputError
-from msg_analysis.sweep.points import (
+from msg_analysis.sweeps.points import (
     DONE,
     Job,
     NetworkOptions,
@@ -20,7 +20,7 @@ from msg_analysis.sweep.points import (
     source_digest,
     source_files,
 )
-from msg_analysis.sweep.results import JOURNAL, OutcomeStore
+from msg_analysis.sweeps.results import JOURNAL, OutcomeStore
 
 DOCUMENT = {"name": "two", "graphs": {"link": {"path": [1, 2]}}}
 
@@ -115,7 +115,7 @@ def test_lines_that_are_none_are_counted(tmp_path: Path, line: bytes) -> None:
 
 
 def test_one_writer_at_a_time(tmp_path: Path) -> None:
-    code = f"from msg_analysis.sweep.results import OutcomeStore; OutcomeStore.open({str(tmp_path)!r})"
+    code = f"from msg_analysis.sweeps.results import OutcomeStore; OutcomeStore.open({str(tmp_path)!r})"
     with OutcomeStore.open(tmp_path):
         with pytest.raises(InputError, match="another sweep is writing"):
             OutcomeStore.open(tmp_path)
@@ -133,7 +133,7 @@ def test_a_place_that_cannot_be(tmp_path: Path) -> None:
 PACKAGE = Path(msg_analysis.__file__).parent
 IMPORTED = """
 import sys
-from msg_analysis.sweep.jobs import evaluate, network_run
+from msg_analysis.sweeps.jobs import evaluate, network_run
 from msg_analysis.theory import prediction
 from msg_analysis.inference.verdict import compare
 from msg_analysis.twin import simulate

@@ -101,22 +101,23 @@ def test_system_error_against_kronecker_algebra(seed: int, directed: bool, gain:
     twin = Experiment.parse(discrete_document(seed, directed=directed))
     for law, model in (("continuous", experiment), ("emulated", experiment), ("discrete", twin)):
         expected = kronecker_error(model, leaders, law, gain)
-        assert system_error(model, list(leaders), law=law, gain=gain) == pytest.approx(expected, rel=1e-9)  # type: ignore[arg-type]
+        numbers = [agent + 1 for agent in leaders]
+        assert system_error(model, numbers, law=law, gain=gain) == pytest.approx(expected, rel=1e-9)  # type: ignore[arg-type]
 
 
 def test_leaders_of_the_experiment_do_not_count() -> None:
     consensus = Experiment.parse(random_document(1))
     led = {"problem": "tracking", "leaders": {"agents": [2], "gain": 0.5, "reference": 7.0}}
     tracking = Experiment.parse(random_document(1) | led)
-    assert system_error(tracking, [0, 3]) == system_error(consensus, [0, 3])
-    assert joint_robustness_centrality(tracking, [0, 3]) == 1.0 / system_error(consensus, [0, 3])
-    assert tracking.leaders.agents == [2]
+    assert system_error(tracking, [1, 4]) == system_error(consensus, [1, 4])
+    assert joint_robustness_centrality(tracking, [1, 4]) == 1.0 / system_error(consensus, [1, 4])
+    assert tracking.spec.leaders.agents == [2]
 
 
 def test_infinite_gain_is_the_limit_of_large_ones() -> None:
     experiment = Experiment.parse(random_document(2))
-    limit = system_error(experiment, [1, 2])
-    errors = [system_error(experiment, [1, 2], gain=gain) - limit for gain in (1e3, 1e4, 1e5)]
+    limit = system_error(experiment, [2, 3])
+    errors = [system_error(experiment, [2, 3], gain=gain) - limit for gain in (1e3, 1e4, 1e5)]
     assert errors[0] > errors[1] > errors[2] > 0
     assert errors[2] == pytest.approx(errors[1] / 10, rel=0.01)
 
@@ -129,7 +130,7 @@ def test_single_leader_of_one_graph_is_information_centrality(graph: Any) -> Non
     centrality = nx.information_centrality(graph)
     for agent in graph:
         expected = 2.0 * centrality[agent]
-        assert joint_robustness_centrality(experiment, [agent]) == pytest.approx(expected, rel=1e-10)
+        assert joint_robustness_centrality(experiment, [agent + 1]) == pytest.approx(expected, rel=1e-10)
 
 
 def between(distance: int) -> float:
@@ -271,12 +272,12 @@ def test_agents_that_hear_nobody_must_lead() -> None:
         "run": {"dt": 0.1, "duration": 10},
     }
     experiment = Experiment.parse(document)
-    assert system_error(experiment, [1, 2]) == math.inf
-    assert joint_robustness_centrality(experiment, [1, 2]) == 0.0
+    assert system_error(experiment, [2, 3]) == math.inf
+    assert joint_robustness_centrality(experiment, [2, 3]) == 0.0
     for method in ("exhaustive", "greedy", "swap"):
         selection = select_leaders(experiment, 2, method=method)  # type: ignore[arg-type]
-        assert [agents for _, agents in selection.sets] == [(0, 5)]
-        assert {0, 5} < set(select_leaders(experiment, 3, method=method).sets[0][1])  # type: ignore[arg-type]
+        assert [agents for _, agents in selection.sets] == [(1, 6)]
+        assert {1, 6} < set(select_leaders(experiment, 3, method=method).sets[0][1])  # type: ignore[arg-type]
         with pytest.raises(InputError, match="no set of 1 reaches all agents"):
             select_leaders(experiment, 1, method=method)  # type: ignore[arg-type]
 
@@ -288,15 +289,15 @@ def test_noise_on_the_air_is_looked_at_in_the_steps_law() -> None:
     problem = LeaderProblem(experiment, "emulated")
     assert problem.supermodular
     quiet = Experiment.parse(random_document(4, noise={"process": 1.0}))
-    assert problem.system_error(frozenset({0})) > system_error(quiet, [0], law="emulated")
-    with pytest.raises(InputError, match=r"--law continuous.*use emulated"):
+    assert problem.system_error(frozenset({0})) > system_error(quiet, [1], law="emulated")
+    with pytest.raises(InputError, match=r"law continuous.*use emulated"):
         resolve_law(experiment, "continuous")
 
 
 def test_limits_and_everybody() -> None:
     experiment = Experiment.parse(random_document(5))
-    assert system_error(experiment, list(range(5))) == 0.0
-    assert select_leaders(experiment, 5, gain=2.0).sets[0][1] == (0, 1, 2, 3, 4)
+    assert system_error(experiment, range(1, 6)) == 0.0
+    assert select_leaders(experiment, 5, gain=2.0).sets[0][1] == (1, 2, 3, 4, 5)
     path = Experiment.parse({"name": "path", "graphs": {"g": {"path": list(range(1, 61))}}})
     with pytest.raises(InputError, match="5461512 sets of 5 leaders: use swap"):
         select_leaders(path, 5, method="exhaustive")
@@ -314,7 +315,7 @@ def test_limits_and_everybody() -> None:
         ({"gain": 0.0}, "gain 0.0: expected a number > 0"),
         ({"gain": math.nan}, "gain nan"),
         ({"top": 0}, "top 0"),
-        ({"law": "discrete"}, "--law discrete.*use continuous or emulated"),
+        ({"law": "discrete"}, "law discrete.*use continuous or emulated"),
         ({"method": "best"}, "method best: expected one of auto, exhaustive"),
     ],
 )

@@ -408,7 +408,7 @@ def test_leaders(case, gain):
     consensus = Experiment.parse(document)
     leaders = {"problem": "tracking", "leaders": {"agents": [3], "gain": gain}}
     tracking = Experiment.parse(document | leaders)
-    found = system_error(consensus, [2], gain=gain)
+    found = system_error(consensus, [3], gain=gain)
     assert found == pytest.approx(predict(tracking).emulated.system_error, rel=1e-10)
     brute = Brute(case, tracking)
     assert found == pytest.approx(brute.course([0.0] * 3, 400)[-1].sum(), rel=1e-9)

@@ -28,9 +28,9 @@ from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import json_text
 from msg_analysis.errors import ExitCode, InputError
 from msg_analysis.inference.statistics import holm
-from msg_analysis.sweep.grid import Sweep
-from msg_analysis.sweep.points import DONE, FAILED, Job, NetworkOptions, Outcome, evaluate, installed_software
-from msg_analysis.sweep.workers import Lost, Workers, deferring_interrupts
+from msg_analysis.sweeps.grid import Sweep
+from msg_analysis.sweeps.points import DONE, FAILED, Job, NetworkOptions, Outcome, evaluate, installed_software
+from msg_analysis.sweeps.workers import Lost, Workers, deferring_interrupts
 
 if TYPE_CHECKING:
     import pyarrow as pa

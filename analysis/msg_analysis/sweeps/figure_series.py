@@ -16,8 +16,8 @@ from typing import Any
 from msg_analysis.common.text import HALF_WIDTH_95
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.problems import show
-from msg_analysis.sweep.grid import Sweep, key_words
-from msg_analysis.sweep.results import Row, column_names, is_number
+from msg_analysis.sweeps.grid import Sweep, key_words
+from msg_analysis.sweeps.results import Row, column_names, is_number
 
 DEFAULT_COLUMN = "system_error"
 
@@ -86,7 +86,7 @@ def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None, along:
         if column is None:  # nothing but failures
             names["value"] = wanted
         else:
-            raise InputError(f"--column {wanted}: not a column of numbers: expected one of {_offer(rows)}")
+            raise InputError(f"column {wanted}: not a column of numbers: expected one of {_offer(rows)}")
     several = several_values(sweep)
     along = along or next(iter(several), sweep.keys[0])
     others = [key for key in several if key != along] if sweep.spec.combine == "grid" else []

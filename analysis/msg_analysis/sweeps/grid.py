@@ -30,8 +30,8 @@ from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import other_kind, read_yaml
 from msg_analysis.experiment.problems import ExperimentError, problem, show, translate
-from msg_analysis.sweep.points import Job, JobKind
-from msg_analysis.sweep.sweep_file import MOST_POINTS, SweepSpec
+from msg_analysis.sweeps.points import Job, JobKind
+from msg_analysis.sweeps.sweep_file import MOST_POINTS, SweepSpec
 
 _PART = re.compile(r"([^\[\]]+)|\[(\d+)\]")
 
@@ -239,7 +239,7 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
     lines = _spec_problems(spec)
     if lines:
         raise ExperimentError(str(path), lines)
-    return _plan(path, spec, base, directory, checked)
+    return points_of(path, spec, base, directory, checked)
 
 
 def _spec_problems(spec: SweepSpec) -> list[str]:
@@ -271,7 +271,8 @@ def _combinations(spec: SweepSpec) -> Iterator[dict[str, Any]]:
         yield dict(zip(spec.over, values, strict=True))
 
 
-def _plan(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
+def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
+    """The sweep of a document; every point is checked. ExperimentError: all mistakes, with their points."""
     combinations = list(_combinations(spec))
     wrong: dict[str, list[int]] = {}  # line: indices of the combinations that have it
     points: list[Point] = []

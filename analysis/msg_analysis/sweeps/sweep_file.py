@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidato
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.network_spec import Count, expected, is_number
 from msg_analysis.model.run_record import Until
-from msg_analysis.sweep.points import JobKind
+from msg_analysis.sweeps.points import JobKind
 
 MOST_POINTS = 20_000  # of a sweep: the experiments of all are held in memory
 

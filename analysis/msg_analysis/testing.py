@@ -1,0 +1,48 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""For tests of other packages: a run must agree with its prediction."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from msg_analysis.inference.comparison import Comparison
+from msg_analysis.inference.pool import compare
+from msg_analysis.model.run import Run
+
+
+def assert_agrees(*runs: Run | str | Path, level: float = 0.001) -> Comparison:
+    """Fail unless a run, or several together, agree with the prediction.
+
+    A correct run fails with a probability of at most ``level``: fix the seed, or choose a small level.
+
+    Parameters
+    ----------
+    *runs
+        runs, or paths of their bags
+    level
+        probability of a false failure, all tests together; above 0, at most 0.5
+
+    Returns
+    -------
+    Comparison
+        for more assertions
+
+    Raises
+    ------
+    AssertionError
+        the verdict is not "agrees"; names the tests that are rejected, and the causes that were found
+    InputError, BagError
+        as of :func:`msg_analysis.compare`
+    """
+    comparison = compare(*runs, level=level)
+    if comparison.verdict != "agrees":
+        rejected = [f"{test.name} (adjusted p {test.p_adjusted:.3g})" for test in comparison.tests if test.rejected]
+        missing = f"{comparison.trajectory.completeness.missing} states are missing"
+        reasons = [
+            comparison.unpredicted or ", ".join(rejected) or missing,
+            *(cause.words for cause in comparison.blame),
+        ]
+        raise AssertionError(f"{comparison!r}: {'; '.join(reasons)}")
+    return comparison
