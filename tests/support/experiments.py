@@ -14,9 +14,12 @@ from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.verdict import compare as compare
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.twin.check import check as check
+from msg_analysis.twin.simulate import new_record as new_record
 from msg_analysis.twin.simulate import simulate
 
 GOLDEN = Path(__file__).parents[1] / "data/golden"
