@@ -1,6 +1,5 @@
 """Threads of linear algebra, hostile text, files that are whole, requests to fork servers, and how far work is."""
 
-import json
 import os
 import re
 import resource
@@ -9,16 +8,12 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import many_commands
 import numpy as np
 import pytest
 import scipy.linalg  # its library of linear algebra is another one than that of numpy
 import yaml
-from hypothesis import given
-from hypothesis import strategies as st
-from msg_analysis.common.forked_processes import LONGEST, MOST_DESCRIPTORS, _messages
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from experiments import compare, line_ring, read_bag, simulate, write_trajectory
@@ -162,30 +157,6 @@ def test_a_place_that_is_not_utf8(words: list[str], tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (2, "")
     assert re.fullmatch(r"error: .*\\udcff: not UTF-8: choose a name in UTF-8\n", done.stderr)
     assert list(tmp_path.iterdir()) == []
-
-
-REQUESTS = st.lists(
-    st.tuples(st.integers(0, 9000), st.lists(st.integers(3, 400), unique=True, max_size=5)), max_size=80
-)
-
-
-@given(REQUESTS)
-def test_every_request_is_in_one_message_with_its_descriptors(sizes: list[tuple[int, list[int]]]) -> None:
-    requests = [({"number": i, "text": "x" * size}, numbers) for i, (size, numbers) in enumerate(sizes)]
-    received: list[tuple[Any, list[int]]] = []
-    for message, descriptors in _messages(requests):
-        assert len(message) <= LONGEST
-        assert len(descriptors) == len(set(descriptors)) <= MOST_DESCRIPTORS
-        received += [(request, [descriptors[place] for place in places]) for request, places in json.loads(message)]
-    assert received == requests
-
-
-def test_few_messages() -> None:
-    """A network of forty processes is one, and what they share is sent once."""
-    (message,) = _messages(
-        [({"arguments": ["agent", "run.json", "--agent", str(i)]}, [5, 6, 10 + i]) for i in range(40)]
-    )
-    assert len(message[1]) == 42
 
 
 def test_what_is_told(tmp_path: Path) -> None:
