@@ -28,7 +28,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # With --jobs, what is started here would look for other jobs of this make, and build with one core.
 unexport MAKEFLAGS MFLAGS
 
-.PHONY: help setup demo wheels wheels-test test test-fast test-ros stress fuzz lint lint-container format bench calibrate docs colcon colcon-test container lock clean
+.PHONY: help setup demo wheels wheels-test test test-fast test-ros stress fuzz mutants lint lint-container format bench calibrate docs colcon colcon-test container lock clean
 
 help: ## Say what can be made
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -105,6 +105,15 @@ stress: setup ## Repeat every random fault 20 times (STRESS=N: N times), run eve
 
 fuzz: setup ## Damage 20,000 bags and 20,000 experiment files: only clean errors
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py
+
+# Of its own, as lint-container below: it is needed for this only.
+build/mutants/.installed:
+	$(PYTHON) -m venv build/mutants
+	build/mutants/bin/pip install --quiet --disable-pip-version-check mutmut==2.5.1
+	@touch $@
+
+mutants: setup build/mutants/.installed ## Change five core files in small ways, and count the changes that tests notice
+	$(BIN)/python benchmarks/mutants.py
 
 lint: setup ## Check style and types
 	$(BIN)/ruff check
