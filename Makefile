@@ -106,13 +106,11 @@ stress: setup ## Repeat every random fault 20 times (STRESS=N: N times), run eve
 fuzz: setup ## Damage 20,000 bags and 20,000 experiment files: only clean errors
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py
 
-# Of its own, as lint-container below: it is needed for this only.
-build/mutants/.installed:
-	$(PYTHON) -m venv build/mutants
-	build/mutants/bin/pip install --quiet --disable-pip-version-check mutmut==2.5.1
-	@touch $@
+# In a folder of its own, so that what the software needs stays as it is pinned.
+build/mutants/mutmut: | setup
+	$(PIP) install --target build/mutants --upgrade mutmut==2.5.1
 
-mutants: setup build/mutants/.installed ## Change five core files in small ways, and count the changes that tests notice
+mutants: build/mutants/mutmut ## Change five core files in small ways, and count the changes that tests notice
 	$(BIN)/python benchmarks/mutants.py
 
 lint: setup ## Check style and types
