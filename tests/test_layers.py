@@ -18,9 +18,9 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = {"msg_analysis": ROOT / "analysis/msg_analysis", "msg_agents": ROOT / "msg_agents/msg_agents"}
 LAYERS = {  # lowest first; what stands between two slashes may import each other; msg_agents is above msg_analysis
     "msg_analysis": "errors / common / arithmetic / protocol experiment / model / messages / theory / twin / bags / "
-    "inference / sweep / runs / report / __init__ / paper / cli / __main__",
+    "inference / sweeps / runs / report / __init__ / testing / paper / cli / __main__",
     "msg_agents": "terminal / discovery / environment / process_layout / channel / stepping / recovery / replay / "
-    "watch / run / doctor / nodes / __init__ / cli / __main__",
+    "watch / run / doctor / nodes / __init__ / testing / cli / __main__",
 }
 MOST_FILES = 210
 MOST_LINES = 500

@@ -72,7 +72,7 @@ def test_page(name: str, network, domain: int, monkeypatch: pytest.MonkeyPatch) 
     if "pyproject.toml" in written:  # not into this environment, as the page says
         pip = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps", "--no-build-isolation"]
         subprocess.run([*pip, "--target", place / "installed", place], check=True)
-        monkeypatch.setenv("PYTHONPATH", str(place / "installed"))
+        monkeypatch.setenv("PYTHONPATH", str(place / "installed"), prepend=os.pathsep)
     shell = [block for block in blocks(page, "sh") if "--out runs/" in block]
     for shown in console(page):
         for block in [block for block in shell if shown.command.split()[-1] in block]:
