@@ -28,7 +28,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # With --jobs, what is started here would look for other jobs of this make, and build with one core.
 unexport MAKEFLAGS MFLAGS
 
-.PHONY: help setup demo wheels wheels-test test test-fast test-ros stress fuzz lint lint-container format bench calibrate docs colcon colcon-test container lock clean
+.PHONY: help setup demo wheels wheels-test test test-fast test-ros stress fuzz mutants lint lint-container format bench calibrate docs colcon colcon-test container lock clean
 
 help: ## Say what can be made
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -105,6 +105,13 @@ stress: setup ## Repeat every random fault 20 times (STRESS=N: N times), run eve
 
 fuzz: setup ## Damage 20,000 bags and 20,000 experiment files: only clean errors
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py
+
+# In a folder of its own, so that what the software needs stays as it is pinned.
+build/mutants/mutmut: | setup
+	$(PIP) install --target build/mutants --upgrade mutmut==2.5.1
+
+mutants: build/mutants/mutmut ## Change five core files in small ways, and count the changes that tests notice
+	$(BIN)/python benchmarks/mutants.py
 
 lint: setup ## Check style and types
 	$(BIN)/ruff check

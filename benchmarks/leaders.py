@@ -1,4 +1,4 @@
-"""Leader selection: how long it takes, and how far from the best set it ends: the tables of docs/leaders.md.
+"""Leader selection: how long it takes, and how far from the best set it ends: the tables of docs/leader_theory.md.
 
 Random undirected networks: every graph is a ring in random order with half as many random chords, all weights 1;
 rates between 0.3 and 2; F = I; leaders held at the reference. One thread. Prints Markdown; takes about a minute and a

@@ -48,7 +48,7 @@ def run_of(replicas: int) -> tuple[RunRecord, list[bytes]]:
 
 
 def main() -> None:
-    """Print the table of docs/messages.md."""
+    """Print the table of docs/performance.md."""
     argparse.ArgumentParser(description=__doc__.partition("\n")[0]).parse_args()
     print("| replicas | compression | split | CPU per state | bytes per state |\n|---:|---|---|---:|---:|")
     for replicas in (1, 16):

@@ -2,8 +2,8 @@
 
     python cyclone_agent.py RUN_RECORD AGENT
 
-It does what docs/messages.md asks of an agent of your own; only the arithmetic of the step comes from msg_analysis. The
-other nodes are started one by one (docs/messages.md says how), in the same ROS_DOMAIN_ID.
+It does what docs/wire.md asks of an agent of your own; only the arithmetic of the step comes from msg_analysis. The
+other nodes are started one by one (docs/wire.md says how), in the same ROS_DOMAIN_ID.
 """
 
 from __future__ import annotations

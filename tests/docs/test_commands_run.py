@@ -32,7 +32,6 @@ TESTED = {  # and where
     r"msg-agents run lab\.yaml": "tests/integration/test_begin.py",
     r"msg-agents run line_ring\.yaml$|msg-agents run line_ring\.yaml --json": "tests/integration/test_docs.py",
     r"msg-agents run line_ring --no-record": "tests/integration/test_bag.py",
-    r"msg-agents run line_ring$": "tests/docs/test_pages.py",
     r"msg-agents run line_ring(\.yaml)? --web": "tests/integration/test_view.py",
     r"msg-agents run line_ring\.yaml --domain 42$": "tests/integration/test_markers.py",
     r"msg-agents run line_ring --domain 42 --await my_node": "tests/integration/test_cyclone.py",

@@ -1,4 +1,4 @@
-"""The pages with real processes: the tutorial from its first line to its last, and examples."""
+"""Pages word for word with real processes: every command and every Python block in order, with what they print."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
-from pages import ROOT, blocks, console, experiments, missing
+from pages import EXPERIMENTS, ROOT, blocks, console, experiments, files, missing, python
 
 DOCS = ROOT / "docs"
+NEXT_BLOCK = "next block of the page"
 
 
 def started(command: str, place: Path) -> subprocess.Popen[str]:
@@ -35,14 +36,21 @@ def ended(process: subprocess.Popen[str], code: int = 0) -> str:
     return stdout
 
 
-def script(text: str, place: Path) -> None:
+def script(text: str, place: Path, patch: pytest.MonkeyPatch) -> None:
     """Line by line; those that end with "&" go on until "wait"."""
     subprocess.run(["bash", "-n", "-c", text], check=True)
     meanwhile: list[subprocess.Popen[str]] = []
     for line in filter(None, text.splitlines()):
+        word, *rest = line.split()
         if line.endswith(" &"):
             meanwhile.append(started(line.removesuffix(" &"), place))
-        elif line == "wait":
+        elif word == "export":
+            for variable in rest:
+                patch.setenv(*variable.split("="))
+        elif word == "unset":
+            for variable in rest:
+                patch.delenv(variable)
+        elif word == "wait":
             while meanwhile:
                 ended(meanwhile.pop(0))
         else:
@@ -51,23 +59,48 @@ def script(text: str, place: Path) -> None:
 
 
 @pytest.mark.timeout(300)
-def test_tutorial(network, domain: int) -> None:
-    """Every command of the page that starts a network or looks at one, in order; tests/docs has seen the others.
+@pytest.mark.parametrize("name", ["index", "tutorial", "protocols"])
+def test_page(name: str, network, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its files, then its commands; the shell block with a bag is run before the first command that reads this bag.
 
-    The first block of a shell sets up what is set up here.
+    A domain that the page chooses is replaced by the test's own, as other tests run at the same time.
     """
-    page = DOCS / "tutorial.md"
-    ((name, text),) = experiments(page).items()
-    (network.directory / f"{name}.yaml").write_text(text)
-    by_hand = list(blocks(page, "sh"))[1]
-    assert "loud.json" in by_hand
+    page, place = DOCS / f"{name}.md", network.directory
+    written = files(page) | {f"{experiment}.yaml": text for experiment, text in experiments(page).items()}
+    for file, text in written.items():
+        (place / file).write_text(text)
+    if "pyproject.toml" in written:  # not into this environment, as the page says
+        pip = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps", "--no-build-isolation"]
+        subprocess.run([*pip, "--target", place / "installed", place], check=True)
+        monkeypatch.setenv("PYTHONPATH", str(place / "installed"), prepend=os.pathsep)
+    shell = [block for block in blocks(page, "sh") if "--out runs/" in block]
     for shown in console(page):
-        if shown.command.startswith(("msg-analysis info", "msg-analysis predict")):
-            continue
-        if "runs/loud" in shown.command and not (network.directory / "runs/loud").exists():
-            script(by_hand, network.directory)
-        printed = ended(started(shown.command, network.directory), 1 if "runs/loud" in shown.command else 0)
-        assert missing(shown.lines, printed) == []
+        for block in [block for block in shell if shown.command.split()[-1] in block]:
+            shell.remove(block)
+            script(block.replace("ROS_DOMAIN_ID=42", f"ROS_DOMAIN_ID={domain}"), place, monkeypatch)
+            assert os.environ.get("ROS_DOMAIN_ID") is None
+            monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        differs = int("disagrees" in "".join(shown.lines) or "differs from" in "".join(shown.lines))
+        assert missing(shown.lines, ended(started(shown.command, place), differs)) == []
+    assert shell == []
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("name", ["index", "protocols", "python"])
+def test_python_blocks(name: str, network, domain: int) -> None:
+    """One after the other, as in a notebook, in a folder with the examples; a block of text is what is printed."""
+    page, place = DOCS / f"{name}.md", network.directory
+    for file in EXPERIMENTS.glob("*.yaml"):
+        (place / file.name).write_text(file.read_text())
+    found = python(page)
+    code = f"\nprint({NEXT_BLOCK!r})\n".join(block for block, _ in found)
+    call = [sys.executable, "-P", "-W", "error::DeprecationWarning:__main__", "-c", code]
+    process = subprocess.run(
+        call, cwd=place, env=os.environ | {"MPLBACKEND": "agg"}, capture_output=True, text=True, timeout=280
+    )
+    assert process.returncode == 0, process.stderr
+    printed = process.stdout.split(f"{NEXT_BLOCK}\n")
+    assert [missing(shown, text) for (_, shown), text in zip(found, printed, strict=True)] == [[]] * len(found)
 
 
 @pytest.mark.parametrize("name", ["discrete", "tracking"])

@@ -33,6 +33,20 @@ def blocks(page: Path, *languages: str) -> Iterator[str]:
             yield textwrap.dedent(text)
 
 
+def python(page: Path) -> list[tuple[str, list[str]]]:
+    """All Python blocks in their order, each with the lines of a block of text directly below, if there is one."""
+    found = re.findall(
+        r"^```python\n(.*?)^```\n(?:\n```text\n(.*?)^```)?", page.read_text("utf-8"), re.MULTILINE | re.DOTALL
+    )
+    return [(code, shown.splitlines()) for code, shown in found]
+
+
+def files(page: Path) -> dict[str, str]:
+    """Blocks below a line with the name of a file alone."""
+    named = re.findall(r"^`([\w.]+)`\n\n```\w+\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    return dict(named)
+
+
 def console(page: Path) -> list[Shown]:
     """All commands of the blocks of a terminal, in their order."""
     shown = []

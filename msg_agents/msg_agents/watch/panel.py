@@ -18,7 +18,6 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from msg_agents.run.fork_server import Process
 from msg_agents.terminal import JobControl
 from msg_agents.watch.observer import RunObserver
 from msg_agents.watch.snapshot import Snapshot, SnapshotSource, run_description, snapshot_document
@@ -31,6 +30,7 @@ from msg_analysis.report.figures import shorten
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from msg_agents.run.fork_server import Process
     from msg_agents.watch.web_server import WebServer
     from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.inference.estimates import Estimate

@@ -167,3 +167,26 @@ def test_what_steers_a_run_is_signed() -> None:
     without = replace(RECORD, key=None)
     assert RunRules(without).progress(message.encode(), PROGRESS) == message
     assert sign(message, PROGRESS, None) == message
+
+
+def test_the_last_that_is_taken() -> None:
+    """The last step, the last agent, and the graph as far ahead as it may be; agents do not sign what the run does."""
+    rules, last = RunRules(RECORD), Progress(7, RUN, 2, 10)
+    assert RECORD.key is not None
+    for message, topic in ((last, PROGRESS), (replace(last, agent=0), END)):
+        signed = sign(message, topic, RECORD.key)
+        assert rules.progress(signed.encode(), topic) == signed
+    assert rules.progress(sign(replace(last, agent=1), END, RECORD.key).encode(), END) == Refusal.UNKNOWN_AGENT
+    ahead = RunRules(SWITCHING)
+    assert ahead.graph(published(PATH[0], sequence=10_000)) == Refusal.GRAPH_OUT_OF_RANGE
+    assert ahead.graph(published(PATH[0], sequence=10_001)) == Refusal.TOO_EARLY
+
+
+def test_impossible_states_are_refused_only_where_that_is_asked_for() -> None:
+    """Agents leave it to their synchronizer; the recorder asks for it."""
+    taken, refused = [], []
+    receive = state_receiver(
+        RECORD, 1, state_frame(RECORD, whole=False), lambda *found: taken.append(found), refused.append
+    )
+    receive(state(mode=2))
+    assert (len(taken), refused) == (1, [])
