@@ -36,12 +36,30 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "true")
 NOT_WRITTEN = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF}
 
 
+SHORT_HELP = 55  # most letters of the first sentence of a command's help, which the list of commands shows
+
+
 class CommandGroup(click.Group):
     """A click group that turns errors of the user into messages and exit codes; all help pages share its settings."""
 
     def __init__(self, *args: Any, **attributes: Any) -> None:
         attributes["context_settings"] = {"help_option_names": ["-h", "--help"], "show_default": True}
         super().__init__(*args, **attributes)
+        self.sections: dict[str, list[str]] = {}  # of the list of commands: title, names
+
+    def add_section(self, title: str, *commands: click.Command) -> None:
+        """Add commands, which the list of commands shows below this title."""
+        self.sections[title] = [str(command.name) for command in commands]
+        for command in commands:
+            self.add_command(command)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        """Write the commands of each section; see click.Group."""
+        width = max(map(len, self.commands))
+        for title, names in self.sections.items():
+            with formatter.section(title):
+                rows = [(f"{name:<{width}}", self.commands[name].get_short_help_str(SHORT_HELP)) for name in names]
+                formatter.write_dl(rows)
 
     def main(self, *args: Any, **extra: Any) -> Any:
         """Run the program; see click.Command."""

@@ -69,12 +69,13 @@ def sweep(
     keep_bags: bool,
     as_json: bool,
 ) -> None:
-    """Predict, simulate or run an experiment at many values of its keys, as described in the file SWEEP.
+    """Predict, simulate or run at many values of the keys.
 
-    Results are kept: after an interruption, the same command continues. Tables (Parquet, CSV, JSON), a figure and
+    The file SWEEP describes them. Results are kept: after an interruption, the same command continues. Tables
+    (Parquet, CSV, JSON), a figure and
     an interactive page are written next to them.
 
-    Exit code 0: success, 1: some run disagrees with its prediction, all runs judged together, 3: some point has no
+    Exit code 0: success, 1: some run disagrees with its prediction, all runs tested together, 3: some point has no
     result.
     """
     if workers and scheduler:

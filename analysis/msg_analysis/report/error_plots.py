@@ -28,6 +28,7 @@ from bokeh.palettes import interp_palette
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray, release
 from msg_analysis.common.text import HALF_WIDTH_95, agent_name
+from msg_analysis.report.comparison_text import TIMES
 from msg_analysis.report.plot_style import (
     BLACK,
     BLUE,
@@ -48,7 +49,6 @@ from msg_analysis.report.plot_style import (
     place_legend,
     plain_legend,
 )
-from msg_analysis.report.wording import TIMES
 
 MOST_DECADES = 12  # of evidence, shown either way
 MOST_LINES = 8  # agents whose convergence is drawn at once

@@ -25,7 +25,7 @@ from msg_analysis.experiment.graphs import Graph
 from msg_analysis.inference.autocovariance import LoggedAutocovariance, LoggedDensity
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.model.run import Run
-from msg_analysis.report.wording import agent_errors, verdict_line
+from msg_analysis.report.comparison_text import agent_errors, verdict_line
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.spectrum import Spectrum
 

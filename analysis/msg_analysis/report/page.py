@@ -37,26 +37,24 @@ from msg_analysis.inference.realtime_laws import SUPPORT
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.report import drawings, error_plots, plot_style, run_plots
-from msg_analysis.report.drawings import interval_bars, plus_minus
-from msg_analysis.report.error_plots import covariances
-from msg_analysis.report.plot_style import Accused
-from msg_analysis.report.run_plots import Event, run_events
-from msg_analysis.report.wording import (
+from msg_analysis.report.comparison_text import (
     QUANTILES,
     REAL_TIME_LAWS,
     TIMES,
     agent_errors,
     agent_order,
     any_time_words,
-    explain,
     furthest,
-    graph_facts,
     sentence,
     timing_facts,
     trust_words,
     unheard_words,
     verdict_line,
 )
+from msg_analysis.report.drawings import explain, graph_facts, interval_bars, plus_minus
+from msg_analysis.report.error_plots import covariances
+from msg_analysis.report.plot_style import Accused
+from msg_analysis.report.run_plots import Event, run_events
 from msg_analysis.theory.prediction import LAW_NAMES
 
 

@@ -20,8 +20,8 @@ from msg_analysis.common.files import RESULT_FILE
 from msg_analysis.common.text import half_width_text, markdown_table, measured_text, number_text, p_text, z_text
 from msg_analysis.inference.estimates import Estimate, Ranking, rank_estimates
 from msg_analysis.inference.statistics import two_sided
+from msg_analysis.report.comparison_text import order_statements
 from msg_analysis.report.tables import number_table, print_table, room_for_names
-from msg_analysis.report.wording import order_statements
 from msg_analysis.runs import Result
 
 

@@ -19,7 +19,6 @@ from rich.text import Text
 
 from msg_analysis.common.text import agent_name, counted, half_width_text, listed, number_text, p_text, z_text
 from msg_analysis.experiment.loading import amount
-from msg_analysis.report.wording import gaps
 from msg_analysis.runs import RunEntry
 from msg_analysis.sweep.figure_series import Picture, value_text
 from msg_analysis.sweep.grid import Sweep
@@ -150,6 +149,25 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
         console.print(Text(line, style="yellow"))
     if document["predicted_system_error"]:
         console.print("How long to run it, and what it will find: msg-analysis plan", style="dim")
+
+
+def gaps(count: dict[str, Any]) -> list[str]:
+    """Where the gaps of a log are, and what was refused, of ``completeness`` of a comparison; empty for a whole log."""
+    lines = []
+    if count["missing"]:
+        first, last = count.get("stretch") or (None, None)
+        if first is None:
+            lines.append("No step has the states of all agents.")
+        elif first == 0:
+            lines.append(f"All steps up to step {last} are complete.")
+        else:
+            lines.append(
+                f"The longest part without gaps is steps {first} to {last}; errors are computed only from step 0 on."
+            )
+    if count.get("refused"):
+        reasons = ", ".join(f"{number} x {reason}" for reason, number in count["refused"].items())
+        lines.append(f"Refused: {reasons}")
+    return lines
 
 
 def add_protocol(facts: Table, protocol: dict[str, Any] | None) -> None:

@@ -136,7 +136,7 @@ def play(
     domain: int | None,
     as_json: bool,
 ) -> None:
-    """Play BAG, a bag of ROS 2: publish its messages in the recorded order.
+    """Play BAG: publish its messages in the recorded order.
 
     No message is lost: the player waits for slow readers.
 
@@ -246,9 +246,9 @@ class PlayBar:
 @click.argument("bag", type=BAG, required=False)
 @json_option
 def check(bag: Path | None, *, as_json: bool) -> None:
-    """Recompute the run in BAG with the offline twin; report the first agent and step that differ.
+    """Recompute a run with the twin, bit for bit.
 
-    Without BAG, the newest bag below ./runs is checked.
+    The first step and agent that differ are reported. Without BAG, the newest bag below ./runs is checked.
     """
     from msg_analysis.bags.reading import read_bag
     from msg_analysis.cli.console import WorkProgress

@@ -33,8 +33,9 @@ def finish(
     interruption: Interruption,
     analyse: bool = True,
     report: ReportWhen = "always",
+    verbose: bool = False,
 ) -> None:
-    """Print the failures, judge what was recorded, show the result, and exit with its code.
+    """Print the failures, compare what was recorded, show the result, and exit with its code.
 
     ``interruption``: of the run; a signal ends the comparison, too, and nothing else.
     """
@@ -53,7 +54,7 @@ def finish(
             result.interrupt(signal.SIGINT, "while the run was compared with the prediction")
             complain(result.failures[0], "failed:")
     say(_ending(result), result.report)
-    _show(result, as_json)
+    _show(result, as_json, verbose)
     if _incomplete(result) or (analyse and result.bag is not None and result.comparison is None):
         sys.exit(ExitCode.INCOMPLETE)
     if result.comparison is not None:
@@ -77,9 +78,9 @@ def _ending(result: RunResult) -> dict[str, Any]:
     return {"text": f"The run has ended; {outcome}.", "verdict": verdict}
 
 
-def _show(result: RunResult, as_json: bool) -> None:
+def _show(result: RunResult, as_json: bool, verbose: bool) -> None:
     """Print the result on stdout; with a comparison, also write result.json into the bag's directory."""
-    document: dict[str, Any] = {"verdict": "incomplete" if _incomplete(result) else None}  # None: nothing to judge
+    document: dict[str, Any] = {"verdict": "incomplete" if _incomplete(result) else None}  # None: nothing to compare
     if result.comparison is not None:
         document = dict(result.comparison.to_json())
     elif result.interrupted:
@@ -105,7 +106,7 @@ def _show(result: RunResult, as_json: bool) -> None:
     if result.comparison is not None:
         from msg_analysis.report.comparison_text import print_comparison
 
-        print_comparison(document, result_console())
+        print_comparison(document, result_console(), verbose=verbose)
     for line in (result.channel or {}).get("findings", []):
         click.echo(f"Channel: {line}")
     if result.comparison is not None:

@@ -144,10 +144,10 @@ def live(
     web_host: str,
     domain: int | None,
 ) -> None:
-    """Watch a network, running or played: its errors so far next to their prediction.
+    """Watch the errors of a network next to their prediction.
 
-    It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The numbers are those of `msg-analysis
-    compare`, also published on the topic `estimate`; they are not a verdict.
+    The network runs, or is played. It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The
+    numbers are those of `msg-analysis compare`, also published on the topic `estimate`; they are not a verdict.
     """
     from msg_agents.nodes.live import watch
     from msg_agents.watch.panel import Display
@@ -237,11 +237,11 @@ class LiveView:
 @_timeout
 @domain_option
 def markers(*, rate: float, replica: int, frame: str, timeout: float | None, domain: int | None) -> None:
-    """Draw a network, running or played, for RViz and Foxglove: markers on the topic `markers`.
+    """Draw a network for RViz and Foxglove.
 
-    Agents on a circle, coloured by how far their states are from the mean (or the reference), and the links of the
-    active graph. It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The network never waits
-    for it.
+    It publishes markers on the topic `markers`: agents on a circle, coloured by how far their states are from the
+    mean (or the reference), and the links of the active graph. It ends with the run, or with Ctrl-C (exit code 3:
+    the end was not reached). The network never waits for it.
     """
     from msg_agents.nodes.markers import show_markers
 

@@ -81,16 +81,21 @@ def make_bag_directory(experiment: Experiment, out: Path, *, option: str = "--ou
 
 
 def load_with_overrides(
-    path: Path, run: Mapping[str, Any], *, name: Callable[[str], str] = "--{}".format
+    path: Path,
+    run: Mapping[str, Any],
+    *,
+    name: Callable[[str], str] = "--{}".format,
+    change: Callable[[Any], Any] = lambda document: document,
 ) -> Experiment:
     """The experiment, checked once, after values of ``run`` were replaced; None replaces nothing.
 
-    ``processes`` may be a number as text. ``name``: how errors call the new value of a key.
+    ``processes`` may be a number as text. ``name``: how errors call the new value of a key. ``change``: of other keys
+    of the file, made first.
     """
     changes = {key: value for key, value in run.items() if value is not None}
     if str(changes.get("processes", "")).isdigit():
         changes["processes"] = int(changes["processes"])
-    document = read_yaml(path)
+    document = change(read_yaml(path))
     if not changes or not isinstance(document, dict) or not isinstance(section := document.get("run", {}), dict):
         return Experiment.parse(document, source=str(path), directory=path.parent)
     changed = document | {"run": section | changes}

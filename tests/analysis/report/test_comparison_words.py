@@ -1,6 +1,6 @@
 """What a comparison says in sentences."""
 
-from msg_analysis.report.wording import furthest, order_statements, sentence
+from msg_analysis.report.comparison_text import furthest, order_statements, sentence
 
 NAMES = ["agent 1", "agent 2", "agent 3"]
 

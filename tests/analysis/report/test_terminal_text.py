@@ -12,7 +12,7 @@ from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.protocols import ProtocolInfo
 from msg_analysis.report import comparison_text, tables, theory_text
 from msg_analysis.report.documents import describe_experiment
-from msg_analysis.report.wording import explain
+from msg_analysis.report.drawings import explain
 from msg_analysis.theory.graph_indices import algebraic_connectivity
 
 
