@@ -66,7 +66,7 @@ def print_comparison(document: dict[str, Any], console: Console, *, verbose: boo
     if document.get("laws"):
         if verbose:
             _print_timing(document["timing"], document["laws"], console)
-        for line in [with_names(document["laws"]["why"], document.get("names")), *unheard_words(document)]:
+        for line in [with_names(document["laws"]["why"], document.get("names")), *lost_words(document)]:
             console.print(Text(line))
     _print_rejected(document.get("strangers") or [], console)
     if verbose:
@@ -251,7 +251,7 @@ def timing_facts(timing: dict[str, Any]) -> list[tuple[str, str]]:
     return facts
 
 
-def unheard_words(document: dict[str, Any]) -> list[str]:
+def lost_words(document: dict[str, Any]) -> list[str]:
     """That messages between agents were lost or late, in a sentence; empty where the experiment says so."""
     words = ((document.get("timing") or {}).get("unheard") or {}).get("words")
     return [with_names(sentence(words), document.get("names"))] if words else []
@@ -268,9 +268,9 @@ def agent_errors(document: dict[str, Any]) -> tuple[list[dict[str, Any]], bool]:
     They are where only these have intervals: in runs that are too short for intervals over all paths.
     """
     given = (document.get("given_path") or {}).get("node_errors") or []
-    if document["system_error"].get("standard_error") is None and given:
-        return given, True
-    return document["node_errors"] or [], False
+    corrected = bool(document["system_error"].get("standard_error") is None and given)
+    found = given if corrected else document["node_errors"] or []
+    return [{"p_adjusted": error.get("p_holm"), **error} for error in found], corrected  # results of before have p_holm
 
 
 def any_time_words(document: dict[str, Any]) -> list[str]:

@@ -17,7 +17,7 @@ from msg_analysis.common.text import agent_name, listed, z_text
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.report.figures import LABELLED, places, shorten
-from msg_analysis.report.plot_style import NOBODY, Accused, graph_variable
+from msg_analysis.report.plot_style import NOBODY, Candidates, graph_variable
 from msg_analysis.theory.graph_indices import algebraic_connectivity
 
 _LEAST_REACH = 0.02  # relative deviation at the ends of the narrowest scale
@@ -84,17 +84,17 @@ MOST_GRAPHS = 8
 """Most graphs that are drawn."""
 MOST_MODES = 6
 """Most graphs whose chain is drawn; with more, the report has a table of the rates."""
-MARK = ' class="accused"'
+MARK = ' class="candidate"'
 _SIDE = 200.0
 _WEIGHTS = 5  # different line widths
 
 
-def graph_drawings(experiment: Experiment, accused: Accused = NOBODY) -> list[Markup]:
+def graph_drawings(experiment: Experiment, candidates: Candidates = NOBODY) -> list[Markup]:
     """The first ``MOST_GRAPHS`` graphs, each agent at the same place in all of them; leaders are squares."""
     where = _scaled(places(experiment.graph_list), experiment.agents)
     leaders = set(experiment.leaders.agents) if experiment.leaders else set()
     return [
-        _graph(graph, where, graph_variable(mode), leaders, accused, experiment.names)
+        _graph(graph, where, graph_variable(mode), leaders, candidates, experiment.names)
         for mode, graph in enumerate(experiment.graph_list[:MOST_GRAPHS])
     ]
 
@@ -110,7 +110,7 @@ def _scaled(where: Mapping[int, FloatArray], agents: int) -> FloatArray:
 
 
 def _graph(
-    graph: Graph, where: FloatArray, colour: str, leaders: set[int], accused: Accused, names: Sequence[str] | None
+    graph: Graph, where: FloatArray, colour: str, leaders: set[int], candidates: Candidates, names: Sequence[str] | None
 ) -> Markup:
     radius = 11.0 if graph.agents <= 12 else 8.0 if graph.agents <= LABELLED else 3.0
     links = graph.edges if graph.symmetric else graph.arcs
@@ -118,7 +118,7 @@ def _graph(
         f'<svg viewBox="0 0 {_SIDE:g} {_SIDE:g}" role="img" aria-label="{escape(graph.name)}: {len(links)} links" '
         'xmlns="http://www.w3.org/2000/svg">',
         *_links(links, where, colour, radius, directed=not graph.symmetric),
-        *_marked_links(accused.links_of(graph.name), links, where),
+        *_marked_links(candidates.links_of(graph.name), links, where),
     ]
     for agent, (x, y) in enumerate(where, start=1):
         name = agent_name(agent, names)
@@ -128,15 +128,15 @@ def _graph(
             if agent in leaders
             else f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}"'
         )
-        hears: list[int] = (np.flatnonzero(graph.adjacency[agent - 1]) + 1).tolist()
-        heard = (
-            ", ".join(agent_name(other, names) for other in hears[:20]) + (", …" if len(hears) > 20 else "")
-            if hears
+        senders: list[int] = (np.flatnonzero(graph.adjacency[agent - 1]) + 1).tolist()
+        named = (
+            ", ".join(agent_name(other, names) for other in senders[:20]) + (", …" if len(senders) > 20 else "")
+            if senders
             else "no agent"
         )
         parts.append(
             f'<g>{shape} fill="var(--page)" stroke="{colour}" stroke-width="1.5"'
-            f"{MARK if agent in accused.agents else ''}/><title>{escape(f'{kind} {name} hears {heard}')}</title>"
+            f"{MARK if agent in candidates.agents else ''}/><title>{escape(f'{kind} {name} receives from {named}')}</title>"
         )
         if graph.agents <= LABELLED:
             size = radius * min(1.0, 2.4 / len(name)) if names else radius if agent < 100 else 0.8 * radius
@@ -177,7 +177,7 @@ def _marked_links(marked: set[tuple[int, int]], links: list[tuple[int, int, floa
     """The links that the verdict names, on top of the others."""
     there = {(source, target) for source, target, _ in links}
     return [
-        f'<path class="accused" d="M{_at(where[first - 1])}L{_at(where[second - 1])}" fill="none">'
+        f'<path class="candidate" d="M{_at(where[first - 1])}L{_at(where[second - 1])}" fill="none">'
         f"<title>named by the verdict: {first}-{second}</title></path>"
         for first, second in sorted(marked)
         if {(first, second), (second, first)} & there
@@ -193,7 +193,7 @@ def _at(point: FloatArray) -> str:
     return f"{point[0]:.1f} {point[1]:.1f}"
 
 
-def chain_drawing(experiment: Experiment, accused: Accused = NOBODY) -> Markup | None:
+def chain_drawing(experiment: Experiment, candidates: Candidates = NOBODY) -> Markup | None:
     """The chain: a circle per graph, an arrow per rate (or probability) from one to another.
 
     None for a single graph, and for more than ``MOST_MODES``.
@@ -217,7 +217,7 @@ def chain_drawing(experiment: Experiment, accused: Accused = NOBODY) -> Markup |
         for j in range(modes):
             if i != j and chain.matrix[i, j] > 0:
                 title = f"{unit} from {names[i]} to {names[j]}: {chain.matrix[i, j]:g}"
-                mark = MARK if accused.jump(names[i], names[j]) else ""
+                mark = MARK if candidates.jump(names[i], names[j]) else ""
                 parts.append(_jump(centres[i], centres[j], radius, f"{chain.matrix[i, j]:.4g}", title, mark))
     for mode, (x, y) in enumerate(centres):
         share = f"{100 * chain.stationary[mode]:.3g} %"
@@ -357,7 +357,7 @@ def _losses(experiment: Experiment) -> str:
         text += f", and {span} % of those of {len(special)} link{'s' if len(special) > 1 else ''}"
     if noise.burst is not None:
         text += f", on average {noise.burst:.3g} of a link in a row"
-    return text + (", and the last value that was heard takes the place of a lost one" if noise.holds else "")
+    return text + (", and the last received value takes the place of a lost one" if noise.holds else "")
 
 
 def _run(experiment: Experiment) -> str:
