@@ -136,7 +136,8 @@ def _graph(
         )
         parts.append(
             f'<g>{shape} fill="var(--page)" stroke="{colour}" stroke-width="1.5"'
-            f"{MARK if agent in candidates.agents else ''}/><title>{escape(f'{kind} {name} receives from {named}')}</title>"
+            f"{MARK if agent in candidates.agents else ''}/>"
+            f"<title>{escape(f'{kind} {name} receives from {named}')}</title>"
         )
         if graph.agents <= LABELLED:
             size = radius * min(1.0, 2.4 / len(name)) if names else radius if agent < 100 else 0.8 * radius
