@@ -199,14 +199,7 @@ class _Progress:
     """Progress display, a context manager."""
 
     def __init__(self, title: str, *, time_left: bool) -> None:
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            ProgressColumn,
-            TextColumn,
-            TimeElapsedColumn,
-        )
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
         from rich.text import Text
 
         from msg_analysis.common.text import SafeConsole

@@ -47,8 +47,7 @@ def main() -> None:
 
 @click.command(
     epilog=examples(
-        "msg-analysis predict line_ring",
-        "msg-analysis predict line_ring --set noise.process=2 --json | jq .emulated",
+        "msg-analysis predict line_ring", "msg-analysis predict line_ring --set noise.process=2 --json | jq .emulated"
     )
 )
 @experiment_argument
@@ -113,8 +112,7 @@ def simulate(
 
 @click.command(
     epilog=examples(
-        "msg-analysis leaders line_ring --count 2",
-        "msg-analysis leaders line_ring --count 2 --gain 0.5 --json",
+        "msg-analysis leaders line_ring --count 2", "msg-analysis leaders line_ring --count 2 --gain 0.5 --json"
     )
 )
 @experiment_argument
@@ -161,9 +159,7 @@ def leaders(experiment: Path, *, count: int | None, changes: tuple[str, ...], as
 
 @click.command(
     epilog=examples(
-        "msg-analysis figures",
-        "msg-analysis figures 3 --out paper --format pdf",
-        "msg-analysis figures 1 --emulate",
+        "msg-analysis figures", "msg-analysis figures 3 --out paper --format pdf", "msg-analysis figures 1 --emulate"
     )
 )
 @click.argument("example", type=click.Choice(["1", "2", "3", "all"]), default="all")

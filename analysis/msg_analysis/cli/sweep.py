@@ -94,7 +94,7 @@ def sweep(
 
         plan = load_sweep(sweep_file, checked)
     from msg_analysis.report.list_pages import write_sweep_page
-    from msg_analysis.report.sweep_figure import write_figure
+    from msg_analysis.report.sweep_plots import write_figure
     from msg_analysis.report.tables import describe_sweep, print_sweep, summary
     from msg_analysis.sweep.figure_series import picture
     from msg_analysis.sweep.points import options

@@ -150,10 +150,7 @@ UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}  # of --budget
 )
 @click.option("--budget", metavar="TIME", help="Time budget: 90s, 10min, 2h or 1d; finds the best replicas.")
 @click.option(
-    "--speed",
-    type=float,
-    metavar="STEPS",
-    help="Steps per second of a run in lockstep, as msg-agents run prints them.",
+    "--speed", type=float, metavar="STEPS", help="Steps per second of a run in lockstep, as msg-agents run prints them."
 )
 @level_option("Probability of a false 'disagrees', over all tests.")
 @set_option
@@ -223,13 +220,7 @@ def _parse_duration(text: str | None) -> float | None:
 @json_option
 @click.pass_context
 def spectrum(
-    context: click.Context,
-    source: Path,
-    *,
-    figure: Path | None,
-    level: float,
-    changes: tuple[str, ...],
-    as_json: bool,
+    context: click.Context, source: Path, *, figure: Path | None, level: float, changes: tuple[str, ...], as_json: bool
 ) -> None:
     """Predict autocovariance and spectrum, or test a bag.
 

@@ -26,11 +26,7 @@ from msg_analysis.common.text import (
 from msg_analysis.report.tables import fact_table, first_rows, interval_text, number_table, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 
-_METHODS = {
-    "exhaustive": "exhaustive search",
-    "greedy": "greedy selection",
-    "swap": "greedy selection with exchanges",
-}
+_METHODS = {"exhaustive": "exhaustive search", "greedy": "greedy selection", "swap": "greedy selection with exchanges"}
 
 
 def print_prediction(document: dict[str, Any], console: Console) -> None:

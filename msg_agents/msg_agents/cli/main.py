@@ -116,10 +116,7 @@ def _interruption() -> Interruption:
     help="Overrides run.pace: lockstep or realtime.",
 )
 @click.option(
-    "--speed",
-    type=float,
-    metavar="SPEED",
-    help="Overrides run.speed: units of simulated time per second (realtime).",
+    "--speed", type=float, metavar="SPEED", help="Overrides run.speed: units of simulated time per second (realtime)."
 )
 @click.option(
     "--delivery",
@@ -141,11 +138,7 @@ def _interruption() -> Interruption:
     help="How often, in total, killed agents or the switcher are restarted.",
 )
 @click.option(
-    "--domain",
-    type=click.IntRange(0, LAST_DOMAIN),
-    metavar="D",
-    show_default="a free one",
-    help="ROS_DOMAIN_ID.",
+    "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", show_default="a free one", help="ROS_DOMAIN_ID."
 )
 @click.option(
     "--await",

@@ -79,12 +79,7 @@ class _Rate(click.types.FloatParamType):
 @click.option("--duration", type=PositiveFloat(), metavar="SECONDS", help="Seconds of the bag to play.")
 @click.option("-l", "--loop", is_flag=True, help="Start again at the end.")
 @click.option("--paused", is_flag=True, help="Start paused; the space bar continues.")
-@click.option(
-    "--clock",
-    type=PositiveFloat(),
-    metavar="HZ",
-    help="Publish the time of the bag on /clock at this rate.",
-)
+@click.option("--clock", type=PositiveFloat(), metavar="HZ", help="Publish the time of the bag on /clock at this rate.")
 @click.option(
     "--topics",
     multiple=True,
@@ -110,11 +105,7 @@ class _Rate(click.types.FloatParamType):
 )
 @click.option("--await", "readers", multiple=True, metavar="NODE", help="Start when NODE reads the topics. Repeatable.")
 @click.option(
-    "--wait-timeout",
-    type=PositiveFloat(),
-    metavar="SECONDS",
-    default=30.0,
-    help="How long to wait for readers [s].",
+    "--wait-timeout", type=PositiveFloat(), metavar="SECONDS", default=30.0, help="How long to wait for readers [s]."
 )
 @domain_option
 @json_option

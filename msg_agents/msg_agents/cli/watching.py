@@ -226,11 +226,7 @@ class LiveView:
     epilog=examples("msg-agents markers --domain 42", "msg-agents markers --rate 30 --replica 2 --frame map"),
 )
 @click.option(
-    "--rate",
-    type=click.FloatRange(0, 1000, min_open=True),
-    metavar="HZ",
-    default=10.0,
-    help="Updates per second.",
+    "--rate", type=click.FloatRange(0, 1000, min_open=True), metavar="HZ", default=10.0, help="Updates per second."
 )
 @click.option("--replica", type=click.IntRange(1), metavar="R", default=1, help="Replica to draw.")
 @click.option("--frame", metavar="FRAME", default="network", help="Frame of reference: the fixed frame of RViz.")

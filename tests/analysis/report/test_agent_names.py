@@ -78,7 +78,7 @@ def test_notebooks_and_report(run: Run, tmp_path: Path) -> None:
         assert "Bonn" in text
     html = write_report(comparison, tmp_path / "report.html").read_text(encoding="utf-8")
     assert "the leader, agent Bonn, is pulled" in html
-    assert "leader, agent Bonn hears Ulm, Kiel" in html
+    assert "leader, agent Bonn receives from Ulm, Kiel" in html
     assert "<td>Kiel</td>" in html
     assert "agent 2" not in html
 

@@ -23,20 +23,20 @@ def order(distinctions, contradictions=()):
 
 def test_order_in_sentences():
     pairs = [pair(3, 2, 0.99999, True), pair(1, 2, 0.9951, None)]
-    assert order_statements(order(pairs, [pairs[1]]), NAMES, "is more certain than") == [
-        "Order, smallest measured error first: agent 3, agent 1, agent 2. 2 of 3 pairs differ significantly (level "
-        "0.01 for all pairs together).",
-        "Agent 3 is more certain than agent 2 (confidence > 99.99 %).",
-        "Agent 1 is more certain than agent 2 (confidence 99.51 %).",
+    assert order_statements(order(pairs, [pairs[1]]), NAMES, "has a smaller error than") == [
+        "Order, smallest measured error first: agent 3, agent 1, agent 2. 2 of 3 pairs differ significantly "
+        "(family-wise level 0.01).",
+        "Agent 3 has a smaller error than agent 2 (confidence > 99.99 %).",
+        "Agent 1 has a smaller error than agent 2 (confidence 99.51 %).",
         "Not significantly different: agent 3 and agent 1.",
-        "Measured, but predicted equal: agent 1 is more certain than agent 2 (confidence 99.51 %).",
+        "Unexpected: agent 1 has a smaller error than agent 2 (confidence 99.51 %); the theory predicts equal errors.",
     ]
     files = order_statements(order([pair(3, 2, 0.999, False)]), ["a.json", "b.json", "c.json"], "beats")
     assert files[1] == "c.json beats b.json (confidence 99.90 %)."
 
 
 def test_no_significant_difference():
-    (line,) = order_statements(order([]), NAMES, "is more certain than")
+    (line,) = order_statements(order([]), NAMES, "has a smaller error than")
     assert "0 of 3 pairs differ significantly" in line
 
 
