@@ -1,4 +1,4 @@
-"""MkDocs hook: the comment ``<!-- help: msg-agents msg-analysis -->`` becomes the help of all commands of these two."""
+"""MkDocs hook: the comment ``<!-- help: msg-analysis msg-agents -->`` becomes the help of all commands of these two."""
 
 from __future__ import annotations
 

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, Self
 import click
 from click.exceptions import Exit
 
-from msg_analysis.common.text import duration_text, json_text, visible
 from msg_analysis.errors import INTERRUPTED, ExitCode, InputError, killed_by
 
 if TYPE_CHECKING:
@@ -83,6 +82,8 @@ def _exit_codes() -> Iterator[None]:
     try:
         yield
     except click.ClickException as error:
+        from msg_analysis.common.text import visible
+
         vars(error)["message"] = visible(error.message)
         raise
     except InputError as error:
@@ -164,6 +165,8 @@ def _drop_stdout() -> None:
 
 def complain(text: str, label: str = "error:") -> None:
     """Print one error on stderr, behind a label that is red on a terminal."""
+    from msg_analysis.common.text import visible
+
     color = False if os.environ.get("NO_COLOR") else None
     click.echo(f"{click.style(label, fg='red', bold=True)} {visible(text)}", err=True, color=color)
 
@@ -182,12 +185,23 @@ def result_console() -> Console:
 
 def print_text(text: str) -> None:
     """Print lines on stdout, with the names in them made safe for terminals."""
+    from msg_analysis.common.text import visible
+
     click.echo(visible(text))
 
 
 def print_json(document: dict[str, Any], indent: int | None = None) -> None:
     """Print one JSON object on stdout; infinite numbers and NaN become null."""
+    from msg_analysis.common.text import json_text
+
     click.echo(json_text(document, indent))
+
+
+def print_note(line: str) -> None:
+    """Print one line on stderr, behind a coloured ``note:``."""
+    from msg_analysis.common import text
+
+    text.print_note(line)
 
 
 _LINE_PERIOD = 10.0  # s between two lines where there is no terminal
@@ -236,6 +250,8 @@ class _Progress:
 
     def _times(self) -> str:
         """The time so far, and what is left at the mean speed so far, once it is known."""
+        from msg_analysis.common.text import duration_text
+
         now = time.monotonic()
         text = f"{duration_text(now - self._begun)} so far"
         done, total, when = self._newest

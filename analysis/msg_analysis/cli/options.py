@@ -15,20 +15,17 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
-from msg_analysis.bags.mcap_chunks import (
-    BAG_SUFFIXES,
-    COMPRESSIONS,
-    DEFAULT_STORAGE,
-    MEGABYTE,
-    SMALLEST_SPLIT,
-    Compression,
-    Storage,
-)
-from msg_analysis.common.files import RESULT_FILE
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
-    from msg_analysis.api import Experiment
+    from msg_analysis import Experiment
+    from msg_analysis.bags.mcap_chunks import Compression, Storage
+
+# As in the modules of bags and results, whose imports take longer than --help may take.
+BAG_SUFFIXES = (".mcap", ".mcap.zstd", ".db3", ".db3.zstd")
+COMPRESSIONS = ("none", "zstd", "lz4")
+SMALLEST_SPLIT = 0.1  # MB
+RESULT_FILE = "result.json"
 
 
 def storage_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -37,7 +34,7 @@ def storage_options(command: Callable[..., None]) -> Callable[..., None]:
         click.option(
             "--compression",
             type=click.Choice(COMPRESSIONS),
-            default=DEFAULT_STORAGE.compression,
+            default="zstd",
             help="Compression of the chunks of the bag.",
         ),
         click.option(
@@ -53,6 +50,8 @@ def storage_options(command: Callable[..., None]) -> Callable[..., None]:
 
 def storage(compression: Compression, split_size: float | None) -> Storage:
     """The storage that these options ask for; ``split_size`` [MB, 10^6 bytes] is None for one file."""
+    from msg_analysis.bags.mcap_chunks import MEGABYTE, Storage
+
     try:
         size = None if split_size is None else round(split_size * MEGABYTE)
     except (ValueError, OverflowError) as error:  # nan, inf
@@ -170,7 +169,7 @@ def with_changes(document: Any, changes: Sequence[str]) -> Any:
 
 def load_experiment(path: Path, changes: Sequence[str]) -> Experiment:
     """The experiment of a file with the values of ``--set``."""
-    from msg_analysis.api import Experiment
+    from msg_analysis import Experiment
     from msg_analysis.experiment.loading import read_yaml
 
     if not changes:

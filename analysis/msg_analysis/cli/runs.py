@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from msg_analysis.cli.console import examples, print_json, print_text, result_console
+from msg_analysis.cli.console import examples, print_json, print_note, print_text, result_console
 from msg_analysis.cli.options import (
     BAG,
     FILE,
@@ -23,7 +23,6 @@ from msg_analysis.cli.options import (
     seed_option,
     verbose_option,
 )
-from msg_analysis.common.files import require_place
 from msg_analysis.common.resources import watched
 
 if TYPE_CHECKING:
@@ -119,8 +118,6 @@ def _open(page: Path) -> None:
     import sys
     import webbrowser
 
-    from msg_analysis.common.text import print_note
-
     address = page.absolute().as_uri()
     screen = sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
     if not screen or not webbrowser.open(address):
@@ -194,14 +191,15 @@ def compare(
 
     Exit code 0: agrees, 1: disagrees, 3: data incomplete, no verdict.
     """
-    from msg_analysis import api
+    import msg_analysis
     from msg_analysis.cli.console import WorkProgress
+    from msg_analysis.common.files import require_place
 
     require_place(report)
     with WorkProgress() as progress, watched(progress):
-        comparison = api.compare(*bags, level=level)
+        comparison = msg_analysis.compare(*bags, level=level)
         if report:
-            api.write_report(comparison, report)
+            msg_analysis.write_report(comparison, report)
     if as_json:
         print_json(comparison.to_json())
     else:

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from msg_analysis.cli.console import complain, examples, print_json, print_text, result_console
+from msg_analysis.cli.console import complain, examples, print_json, print_note, print_text, result_console
 from msg_analysis.cli.options import PATH, YAML, json_option
-from msg_analysis.common.text import finite, print_note
 from msg_analysis.errors import ExitCode, InputError, killed_by
 from msg_analysis.sweep.points import require_libraries
 
@@ -93,6 +92,7 @@ def sweep(
             checking.checked(done, total)
 
         plan = load_sweep(sweep_file, checked)
+    from msg_analysis.common.text import finite
     from msg_analysis.report.list_pages import write_sweep_page
     from msg_analysis.report.sweep_plots import write_figure
     from msg_analysis.report.tables import describe_sweep, print_sweep, summary

@@ -21,7 +21,6 @@ from msg_analysis.cli.options import (
     load_experiment,
     set_option,
 )
-from msg_analysis.common.files import require_place
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
@@ -62,6 +61,7 @@ def transient(
     as_json: bool,
 ) -> None:
     """Predict the errors over time, from the start of a run."""
+    from msg_analysis.common.files import require_place
     from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report.documents import describe_transient, write_transient_csv
 
@@ -137,7 +137,8 @@ UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}  # of --budget
 @click.command(
     epilog=examples(
         "msg-analysis plan line_ring --precision 1%",
-        "msg-analysis plan line_ring --budget 10min --speed 5000 --set noise.process=2",
+        "msg-analysis plan line_ring --budget 10min --speed 5000",
+        "msg-analysis plan line_ring --set run.replicas=64",
         "msg-analysis plan line_ring --json | jq .faults",
     )
 )
@@ -228,6 +229,7 @@ def spectrum(
 
     Exit code 0: predicted, or agrees, 1: disagrees, 3: data incomplete.
     """
+    from msg_analysis.common.files import require_place
     from msg_analysis.errors import ExitCode
     from msg_analysis.report.documents import measure_spectrum, predicted_spectrum
 

@@ -17,7 +17,6 @@ from click.shell_completion import CompletionItem
 from msg_agents.cli.entry_points import RosCommand, domain_option, enter
 from msg_analysis.cli.console import examples, print_json, print_text
 from msg_analysis.cli.options import BAG, PositiveFloat, json_option
-from msg_analysis.common.text import print_note
 from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -230,6 +229,8 @@ class PlayBar:
 
     def note(self, line: str) -> None:
         """Print a note, above the bar."""
+        from msg_analysis.common.text import print_note
+
         print_note(line, self._console)
 
 

@@ -15,9 +15,7 @@ import click
 
 from msg_agents.terminal import Interruption
 from msg_analysis.cli.console import complain, print_json, result_console
-from msg_analysis.common.files import RESULT_FILE, write_whole
 from msg_analysis.common.resources import watched
-from msg_analysis.common.text import json_text
 from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -80,6 +78,9 @@ def _ending(result: RunResult) -> dict[str, Any]:
 
 def _show(result: RunResult, as_json: bool, verbose: bool) -> None:
     """Print the result on stdout; with a comparison, also write result.json into the bag's directory."""
+    from msg_analysis.common.files import RESULT_FILE, write_whole
+    from msg_analysis.common.text import json_text
+
     document: dict[str, Any] = {"verdict": "incomplete" if _incomplete(result) else None}  # None: nothing to compare
     if result.comparison is not None:
         document = dict(result.comparison.to_json())

@@ -16,9 +16,8 @@ import click
 
 from msg_agents.cli import nodes
 from msg_agents.cli.entry_points import RosCommand, domain_option, enter
-from msg_analysis.cli.console import examples, print_json, print_text, result_console
+from msg_analysis.cli.console import examples, print_json, print_note, print_text, result_console
 from msg_analysis.cli.options import BAG, RUN_RECORD, PositiveFloat, json_option
-from msg_analysis.common.text import print_note
 from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
