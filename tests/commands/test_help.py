@@ -9,8 +9,8 @@ import shlex
 import subprocess
 import sys
 from collections import defaultdict
-from importlib.machinery import SourceFileLoader
 from pathlib import Path
+from runpy import run_path
 
 import click
 import pytest
@@ -23,7 +23,7 @@ from msg_analysis.cli.console import SHORT_HELP, CommandGroup
 from msg_analysis.common.files import RESULT_FILE
 
 DOCS = Path(__file__).parents[2] / "docs"
-HOOK = SourceFileLoader("commands_hook", str(DOCS / "hooks/commands.py")).load_module()
+HOOK = run_path(str(DOCS / "hooks/commands.py"))
 HEAVY = (
     *("numpy", "scipy", "networkx", "pydantic", "matplotlib", "rich", "jinja2", "yaml", "mcap", "zstandard", "lz4"),
     *("rclpy", "dask", "distributed", "pyarrow", "bokeh", "pandas", "msg_analysis.api", "msg_agents.run.runner"),
@@ -130,8 +130,8 @@ def test_every_command_and_option_is_documented(program: str, name: str) -> None
     """The command on a page; its options in the help that docs/hooks/commands.py puts into commands.md."""
     text = "".join(page.read_text(encoding="utf-8") for page in sorted(DOCS.glob("*.md")))
     assert f"`{program} {name}`" in text or f"`{name}`" in text
-    assert HOOK.COMMENT.findall(text) == [" ".join(PROGRAMS)] == ["msg-analysis msg-agents"]
-    shown = HOOK.on_page_content(f"<!-- help: {program} -->")
+    assert HOOK["COMMENT"].findall(text) == [" ".join(PROGRAMS)] == ["msg-analysis msg-agents"]
+    shown = HOOK["on_page_content"](f"<!-- help: {program} -->")
     (part,) = re.findall(rf"<summary><code>{program} {name}</code></summary>(.*?)</details>", shown, re.DOTALL)
     assert [each for each in map(long_name, options(program, name)) if not re.search(rf" {each}\b", part)] == []
 

@@ -21,7 +21,7 @@ from msg_analysis.common.text import half_width_text, markdown_table, measured_t
 from msg_analysis.inference.estimates import Estimate, Ranking, rank_estimates
 from msg_analysis.inference.statistics import two_sided
 from msg_analysis.report.comparison_text import order_statements
-from msg_analysis.report.tables import number_table, print_table
+from msg_analysis.report.tables import number_table, print_table, that_fit
 from msg_analysis.runs import Result
 
 
@@ -110,16 +110,20 @@ def to_markdown(rows: Sequence[Result]) -> str:
     return markdown_table(heads, body, names=4)
 
 
+_OPTIONAL = ("smallest p", "time", "seed", "experiment", "leaders", "± (95 %)")  # as in ``that_fit``
+
+
 def print_results(rows: Sequence[Result], level: float, console: Console) -> None:
     """Print the results as a table, and which system errors differ at ``level`` (all pairs together)."""
     heads, body = _shown(rows)
-    wide = ("experiment", "seed", "time", "smallest p") if console.is_terminal else ()  # too much for 80 columns
-    kept = [place for place, head in enumerate(heads) if head not in wide and {line[place] for line in body} != {"-"}]
-    table = number_table(console, "Results", *(heads[place] for place in kept))
-    names = short_names([row.file for row in rows]) if console.is_terminal else [row.file for row in rows]
-    table.columns[0].min_width = max(map(len, names), default=0)
-    for line, name in zip(body, names, strict=True):
-        table.add_row(Text(name), *(Text(line[place]) for place in kept[1:]))
+    columns: dict[str, Sequence[str]] = dict(zip(heads, zip(*body, strict=True), strict=True))
+    if console.is_terminal:
+        columns["result"] = short_names([row.file for row in rows])
+    columns = that_fit(console, columns, _OPTIONAL)
+    table = number_table(console, "Results", *columns)
+    table.columns[0].min_width = max(map(len, columns["result"]))
+    for line in zip(*columns.values(), strict=True):
+        table.add_row(*map(Text, line))
     print_table(console, table)
     for row in rows:
         if row.blame:

@@ -64,6 +64,22 @@ def print_table(console: Console, table: Table) -> None:
         print_wide(console, table, least + MARGIN + (table.columns[0].min_width or LEAST_NAME))
 
 
+def table_width(columns: Mapping[str, Sequence[str]]) -> int:
+    """Width of a ``number_table`` with these headings and cells, if nothing is folded."""
+    return 1 + sum(MARGIN + max(map(cell_len, (head, *cells))) for head, cells in columns.items())
+
+
+def that_fit(
+    console: Console, columns: Mapping[str, Sequence[str]], optional: Sequence[str]
+) -> dict[str, Sequence[str]]:
+    """The columns without empty ones and, on a terminal that is too narrow, without optional ones, first ones first."""
+    kept = {head: cells for head, cells in columns.items() if set(cells) != {"-"}}
+    for head in optional if console.is_terminal else ():
+        if table_width(kept) > console.width:
+            kept.pop(head, None)
+    return kept
+
+
 def print_wide(console: Console, table: Table, least: int) -> None:
     """Print a table with at least this width, wider than the terminal if need be."""
     width = console.width
@@ -328,27 +344,20 @@ def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Cons
     columns: dict[str, Sequence[str]] = dict(zip(heads, zip(*rows, strict=True), strict=True))
     if all(Path(run.folder).name.startswith(f"{run.name}_{run.date:%Y%m%d_%H%M}") for run in runs):
         del columns["experiment"], columns["date"]  # the names of the folders have them
-    columns = {head: cells for head, cells in columns.items() if set(cells) != {"-"}}
-    for head in _OPTIONAL if console.is_terminal else ():
-        if _width(columns) > console.width:
-            columns.pop(head, None)
+    columns = that_fit(console, columns, _OPTIONAL)
     table = number_table(console, f"Runs in {folder}", *columns)
     for run, cells in zip(runs, zip(*columns.values(), strict=True), strict=True):
         style = _STYLES.get(run.verdict or "", "dim" if run.verdict is None else "")
         table.add_row(
             *(Text(cell, style if head == "verdict" else "") for head, cell in zip(columns, cells, strict=True))
         )
-    print_wide(console, table, _width(columns))
+    print_wide(console, table, table_width(columns))
     counts = Counter(run.verdict or run.status for run in runs)
     number = f"{counted(len(runs), 'run')}{f' of {total}' if len(runs) < total else ''}"
     console.print(Text(f"{number}: {', '.join(f'{count} {word}' for word, count in counts.most_common())}"))
     for run in runs:
         if run.status == "damaged" and run.problem:
             console.print(Text(f"damaged: {run.problem}", style="yellow"))
-
-
-def _width(columns: Mapping[str, Sequence[str]]) -> int:
-    return 1 + sum(MARGIN + max(map(cell_len, (head, *cells))) for head, cells in columns.items())
 
 
 def describe_sweep(sweep: Sweep, done: Conducted, judgement: Judgement, rows: Sequence[SweepRow]) -> dict[str, Any]:
