@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -62,16 +62,13 @@ if TYPE_CHECKING:
 def runs(
     folder: Path,
     *,
-    name: str | None,
-    verdicts: tuple[str, ...],
     since: str | None,
     until: str | None,
-    seed: int | None,
-    last: int | None,
     sort: SortKey,
     page: Path | None,
     shown: bool,
     as_json: bool,
+    **filters: Any,
 ) -> None:
     """List the runs in FOLDER, or write a page of them.
 
@@ -84,12 +81,9 @@ def runs(
 
     now = datetime.now().astimezone()
     wanted = RunFilter(
-        name=name,
-        verdicts=verdicts,
         since=moment(since, "--since", now) if since is not None else None,
         until=moment(until, "--until", now, end=True) if until is not None else None,
-        seed=seed,
-        last=last,
+        **filters,
     )
     page = page or (folder / "index.html" if shown else None)
     require_place(page)

@@ -57,16 +57,16 @@ other_software = click.option(
 @click.pass_context
 def sweep(
     context: click.Context,
+    /,
     sweep_file: Path,
     *,
     out: Path | None,
     workers: int | None,
     scheduler: str | None,
     column: str | None,
-    retry: bool,
-    other_software: OtherSoftware,
     keep_bags: bool,
     as_json: bool,
+    **how: Any,
 ) -> None:
     """Predict, simulate or run at many values of the keys.
 
@@ -111,8 +111,7 @@ def sweep(
             workers=workers,
             scheduler=scheduler,
             network=network,
-            other_software=other_software,
-            retry=retry,
+            **how,
         )
         judgement = judge_sweep(done.outcomes, plan.spec.level)
         rows = rows_of(plan, done.outcomes, judgement)

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -50,16 +50,7 @@ if TYPE_CHECKING:
 @click.option("--moments", is_flag=True, help="With --json: also means and second moments of every graph.")
 @click.option("--csv", "table", type=FILE, metavar="FILE", help="Also write a CSV table.")
 @json_option
-def transient(
-    experiment: Path,
-    times: str,
-    law: str,
-    unreduced: bool,
-    fraction: float,
-    moments: bool,
-    table: Path | None,
-    as_json: bool,
-) -> None:
+def transient(experiment: Path, times: str, *, table: Path | None, as_json: bool, **options: Any) -> None:
     """Predict the errors over time, from the start of a run."""
     from msg_analysis.common.files import require_place
     from msg_analysis.experiment.experiment import Experiment
@@ -68,14 +59,7 @@ def transient(
     require_place(table)
     loaded = Experiment.load(experiment)
     loaded.require_available("predict")
-    document = describe_transient(
-        loaded,
-        _parse_times(times),
-        law=law,  # type: ignore[arg-type]  # click has checked it
-        unreduced=unreduced,
-        moments=moments,
-        fraction=fraction,
-    )
+    document = describe_transient(loaded, _parse_times(times), **options)
     if table:
         write_transient_csv(document, table)
     if as_json:

@@ -52,7 +52,8 @@ def state_difference(a: Run, b: Run) -> dict[str, Any]:
     States of a step count as equal if both are missing; +0 and -0 are different.
     """
     if a.states.shape[1:] != b.states.shape[1:]:
-        why = f"{_shape(a)} and {_shape(b)}"
+        shapes = [run.states.shape[1:] for run in (a, b)]
+        why = " and ".join(f"{agents} agents with {counted(width, 'number')} each" for agents, width in shapes)
         return {"compared": None, "why": why, "equal": None, **dict.fromkeys(_KEYS)}
     steps = min(len(a.states), len(b.states)) - 1
     found = _Differences(a.record.experiment.step_length)
@@ -86,11 +87,6 @@ def graph_difference(a: Run, b: Run) -> dict[str, Any] | None:
     return {"step": step, "a": names_a[a.modes[step]], "b": names_b[b.modes[step]], "steps": int(differs.sum())}
 
 
-def _shape(run: Run) -> str:
-    agents, width = run.states.shape[1:]
-    return f"{agents} agents with {width} {'number' if width == 1 else 'numbers'} each"
-
-
 _KEYS = ("first", "largest", "last", "steps", "states", "only_a", "only_b")
 
 
@@ -109,7 +105,7 @@ class _Differences:
 
     def add(self, begin: int, a: FloatArray, b: FloatArray) -> None:
         """Take the states (steps, agents, width) of both runs, from step ``begin`` on."""
-        has_a, has_b = _there(a), _there(b)
+        has_a, has_b = (np.asarray(~np.isnan(states).any(axis=2)) for states in (a, b))  # (steps, agents)
         self.only_a += int((has_a & ~has_b).sum())
         self.only_b += int((has_b & ~has_a).sum())
         both = has_a & has_b
@@ -136,11 +132,6 @@ class _Differences:
         if self.largest is None or size > self.largest["difference"]:
             place = [int(index) for index in np.unravel_index(int(np.argmax(sizes)), sizes.shape)]
             self.largest = {"step": begin + place[0], "agent": place[1] + 1, "number": place[2] + 1, "difference": size}
-
-
-def _there(states: FloatArray) -> BoolArray:
-    """(steps, agents) which states are not missing."""
-    return np.asarray(~np.isnan(states).any(axis=2))
 
 
 def differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -188,8 +179,7 @@ def experiment_difference(a: Experiment, b: Experiment, watch: SearchProgress = 
     rates = [_rates(prediction) if isinstance(prediction, Prediction) else {} for prediction in found]
     return {
         "kind": "experiments",
-        "a": _side(a, found[0]),
-        "b": _side(b, found[1]),
+        **{name: _side(*each) for name, each in zip("ab", zip(pair, found, strict=True), strict=True)},
         "keys": differing(*(flat(experiment.to_document()) for experiment in pair)),
         "predictions": {law: _errors(*(side.get(law) for side in laws)) for law in {**laws[0], **laws[1]}},
         "rates": {key: relative(*(side.get(key) for side in rates)) for key in _RATES},
@@ -221,23 +211,16 @@ def _prediction(experiment: Experiment) -> Prediction | str:
 def _laws(prediction: Prediction) -> dict[str, Moments]:
     """By their names in ``msg-analysis predict --json``."""
     steps = "discrete" if prediction.experiment.time == "discrete" else "emulated"
-    laws = {
-        "continuous": prediction.continuous_moments,
-        steps: prediction.emulated,
-        "static": prediction.static_moments,
-    }
+    laws = {"continuous": prediction.continuous_moments, steps: prediction.emulated}
+    laws["static"] = prediction.static_moments
     return {name: moments for name, moments in laws.items() if moments is not None}
 
 
 def _errors(a: Moments | None, b: Moments | None) -> dict[str, Any]:
     nodes_a, nodes_b = (moments.node_errors.tolist() if moments else [] for moments in (a, b))
-    return {
-        "system_error": relative(*(moments.system_error if moments else None for moments in (a, b))),
-        # Agents of networks of different sizes have nothing in common but their numbers.
-        "node_errors": [relative(*pair) for pair in zip(nodes_a, nodes_b, strict=True)]
-        if len(nodes_a) == len(nodes_b)
-        else [],
-    }
+    pairs = zip(nodes_a, nodes_b, strict=True) if len(nodes_a) == len(nodes_b) else ()  # else not the same agents
+    system = relative(*(moments.system_error if moments else None for moments in (a, b)))
+    return {"system_error": system, "node_errors": [relative(*pair) for pair in pairs]}
 
 
 def _rates(prediction: Prediction) -> dict[str, float | None]:
@@ -256,13 +239,9 @@ def _leaders(
         own = experiment.spec.leaders
         pattern = own or other.spec.leaders
         count, gain = (len(pattern.agents), pattern.gain) if pattern else (1, math.inf)
-        side: dict[str, Any] = {
-            "agents": list(own.agents) if own else None,
-            "gain": _gain(own.gain) if own else None,
-            "system_error": None,
-            "best": None,
-            "note": None,
-        }
+        side: dict[str, Any] = dict.fromkeys(("agents", "gain", "system_error", "best", "note"))
+        if own:
+            side |= {"agents": list(own.agents), "gain": "inf" if math.isinf(own.gain) else own.gain}
         sides.append(side)
         if isinstance(prediction, str):
             side["note"] = "no prediction"
@@ -275,19 +254,10 @@ def _leaders(
                 side["note"] = str(error)
                 continue
             document = selection.to_json()
-            best = document["sets"][0]
-            side["best"] = {
-                "agents": best["agents"],
-                "system_error": best["system_error"],
-                "gain": document["gain"],
-                "law": document["law"],
-            }
+            best = {key: document["sets"][0][key] for key in ("agents", "system_error")}
+            side["best"] = best | {key: document[key] for key in ("gain", "law")}
             side["system_error"] = document["present"]["system_error"] if document["present"] else None
     return sides
-
-
-def _gain(gain: float) -> float | str:
-    return "inf" if math.isinf(gain) else gain
 
 
 _NUMBERS = ("measured", "standard_error", "predicted")
@@ -314,7 +284,7 @@ def bag_difference(a: Path, b: Path) -> dict[str, Any]:
         "errors": {
             "independent": one.experiment.run.seed != other.experiment.run.seed,
             "system": measured(*(side["system_error"] for side in sides)),
-            "agents": _agents(*(_agent_errors(result) for result in results)),
+            "agents": _agents(*results),
         },
     }
 
@@ -358,15 +328,11 @@ def _result(path: Path, run: Run) -> dict[str, Any]:
         return {"verdict": None, "unpredicted": str(error)}
 
 
-def _agent_errors(result: dict[str, Any]) -> list[dict[str, Any]]:
-    if "node_errors" not in result:
-        return []
-    return [_with_interval(node) for node in agent_errors(result)[0]]
-
-
-def _agents(a: list[dict[str, Any]], b: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Side by side, where both runs have as many agents; empty otherwise."""
-    return [measured(*pair) for pair in zip(a, b, strict=True)] if len(a) == len(b) else []
+def _agents(*results: dict[str, Any]) -> list[dict[str, Any]]:
+    """The agent errors side by side, where both runs have as many agents; empty otherwise."""
+    a, b = (agent_errors(result)[0] if "node_errors" in result else [] for result in results)
+    pairs = zip(a, b, strict=True) if len(a) == len(b) else ()
+    return [measured(*map(_with_interval, pair)) for pair in pairs]
 
 
 def _with_interval(error: dict[str, Any]) -> dict[str, Any]:
@@ -387,24 +353,23 @@ def print_bag_difference(document: dict[str, Any], console: Console) -> None:
     """Print a document of ``bag_difference``."""
     a, b = document["a"], document["b"]
     facts = number_table(console, "Runs", "", "A", "B")
-    for title, values in (
-        ("bag", [side["bag"] for side in (a, b)]),
-        ("experiment", [side["experiment"] for side in (a, b)]),
-        ("seed", [str(side["seed"]) for side in (a, b)]),
-        ("steps", [str(side["steps"]) for side in (a, b)]),
-        ("states missing", [_missing(side) for side in (a, b)]),
-        ("verdict", [side["verdict"] or "none" for side in (a, b)]),
-    ):
-        facts.add_row(title, *map(Text, values))
+    for key in ("bag", "experiment", "seed", "steps"):
+        facts.add_row(key, *(Text(str(side[key])) for side in (a, b)))
+    facts.add_row("states missing", *(Text(_missing(side)) for side in (a, b)))
+    facts.add_row("verdict", *(Text(side["verdict"] or "none") for side in (a, b)))
     print_table(console, facts)
     _print_keys("Experiment", document["keys"], console)
     _print_keys("Versions", document["versions"], console)
     for line in _states(document):
         console.print(Text(line))
     _print_error_differences(document["errors"], _names(document), console)
-    for name, side in (("A", a), ("B", b)):
-        if side["unpredicted"]:
-            console.print(Text(f"{name} has no prediction: {side['unpredicted']}"))
+    _print_unpredicted(document, console)
+
+
+def _print_unpredicted(document: dict[str, Any], console: Console) -> None:
+    for name in "ab":
+        if reason := document[name]["unpredicted"]:
+            console.print(Text(f"{name.upper()} has no prediction: {reason}"))
 
 
 def print_experiment_difference(document: dict[str, Any], console: Console) -> None:
@@ -412,9 +377,7 @@ def print_experiment_difference(document: dict[str, Any], console: Console) -> N
     a, b = document["a"], document["b"]
     console.print(Text(f"A: {a['file']} ({a['name']})\nB: {b['file']} ({b['name']}); changes are from A to B"))
     _print_keys("Keys", document["keys"], console)
-    for name, side in (("A", a), ("B", b)):
-        if side["unpredicted"]:
-            console.print(Text(f"{name} has no prediction: {side['unpredicted']}"))
+    _print_unpredicted(document, console)
     for law, errors in document["predictions"].items():
         table = number_table(
             console, f"Mean-square error in the steady state, {LAW_NAMES[law]}", "", "A", "B", "change"
@@ -445,12 +408,10 @@ def _print_keys(title: str, keys: Sequence[dict[str, Any]], console: Console) ->
         return
     table = fact_table(console, f"{title}: {counted(len(keys), 'difference')}")
     for entry in keys:
-        table.add_row(Text(entry["key"]), Text(f"A: {_value(entry['a'])}\nB: {_value(entry['b'])}"))
+        values = (entry["a"], entry["b"])
+        texts = ["-" if value is None else value if isinstance(value, str) else show(value) for value in values]
+        table.add_row(Text(entry["key"]), Text("A: {}\nB: {}".format(*texts)))
     console.print(table)
-
-
-def _value(value: Any) -> str:
-    return "-" if value is None else value if isinstance(value, str) else show(value)
 
 
 def _missing(side: dict[str, Any]) -> str:
@@ -514,14 +475,10 @@ def _measured(error: dict[str, Any]) -> list[str]:
 
 def _relative(pair: dict[str, Any]) -> list[str]:
     a, b, change = pair["a"], pair["b"], pair["relative"]
-    if change is None:
-        text = "-"
-    elif change == 0.0:
-        text = "equal"
-    elif abs(change) > _MOST_PERCENT:
-        text = f"{number_text(b / a, 3)} times"
-    else:
-        text = f"{'+' if change > 0 else '-'}{percent(abs(change))}"
+    text = "-" if change is None else "equal"
+    if change:
+        factor = abs(change) > _MOST_PERCENT
+        text = f"{number_text(b / a, 3)} times" if factor else f"{'+' if change > 0 else '-'}{percent(abs(change))}"
     return [number_text(a), number_text(b), text]
 
 

@@ -88,7 +88,7 @@ def evidence(time: FloatArray, logarithms: FloatArray, threshold: float, crossed
     plot = new_figure(
         230,
         x_axis_label="simulated time",
-        y_axis_label="evidence against the prediction",
+        y_axis_label="evidence",
         x_range=(0.0, float(time[-1])),
         y_axis_type="log",
     )

@@ -275,7 +275,7 @@ def render(
         host=host or platform.node() or "unnamed host",
         tests=[
             test | {"name": with_names(test["name"], experiment.names)}
-            for test in document["tests"]
+            for test in sorted(document["tests"], key=lambda test: not test["rejected"])
             if not test["name"].startswith(_NODE_TEST)
         ],
         agent_names=experiment.names,

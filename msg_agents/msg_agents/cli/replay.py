@@ -108,24 +108,7 @@ class _Rate(click.types.FloatParamType):
 )
 @domain_option
 @json_option
-def play(
-    bag: Path,
-    *,
-    rate: float,
-    start_offset: float,
-    duration: float | None,
-    loop: bool,
-    paused: bool,
-    clock: float | None,
-    topics: tuple[str, ...],
-    exclude: tuple[str, ...],
-    remaps: tuple[str, ...],
-    subscribers: int | None,
-    readers: tuple[str, ...],
-    wait_timeout: float,
-    domain: int | None,
-    as_json: bool,
-) -> None:
+def play(bag: Path, *, subscribers: int | None, domain: int | None, as_json: bool, **options: Any) -> None:
     """Play BAG: publish its messages in the recorded order.
 
     No message is lost: the player waits for slow readers.
@@ -137,24 +120,11 @@ def play(
     from msg_agents.nodes.player import play as play_bag
 
     enter(domain)
-    options = PlayOptions(
-        rate=rate,
-        start_offset=start_offset,
-        duration=duration,
-        loop=loop,
-        paused=paused,
-        clock=clock,
-        topics=topics,
-        exclude=exclude,
-        remaps=remaps,
-        subscribers=subscribers or 0,
-        readers=readers,
-        wait_timeout=wait_timeout,
-    )
+    chosen = PlayOptions(subscribers=subscribers or 0, **options)
     with PlayBar(bag.name) as bar:
         try:
             played = play_bag(
-                bag, options, on_progress=bar.update, on_note=bar.note, on_stop=bar.hide, on_continue=bar.show
+                bag, chosen, on_progress=bar.update, on_note=bar.note, on_stop=bar.hide, on_continue=bar.show
             )
         except (KeyboardInterrupt, SystemExit):
             if bar.played.begun:
