@@ -174,8 +174,13 @@ def load_experiment(path: Path, changes: Sequence[str]) -> Experiment:
 
     if not changes:
         return Experiment.load(path)
-    source = " ".join([str(path), *(f"--set {change}" for change in changes)])
-    return Experiment.parse(with_changes(read_yaml(path), changes), source=source, directory=path.parent)
+    document = with_changes(read_yaml(path), changes)
+    return Experiment.parse(document, source=source_of(path, changes), directory=path.parent)
+
+
+def source_of(path: Path, changes: Sequence[str]) -> str:
+    """How errors call a file with the values of ``--set``."""
+    return " ".join([str(path), *(f"--set {change}" for change in changes)])
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")

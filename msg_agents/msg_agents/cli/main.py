@@ -31,6 +31,7 @@ from msg_analysis.cli.options import (
     json_option,
     seed_option,
     set_option,
+    source_of,
     storage,
     storage_options,
     suggest,
@@ -200,7 +201,12 @@ def run(
     interruption = _interruption()
     until = Until.parse(until_text) if until_text is not None else None
     values = {key: given.pop(key) for key in ("seed", "duration", "pace", "speed", "delivery", "processes")}
-    what = load_with_overrides(experiment, values, change=lambda document: with_changes(document, changes))
+    what = load_with_overrides(
+        experiment,
+        values,
+        change=lambda document: with_changes(document, changes),
+        source=source_of(experiment, changes),
+    )
     channel = None
     if channel_file is not None:
         if use_sim_time or readers:
