@@ -171,7 +171,7 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
 
 
 def gaps(count: dict[str, Any]) -> list[str]:
-    """Where the gaps of a log are, and what was refused, of ``completeness`` of a comparison; empty for a whole log."""
+    """Where the gaps of a log are, and which messages were rejected, of ``completeness`` of a comparison; empty for a whole log."""
     lines = []
     if count["missing"]:
         first, last = count.get("stretch") or (None, None)
@@ -185,7 +185,7 @@ def gaps(count: dict[str, Any]) -> list[str]:
             )
     if count.get("refused"):
         reasons = ", ".join(f"{number} x {reason}" for reason, number in count["refused"].items())
-        lines.append(f"Refused: {reasons}")
+        lines.append(f"Rejected messages: {reasons}")
     return lines
 
 
@@ -270,7 +270,7 @@ def _add_run(facts: Table, document: dict[str, Any]) -> None:
     facts.add_row("duplicates, out of order", f"{count['duplicates']}, {count['out_of_order']}")
     facts.add_row("steps without a graph", str(count["missing_modes"]))
     for reason, number in count["refused"].items():
-        facts.add_row("refused", Text(f"{number}: {reason}"))
+        facts.add_row("rejected", Text(f"{number}: {reason}"))
 
 
 def _state_of(file: dict[str, Any]) -> str:
