@@ -174,28 +174,10 @@ _FIRST_LINES, _FIRST_TRAJECTORIES = 5, 8
 _NODE_TEST = "error of agent "  # beginning of the names of the tests of the nodes
 
 
-def write_report(
-    comparison: Comparison,
-    trajectory: Run,
-    path: str | Path,
-    *,
-    restarts: Sequence[str] = (),
-    strangers: Sequence[Mapping[str, Any]] = (),
-    events: Sequence[Mapping[str, Any]] = (),
-    wall_time: float | None = None,
-    channel: Mapping[str, Any] | None = None,
-) -> None:
+def write_report(comparison: Comparison, trajectory: Run, path: str | Path, **known: Any) -> None:
     """Write the report of a comparison, whole or not at all; InputError if that fails. Arguments as in ``render``."""
     path = Path(path)
-    html = render(
-        comparison,
-        trajectory,
-        restarts=restarts,
-        strangers=strangers,
-        events=events,
-        wall_time=wall_time,
-        channel=channel,
-    )
+    html = render(comparison, trajectory, **known)
     try:
         write_whole(path, html.encode())
     except OSError as error:

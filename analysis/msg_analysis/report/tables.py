@@ -171,7 +171,7 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
 
 
 def gaps(count: dict[str, Any]) -> list[str]:
-    """Where the gaps of a log are, and which messages were rejected, of ``completeness`` of a comparison; empty for a whole log."""
+    """Gaps of a log and rejected messages, of ``completeness`` of a comparison; empty for a whole log."""
     lines = []
     if count["missing"]:
         first, last = count.get("stretch") or (None, None)
