@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import shlex
@@ -9,13 +10,20 @@ import subprocess
 import sys
 from collections import defaultdict
 from pathlib import Path
+from runpy import run_path
 
 import click
 import pytest
 from click.testing import CliRunner
 from programs import COMMANDS, PROGRAMS, command_of, context_of
 
+import msg_analysis.bags.mcap_chunks as storage_module
+from msg_analysis.cli import options as cli_options
+from msg_analysis.cli.console import SHORT_HELP, CommandGroup
+from msg_analysis.common.files import RESULT_FILE
+
 DOCS = Path(__file__).parents[2] / "docs"
+HOOK = run_path(str(DOCS / "hooks/commands.py"))
 HEAVY = (
     *("numpy", "scipy", "networkx", "pydantic", "matplotlib", "rich", "jinja2", "yaml", "mcap", "zstandard", "lz4"),
     *(
@@ -127,11 +135,38 @@ def test_every_example_is_a_command_line(program: str, name: str) -> None:
 
 
 @pytest.mark.parametrize(("program", "name"), COMMANDS)
-def test_every_option_is_documented(program: str, name: str) -> None:
+def test_every_command_and_option_is_documented(program: str, name: str) -> None:
+    """The command on a page; its options in the help that docs/hooks/commands.py puts into commands.md."""
     text = "".join(page.read_text(encoding="utf-8") for page in sorted(DOCS.glob("*.md")))
-    assert f"{program} {name}" in text or f"`{name} " in text
-    names = [long_name(option) for option in options(program, name)]
-    assert [each for each in names if not re.search(rf"[`\[ ]{each.replace('--pin', '--(no-)?pin')}\b", text)] == []
+    assert f"`{program} {name}`" in text or f"`{name}`" in text
+    assert HOOK["COMMENT"].findall(text) == [" ".join(PROGRAMS)] == ["msg-analysis msg-agents"]
+    shown = HOOK["on_page_content"](f"<!-- help: {program} -->")
+    (part,) = re.findall(rf"<summary><code>{program} {name}</code></summary>(.*?)</details>", shown, re.DOTALL)
+    assert [each for each in map(long_name, options(program, name)) if not re.search(rf" {each}\b", part)] == []
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_the_list_of_commands_has_all_in_groups_and_cuts_nothing(program: str) -> None:
+    """At most 55 letters of each, in a narrow terminal, too."""
+    group = PROGRAMS[program]
+    assert isinstance(group, CommandGroup)
+    assert sorted(itertools.chain(*group.sections.values())) == sorted(group.commands)
+    for width in ("80", "50"):
+        text = CliRunner().invoke(group, ["--help"], prog_name=program, env={"COLUMNS": width}).stdout
+        assert "..." not in text.partition("Start here:")[2]
+    for name, command in group.commands.items():
+        sentence = " ".join((command.help or "").partition("\n\n")[0].split())
+        assert f"{name:<10} {sentence}".split() in [line.split() for line in help_of(program).splitlines()]
+        assert len(sentence) <= SHORT_HELP == 55, (name, sentence)
+        assert sentence.endswith("."), name
+
+
+def test_constants_of_options() -> None:
+    """They stand beside the options because importing their modules takes longer than --help may take."""
+    assert cli_options.COMPRESSIONS == storage_module.COMPRESSIONS
+    assert cli_options.BAG_SUFFIXES == storage_module.BAG_SUFFIXES
+    assert cli_options.SMALLEST_SPLIT == storage_module.SMALLEST_SPLIT
+    assert cli_options.RESULT_FILE == RESULT_FILE
 
 
 @pytest.mark.parametrize("program", PROGRAMS)

@@ -39,7 +39,7 @@ WORDS = {  # what each of the others is given
     ("msg-analysis", "info"): ["EXPERIMENT"],
     ("msg-analysis", "salvage"): ["BAG", NEW],
     ("msg-analysis", "export"): ["BAG", "--csv", "--parquet", "--npz", "--out", NEW],
-    ("msg-analysis", "compare"): ["BAG"],
+    ("msg-analysis", "compare"): ["BAG", "--verbose"],
     ("msg-analysis", "tabulate"): ["RESULT"],
     ("msg-analysis", "transient"): ["EXPERIMENT", "--times", "0,1"],
     ("msg-analysis", "facts"): ["EXPERIMENT"],
@@ -104,11 +104,12 @@ def test_results_go_to_stdout(folder: Path) -> None:
 def test_sentences_are_not_wrapped_for_programs(folder: Path) -> None:
     ((_, _, _, piped, _),) = outcomes(folder, (("msg-analysis", "compare"), "plain"))
     ((_, _, _, shown, _),) = outcomes(folder, (("msg-analysis", "compare"), "terminal"))
-    (counts,) = (line for line in piped.splitlines() if " out of order" in line)
-    assert re.fullmatch(r"1005 of 1005 states .*: 0 missing, 0 duplicates, 0 out of order", counts)
+    assert "1005 of 1005 states in 200 steps (10 units of time)" in piped.splitlines()
+    (evidence,) = (line for line in piped.splitlines() if line.startswith("Sequential test: "))
+    assert evidence.endswith(" Valid at any stopping time.")
     (order,) = (line for line in piped.splitlines() if line.startswith("Order, smallest"))
-    assert order.endswith("(level 0.01 for all pairs together).")
-    for sentence in (counts, order):
+    assert order.endswith("(family-wise level 0.01).")
+    for sentence in (evidence, order):
         assert sentence not in shown
         assert sentence in " ".join(re.sub(r"\x1b\[[0-9;]*m", "", shown).split())
 

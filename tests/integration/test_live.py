@@ -174,7 +174,7 @@ def test_a_watcher_that_is_stopped_holds_nobody_up(network: Any, domain: int) ->
     stdout, stderr = live.communicate(timeout=60)
     assert live.returncode in (0, 3), stderr  # it may have missed the last step
     errors = r"system error [\d.]+ ± [\d.]+ \(95 %\), predicted [\d.]+, z = [+-][\d.]+"
-    evidence = r"any time ± [\d.]+, evidence against the prediction [\d.]+ \(disagrees at 100\)"
+    evidence = r"at all times ± [\d.]+, evidence against the prediction [\d.]+ \(threshold 100\)"
     assert re.search(rf"{errors}, {evidence}, \d+ steps", stdout)
 
 

@@ -46,7 +46,7 @@ BY_COMMAND = {  # what takes long to import, and no other command needs
     "figures": ("msg_analysis.paper.figures",),
     "spectrum": ("scipy.signal",),
     "sweep": (
-        "msg_analysis.report.sweep_figure",
+        "msg_analysis.report.sweep_plots",
         "msg_analysis.report.list_pages",
         "msg_analysis.sweeps.results",
     ),

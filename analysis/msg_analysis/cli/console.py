@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, Self
 import click
 from click.exceptions import Exit
 
-from msg_analysis.common.text import duration_text, json_text, visible
 from msg_analysis.errors import INTERRUPTED, ExitCode, InputError, killed_by
 
 if TYPE_CHECKING:
@@ -36,12 +35,30 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "true")
 NOT_WRITTEN = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF}
 
 
+SHORT_HELP = 55  # most letters of the first sentence of a command's help, which the list of commands shows
+
+
 class CommandGroup(click.Group):
     """A click group that turns errors of the user into messages and exit codes; all help pages share its settings."""
 
     def __init__(self, *args: Any, **attributes: Any) -> None:
         attributes["context_settings"] = {"help_option_names": ["-h", "--help"], "show_default": True}
         super().__init__(*args, **attributes)
+        self.sections: dict[str, list[str]] = {}  # of the list of commands: title, names
+
+    def add_section(self, title: str, *commands: click.Command) -> None:
+        """Add commands, which the list of commands shows below this title."""
+        self.sections[title] = [str(command.name) for command in commands]
+        for command in commands:
+            self.add_command(command)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
+        """Write the commands of each section; see click.Group."""
+        width = max(map(len, self.commands))
+        for title, names in self.sections.items():
+            with formatter.section(title):
+                rows = [(f"{name:<{width}}", self.commands[name].get_short_help_str(SHORT_HELP)) for name in names]
+                formatter.write_dl(rows)
 
     def main(self, *args: Any, **extra: Any) -> Any:
         """Run the program; see click.Command."""
@@ -65,6 +82,8 @@ def _exit_codes() -> Iterator[None]:
     try:
         yield
     except click.ClickException as error:
+        from msg_analysis.common.text import visible
+
         vars(error)["message"] = visible(error.message)
         raise
     except InputError as error:
@@ -146,6 +165,8 @@ def _drop_stdout() -> None:
 
 def complain(text: str, label: str = "error:") -> None:
     """Print one error on stderr, behind a label that is red on a terminal."""
+    from msg_analysis.common.text import visible
+
     color = False if os.environ.get("NO_COLOR") else None
     click.echo(f"{click.style(label, fg='red', bold=True)} {visible(text)}", err=True, color=color)
 
@@ -164,12 +185,23 @@ def result_console() -> Console:
 
 def print_text(text: str) -> None:
     """Print lines on stdout, with the names in them made safe for terminals."""
+    from msg_analysis.common.text import visible
+
     click.echo(visible(text))
 
 
 def print_json(document: dict[str, Any], indent: int | None = None) -> None:
     """Print one JSON object on stdout; infinite numbers and NaN become null."""
+    from msg_analysis.common.text import json_text
+
     click.echo(json_text(document, indent))
+
+
+def print_note(line: str) -> None:
+    """Print one line on stderr, behind a coloured ``note:``."""
+    from msg_analysis.common import text
+
+    text.print_note(line)
 
 
 _LINE_PERIOD = 10.0  # s between two lines where there is no terminal
@@ -181,14 +213,7 @@ class _Progress:
     """Progress display, a context manager."""
 
     def __init__(self, title: str, *, time_left: bool) -> None:
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            ProgressColumn,
-            TextColumn,
-            TimeElapsedColumn,
-        )
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
         from rich.text import Text
 
         from msg_analysis.common.text import SafeConsole
@@ -225,6 +250,8 @@ class _Progress:
 
     def _times(self) -> str:
         """The time so far, and what is left at the mean speed so far, once it is known."""
+        from msg_analysis.common.text import duration_text
+
         now = time.monotonic()
         text = f"{duration_text(now - self._begun)} so far"
         done, total, when = self._newest

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -25,7 +25,9 @@ from msg_analysis.cli.options import (
     experiment_argument,
     is_bag,
     json_option,
+    load_experiment,
     seed_option,
+    set_option,
     storage,
     storage_options,
 )
@@ -43,14 +45,17 @@ def main() -> None:
     """Theory, simulation and statistics of Markov-switching networks of agents."""
 
 
-@main.command(epilog=examples("msg-analysis predict line_ring", "msg-analysis predict line_ring --json | jq .emulated"))
+@click.command(
+    epilog=examples(
+        "msg-analysis predict line_ring", "msg-analysis predict line_ring --set noise.process=2 --json | jq .emulated"
+    )
+)
 @experiment_argument
+@set_option
 @json_option
-def predict(experiment: Path, as_json: bool) -> None:
+def predict(experiment: Path, changes: tuple[str, ...], as_json: bool) -> None:
     """Predict the steady errors of EXPERIMENT, exactly."""
-    from msg_analysis.experiment.experiment import Experiment
-
-    document = Experiment.load(experiment).predict().to_json()
+    document = load_experiment(experiment, changes).predict().to_json()
     if as_json:
         print_json(document)
     else:
@@ -59,28 +64,32 @@ def predict(experiment: Path, as_json: bool) -> None:
         print_prediction(document, result_console())
 
 
-@main.command(
+@click.command(
     epilog=examples("msg-analysis simulate line_ring", "msg-analysis simulate line_ring --seed 8 --out twin_8")
 )
 @experiment_argument
 @click.option("--out", type=PATH, metavar="BAG", show_default="<name>_twin", help="Bag to write; must not exist.")
 @seed_option
 @duration_option
+@set_option
 @storage_options
 @json_option
 def simulate(
     experiment: Path,
+    *,
     out: Path | None,
     seed: int | None,
     duration: float | None,
+    changes: tuple[str, ...],
     compression: Compression,
     split_size: float | None,
     as_json: bool,
 ) -> None:
-    """Simulate EXPERIMENT without ROS, write its bag and print the name of the bag."""
-    from msg_analysis.experiment.experiment import Experiment
+    """Simulate EXPERIMENT without ROS and write its bag.
 
-    loaded = Experiment.load(experiment)
+    The name of the bag is printed. A network run of EXPERIMENT with the same seed has the same states.
+    """
+    loaded = load_experiment(experiment, changes)
     directory = out or Path(f"{loaded.name}_twin")
     if directory.exists():
         raise InputError(f"{directory}: exists already: remove it, or choose another name with --out")
@@ -101,10 +110,9 @@ def simulate(
         click.echo(directory)
 
 
-@main.command(
+@click.command(
     epilog=examples(
-        "msg-analysis leaders line_ring --count 2",
-        "msg-analysis leaders line_ring --count 2 --gain 0.5 --json",
+        "msg-analysis leaders line_ring --count 2", "msg-analysis leaders line_ring --count 2 --gain 0.5 --json"
     )
 )
 @experiment_argument
@@ -129,34 +137,18 @@ def simulate(
     help="Gain of the leaders; inf: states held fixed.",
 )
 @click.option("--top", type=int, metavar="N", default=10, help="Number of sets to list.")
+@set_option
 @json_option
-def leaders(
-    experiment: Path,
-    *,
-    count: int | None,
-    method: str,
-    law: str | None,
-    gain: float | None,
-    top: int,
-    as_json: bool,
-) -> None:
-    """Find the best leaders for the network of EXPERIMENT, by joint robustness centrality.
+def leaders(experiment: Path, *, count: int | None, changes: tuple[str, ...], as_json: bool, **options: Any) -> None:
+    """Find the best leaders for the network of EXPERIMENT.
 
-    The leaders that EXPERIMENT names are shown beside them.
+    Sets of leaders are compared by joint robustness centrality. The leaders in EXPERIMENT are shown beside them.
     """
     from msg_analysis.cli.console import SolveProgress
-    from msg_analysis.experiment.experiment import Experiment
 
-    loaded = Experiment.load(experiment)
+    loaded = load_experiment(experiment, changes)
     with SolveProgress(loaded.name) as progress:
-        selection = loaded.leaders(
-            count,
-            method=method,  # type: ignore[arg-type]  # click has checked it
-            law=law,  # type: ignore[arg-type]
-            gain=gain,
-            top=top,
-            watch=progress,
-        )
+        selection = loaded.leaders(count, **options, watch=progress)
     document = selection.to_json()
     if as_json:
         print_json(document)
@@ -166,11 +158,9 @@ def leaders(
         print_leaders(document, result_console())
 
 
-@main.command(
+@click.command(
     epilog=examples(
-        "msg-analysis figures",
-        "msg-analysis figures 3 --out paper --format pdf",
-        "msg-analysis figures 1 --emulate",
+        "msg-analysis figures", "msg-analysis figures 3 --out paper --format pdf", "msg-analysis figures 1 --emulate"
     )
 )
 @click.argument("example", type=click.Choice(["1", "2", "3", "all"]), default="all")
@@ -183,9 +173,7 @@ def leaders(
     default=("png", "svg", "pdf"),
     help="Format of the figures. Repeatable.",
 )
-@click.option(
-    "--emulate", is_flag=True, help="Also run networks with msg-agents (takes minutes) and draw the measured values."
-)
+@click.option("--emulate", is_flag=True, help="Also run networks (takes minutes) and draw the measured values.")
 @sweep.other_software
 @json_option
 @click.pass_context
@@ -199,9 +187,10 @@ def figures(
     other_software: OtherSoftware,
     as_json: bool,
 ) -> None:
-    """Draw the EXAMPLEs of the paper, with the numbers as CSV; print the names of the files.
+    """Draw the figures of the paper, and write their numbers.
 
-    Existing files of the same names are replaced. With --emulate, networks are run, and the measured points are drawn
+    The names of the files are printed; existing files of these names are replaced. With --emulate, networks are
+    run, and the measured points are drawn
     on the curves in separate files; finished runs are kept. Exit code 1: some point disagrees with theory, 3: some
     network failed.
     """
@@ -221,11 +210,13 @@ def figures(
         print_json({"files": written})
 
 
-@main.command(epilog=examples("msg-analysis info line_ring", "msg-analysis info runs/line_ring_20250101_120000 --json"))
+@click.command(
+    epilog=examples("msg-analysis info line_ring", "msg-analysis info runs/line_ring_20250101_120000 --json")
+)
 @click.argument("source", metavar="EXPERIMENT|BAG", type=SOURCE)
 @json_option
 def info(source: Path, as_json: bool) -> None:
-    """Describe an experiment file, or the contents of a bag."""
+    """Describe an experiment file or a bag."""
     from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report import tables
     from msg_analysis.report.documents import describe_bag, describe_experiment
@@ -240,14 +231,14 @@ def info(source: Path, as_json: bool) -> None:
         show(document, result_console())
 
 
-@main.command(epilog=examples("msg-analysis salvage runs/line_ring_20250101_120000 whole"))
+@click.command(epilog=examples("msg-analysis salvage runs/line_ring_20250101_120000 whole"))
 @click.argument("bag", type=BAG)
 @click.argument("out", type=PATH)
 @json_option
 def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
-    """Write the intact part of the torn or damaged BAG to OUT, a valid bag; report what was dropped.
+    """Recover the intact part of a torn or damaged bag.
 
-    BAG is not changed; OUT must not exist.
+    It is written to OUT, which must not exist; what was dropped is reported. BAG is not changed.
     """
     from msg_analysis.bags.salvage import salvage as salvage_bag
     from msg_analysis.report.documents import describe_salvage
@@ -261,7 +252,7 @@ def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
         print_salvage(document, result_console())
 
 
-@main.command(
+@click.command(
     epilog=examples(
         "msg-analysis export runs/line_ring_20250101_120000 --parquet",
         "msg-analysis export line_ring_twin --csv --npz --out data",
@@ -275,9 +266,10 @@ def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
 @click.option("--out", type=PATH, metavar="DIR", show_default="<name of BAG>_export", help="Output directory.")
 @json_option
 def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Path | None, as_json: bool) -> None:
-    """Write the states, graphs and errors of the run in BAG for other programs; print the names of the files.
+    """Convert a bag to CSV, Parquet, NumPy or Rerun files.
 
-    Existing files of the same names are replaced. Exit code 3: states or graphs of the run are missing.
+    The names of the files are printed; existing files of these names are replaced. Exit code 3: states or graphs of
+    the run are missing.
     """
     import pyarrow.csv  # before the progress of the work begins
     import pyarrow.parquet  # noqa: F401
@@ -307,29 +299,24 @@ def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Pa
         sys.exit(ExitCode.INCOMPLETE)
 
 
-main.add_command(runs.compare)
-main.add_command(runs.tabulate)
-main.add_command(runs.runs)
-main.add_command(runs.diff)
-main.add_command(theory.transient)
-main.add_command(theory.facts)
-main.add_command(theory.plan)
-main.add_command(theory.spectrum)
-main.add_command(sweep.sweep)
-
-
-@main.command(
+@click.command(
     epilog=examples("msg-analysis schema > experiment.schema.json", "msg-analysis schema sweep > sweep.schema.json")
 )
 @click.argument("what", type=click.Choice(["experiment", "sweep"]), default="experiment")
 def schema(what: str) -> None:
-    """Print the JSON Schema of experiment files, or of sweep files, for editors."""
+    """Print the JSON Schema of a kind of file, for editors."""
     if what == "sweep":
         from msg_analysis.sweeps.sweep_file import json_schema
     else:
         from msg_analysis.experiment.experiment import json_schema
 
     print_json(json_schema(), indent=2)
+
+
+main.add_section("Start here", predict, simulate, runs.compare, theory.plan, schema)
+main.add_section("Runs", runs.runs, runs.tabulate, runs.diff, sweep.sweep)
+main.add_section("Bags", info, export, salvage)
+main.add_section("Theory", theory.transient, theory.spectrum, leaders, theory.facts, figures)
 
 
 if __name__ == "__main__":

@@ -10,22 +10,22 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.shell_completion import CompletionItem
 
-from msg_analysis.bags.mcap_chunks import (
-    BAG_SUFFIXES,
-    COMPRESSIONS,
-    DEFAULT_STORAGE,
-    MEGABYTE,
-    SMALLEST_SPLIT,
-    Compression,
-    Storage,
-)
-from msg_analysis.common.files import RESULT_FILE
 from msg_analysis.errors import InputError
+
+if TYPE_CHECKING:
+    from msg_analysis import Experiment
+    from msg_analysis.bags.mcap_chunks import Compression, Storage
+
+# As in the modules of bags and results, whose imports take longer than --help may take.
+BAG_SUFFIXES = (".mcap", ".mcap.zstd", ".db3", ".db3.zstd")
+COMPRESSIONS = ("none", "zstd", "lz4")
+SMALLEST_SPLIT = 0.1  # MB
+RESULT_FILE = "result.json"
 
 
 def storage_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -34,7 +34,7 @@ def storage_options(command: Callable[..., None]) -> Callable[..., None]:
         click.option(
             "--compression",
             type=click.Choice(COMPRESSIONS),
-            default=DEFAULT_STORAGE.compression,
+            default="zstd",
             help="Compression of the chunks of the bag.",
         ),
         click.option(
@@ -50,6 +50,8 @@ def storage_options(command: Callable[..., None]) -> Callable[..., None]:
 
 def storage(compression: Compression, split_size: float | None) -> Storage:
     """The storage that these options ask for; ``split_size`` [MB, 10^6 bytes] is None for one file."""
+    from msg_analysis.bags.mcap_chunks import MEGABYTE, Storage
+
     try:
         size = None if split_size is None else round(split_size * MEGABYTE)
     except (ValueError, OverflowError) as error:  # nan, inf
@@ -138,7 +140,53 @@ def is_bag(source: Path) -> bool:
     return source.is_dir() or bool({".mcap", ".db3"} & set(source.suffixes))
 
 
+set_option = click.option(
+    "--set",
+    "changes",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Replace a value of EXPERIMENT, for example noise.process=2. Repeatable.",
+)
+
+
+def with_changes(document: Any, changes: Sequence[str]) -> Any:
+    """The document of an experiment with the values of ``--set``; keys as in sweep files, values in YAML."""
+    from msg_analysis.experiment.loading import parse_yaml
+    from msg_analysis.sweeps.grid import KeyProblemError, put
+
+    if not isinstance(document, dict):
+        return document  # whoever parses it says what is wrong
+    for change in changes:
+        key, _, text = change.partition("=")
+        if not key.strip() or not text.strip():
+            raise InputError(f"--set {change}: expected KEY=VALUE, for example noise.process=2")
+        try:
+            document = put(document, key.strip(), parse_yaml(text, f"--set {change}"))
+        except KeyProblemError as error:
+            raise InputError(f"--set {str(error).removeprefix('over.')}") from None
+    return document
+
+
+def load_experiment(path: Path, changes: Sequence[str]) -> Experiment:
+    """The experiment of a file with the values of ``--set``."""
+    from msg_analysis import Experiment
+    from msg_analysis.experiment.loading import read_yaml
+
+    if not changes:
+        return Experiment.load(path)
+    document = with_changes(read_yaml(path), changes)
+    return Experiment.parse(document, source=source_of(path, changes), directory=path.parent)
+
+
+def source_of(path: Path, changes: Sequence[str]) -> str:
+    """How errors call a file with the values of ``--set``."""
+    return " ".join([str(path), *(f"--set {change}" for change in changes)])
+
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+verbose_option = click.option(
+    "-v", "--verbose", is_flag=True, help="Also print all tests and agents, the order of the agents, and the timing."
+)
 experiment_argument = click.argument("experiment", type=EXPERIMENT)
 seed_option = click.option("--seed", type=int, metavar="N", help="Seed of the run (run.seed).")
 duration_option = click.option(

@@ -6,13 +6,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from msg_analysis.cli.console import examples, print_json, print_text, result_console
-from msg_analysis.cli.options import BAG, FILE, PATH, RESULT, SOURCE, is_bag, json_option, level_option, seed_option
-from msg_analysis.common.files import require_place
+from msg_analysis.cli.console import examples, print_json, print_note, print_text, result_console
+from msg_analysis.cli.options import (
+    BAG,
+    FILE,
+    PATH,
+    RESULT,
+    SOURCE,
+    is_bag,
+    json_option,
+    level_option,
+    seed_option,
+    verbose_option,
+)
 from msg_analysis.common.resources import watched
 
 if TYPE_CHECKING:
@@ -52,20 +62,17 @@ if TYPE_CHECKING:
 def runs(
     folder: Path,
     *,
-    name: str | None,
-    verdicts: tuple[str, ...],
     since: str | None,
     until: str | None,
-    seed: int | None,
-    last: int | None,
     sort: SortKey,
     page: Path | None,
     shown: bool,
     as_json: bool,
+    **filters: Any,
 ) -> None:
-    """List the runs in FOLDER, or write them as one page with overlays and differences.
+    """List the runs in FOLDER, or write a page of them.
 
-    Saved results are read, and run records where there is no result, but no states.
+    Uses saved results (or the run record); does not read states. The page compares the runs of an experiment.
     """
     from datetime import datetime
 
@@ -74,12 +81,9 @@ def runs(
 
     now = datetime.now().astimezone()
     wanted = RunFilter(
-        name=name,
-        verdicts=verdicts,
         since=moment(since, "--since", now) if since is not None else None,
         until=moment(until, "--until", now, end=True) if until is not None else None,
-        seed=seed,
-        last=last,
+        **filters,
     )
     page = page or (folder / "index.html" if shown else None)
     require_place(page)
@@ -108,8 +112,6 @@ def _open(page: Path) -> None:
     import sys
     import webbrowser
 
-    from msg_analysis.common.text import print_note
-
     address = page.absolute().as_uri()
     screen = sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
     if not screen or not webbrowser.open(address):
@@ -127,10 +129,10 @@ def _open(page: Path) -> None:
 @click.argument("b", type=SOURCE)
 @json_option
 def diff(a: Path, b: Path, *, as_json: bool) -> None:
-    """Say what differs between A and B: two bags, or two experiment files.
+    """Compare two bags, or two experiment files.
 
     Of bags: experiment, versions, states to the last bit, graphs, verdicts and measured errors. Of experiments: keys,
-    predictions, decay rates and leaders. The exit code is 0 whether they differ or not.
+    predictions, decay rates and leaders. The exit code is 0 also if they differ.
     """
     from msg_analysis.errors import InputError
 
@@ -141,16 +143,16 @@ def diff(a: Path, b: Path, *, as_json: bool) -> None:
     if bags[0]:
         from msg_analysis.cli.console import WorkProgress
         from msg_analysis.common.resources import watched
-        from msg_analysis.report.comparison_text import print_bag_difference as show
         from msg_analysis.report.differences import bag_difference
+        from msg_analysis.report.differences import print_bag_difference as show
 
         with WorkProgress() as work, watched(work):
             document = bag_difference(a, b)
     else:
         from msg_analysis.cli.console import SolveProgress
         from msg_analysis.experiment.experiment import Experiment
-        from msg_analysis.report.comparison_text import print_experiment_difference as show
         from msg_analysis.report.differences import experiment_difference
+        from msg_analysis.report.differences import print_experiment_difference as show
 
         one, other = (Experiment.load(path) for path in (a, b))
         with SolveProgress("leaders") as search:
@@ -171,9 +173,12 @@ def diff(a: Path, b: Path, *, as_json: bool) -> None:
 @click.argument("bags", metavar="BAG...", nargs=-1, required=True, type=BAG)
 @level_option("Probability of a false 'disagrees', over all tests.")
 @click.option("--report", type=FILE, metavar="FILE", help="Also write an HTML report.")
+@verbose_option
 @json_option
 @click.pass_context
-def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, level: float, report: Path | None) -> None:
+def compare(
+    context: click.Context, bags: tuple[Path, ...], *, level: float, report: Path | None, verbose: bool, as_json: bool
+) -> None:
     """Compare the run in BAG with its prediction.
 
     Several bags, runs of one experiment with different seeds, get one joint verdict.
@@ -181,6 +186,7 @@ def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, level
     Exit code 0: agrees, 1: disagrees, 3: data incomplete, no verdict.
     """
     from msg_analysis.cli.console import WorkProgress
+    from msg_analysis.common.files import require_place
     from msg_analysis.inference.pool import compare as compare_runs
 
     require_place(report)
@@ -195,7 +201,9 @@ def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, level
     else:
         from msg_analysis.report.comparison_text import print_comparison
 
-        print_comparison(comparison.to_json(), result_console())
+        print_comparison(comparison.to_json(), result_console(), verbose=verbose)
+        if report:
+            print_text(f"report: {report}")
     context.exit(comparison.exit_code)
 
 
@@ -212,14 +220,15 @@ def compare(context: click.Context, bags: tuple[Path, ...], as_json: bool, level
     "form",
     type=click.Choice(["table", "markdown", "csv", "json"]),
     default="table",
-    help="The table also says which system errors differ significantly.",
+    help="Form of the output; the table also shows which system errors differ significantly.",
 )
 @level_option("Probability of any false difference of two system errors.")
 @json_option
 def tabulate(results: tuple[Path, ...], form: str, level: float, as_json: bool) -> None:
-    """Show saved results side by side: files written by `compare --json` or `msg-agents run`.
+    """Show saved results side by side.
 
-    A RESULT may also be the directory of a run. The runs are assumed to be independent (different seeds).
+    A RESULT is a file written by `compare --json` or `msg-agents run`, or the directory of a run. The runs are
+    assumed to be independent (different seeds).
     """
     from msg_analysis.report import saved_results as saved
     from msg_analysis.runs import read_result

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from msg_analysis.cli.console import complain, examples, print_json, print_text, result_console
+from msg_analysis.cli.console import complain, examples, print_json, print_note, print_text, result_console
 from msg_analysis.cli.options import PATH, YAML, json_option
-from msg_analysis.common.text import finite, print_note
 from msg_analysis.errors import ExitCode, InputError, killed_by
 from msg_analysis.sweeps.points import require_libraries
 
@@ -58,23 +57,24 @@ other_software = click.option(
 @click.pass_context
 def sweep(
     context: click.Context,
+    /,
     sweep_file: Path,
     *,
     out: Path | None,
     workers: int | None,
     scheduler: str | None,
     column: str | None,
-    retry: bool,
-    other_software: OtherSoftware,
     keep_bags: bool,
     as_json: bool,
+    **how: Any,
 ) -> None:
-    """Predict, simulate or run an experiment at many values of its keys, as described in the file SWEEP.
+    """Predict, simulate or run at many values of the keys.
 
-    Results are kept: after an interruption, the same command continues. Tables (Parquet, CSV, JSON), a figure and
+    The file SWEEP describes them. Results are kept: after an interruption, the same command continues. Tables
+    (Parquet, CSV, JSON), a figure and
     an interactive page are written next to them.
 
-    Exit code 0: success, 1: some run disagrees with its prediction, all runs judged together, 3: some point has no
+    Exit code 0: success, 1: some run disagrees with its prediction, all runs tested together, 3: some point has no
     result.
     """
     if workers and scheduler:
@@ -92,8 +92,9 @@ def sweep(
             checking.checked(done, total)
 
         plan = load_sweep(sweep_file, checked)
+    from msg_analysis.common.text import finite
     from msg_analysis.report.list_pages import write_sweep_page
-    from msg_analysis.report.sweep_figure import write_figure
+    from msg_analysis.report.sweep_plots import write_figure
     from msg_analysis.report.tables import describe_sweep, print_sweep, summary
     from msg_analysis.sweeps.figure_series import picture
     from msg_analysis.sweeps.points import options
@@ -110,8 +111,7 @@ def sweep(
             workers=workers,
             scheduler=scheduler,
             network=network,
-            other_software=other_software,
-            retry=retry,
+            **how,
         )
         judgement = judge_sweep(done.outcomes, plan.spec.level)
         rows = rows_of(plan, done.outcomes, judgement)

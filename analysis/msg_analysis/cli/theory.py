@@ -6,13 +6,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from msg_analysis.cli.console import examples, print_json, result_console
-from msg_analysis.cli.options import FILE, SOURCE, experiment_argument, is_bag, json_option, level_option
-from msg_analysis.common.files import require_place
+from msg_analysis.cli.options import (
+    FILE,
+    SOURCE,
+    experiment_argument,
+    is_bag,
+    json_option,
+    level_option,
+    load_experiment,
+    set_option,
+)
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,7 +41,7 @@ if TYPE_CHECKING:
     "--law",
     type=click.Choice(["emulated", "continuous"]),
     default="emulated",
-    help="The steps of the run, or the paper's continuous time.",
+    help="Steps of the run, or the continuous time of the paper.",
 )
 @click.option("--unreduced", is_flag=True, help="Consensus: errors of the states, not of the disagreement.")
 @click.option(
@@ -42,31 +50,16 @@ if TYPE_CHECKING:
 @click.option("--moments", is_flag=True, help="With --json: also means and second moments of every graph.")
 @click.option("--csv", "table", type=FILE, metavar="FILE", help="Also write a CSV table.")
 @json_option
-def transient(
-    experiment: Path,
-    times: str,
-    law: str,
-    unreduced: bool,
-    fraction: float,
-    moments: bool,
-    table: Path | None,
-    as_json: bool,
-) -> None:
-    """Predict the errors of EXPERIMENT over time, from its own start, exactly."""
+def transient(experiment: Path, times: str, *, table: Path | None, as_json: bool, **options: Any) -> None:
+    """Predict the errors over time, from the start of a run."""
+    from msg_analysis.common.files import require_place
     from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report.documents import describe_transient, write_transient_csv
 
     require_place(table)
     loaded = Experiment.load(experiment)
     loaded.require_available("predict")
-    document = describe_transient(
-        loaded,
-        _parse_times(times),
-        law=law,  # type: ignore[arg-type]  # click has checked it
-        unreduced=unreduced,
-        moments=moments,
-        fraction=fraction,
-    )
+    document = describe_transient(loaded, _parse_times(times), **options)
     if table:
         write_transient_csv(document, table)
     if as_json:
@@ -107,7 +100,7 @@ def _parse_times(text: str) -> FloatArray:
 @experiment_argument
 @json_option
 def facts(experiment: Path, as_json: bool) -> None:
-    """Check the paper's lemmas on EXPERIMENT; bounds, indices of its graphs, two graphs in closed form."""
+    """Check the lemmas of the paper; bounds, graph indices."""
     from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report.documents import describe_facts
 
@@ -129,6 +122,7 @@ UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}  # of --budget
     epilog=examples(
         "msg-analysis plan line_ring --precision 1%",
         "msg-analysis plan line_ring --budget 10min --speed 5000",
+        "msg-analysis plan line_ring --set run.replicas=64",
         "msg-analysis plan line_ring --json | jq .faults",
     )
 )
@@ -141,24 +135,27 @@ UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}  # of --budget
 )
 @click.option("--budget", metavar="TIME", help="Time budget: 90s, 10min, 2h or 1d; finds the best replicas.")
 @click.option(
-    "--speed",
-    type=float,
-    metavar="STEPS",
-    help="Steps per second of a run in lockstep, as msg-agents run prints them.",
+    "--speed", type=float, metavar="STEPS", help="Steps per second of a run in lockstep, as msg-agents run prints them."
 )
-@level_option('Probability of a false "disagrees", all tests together.')
+@level_option("Probability of a false 'disagrees', over all tests.")
+@set_option
 @json_option
 def plan(
-    experiment: Path, precision: str, budget: str | None, speed: float | None, level: float, as_json: bool
+    experiment: Path,
+    *,
+    precision: str,
+    budget: str | None,
+    speed: float | None,
+    level: float,
+    changes: tuple[str, ...],
+    as_json: bool,
 ) -> None:
-    """Plan runs of EXPERIMENT: length, replicas and time for a precision, and power for faults; nothing is run."""
-    from msg_analysis.experiment.experiment import Experiment
+    """Find how long to run EXPERIMENT; nothing is run.
 
-    document = (
-        Experiment.load(experiment)
-        .plan(_parse_share(precision), seconds=_parse_duration(budget), rate=speed, level=level)
-        .to_json()
-    )
+    Length, replicas and time for a precision, and the power of the tests for faults.
+    """
+    loaded = load_experiment(experiment, changes)
+    document = loaded.plan(_parse_share(precision), seconds=_parse_duration(budget), rate=speed, level=level).to_json()
     if as_json:
         print_json(document)
     else:
@@ -204,23 +201,30 @@ def _parse_duration(text: str | None) -> float | None:
 @click.argument("source", metavar="EXPERIMENT|BAG", type=SOURCE)
 @click.option("--figure", type=FILE, metavar="FILE", help="Also draw it: a file that ends with .png, .svg or .pdf.")
 @level_option("Of the test of a bag: probability of a false 'disagrees'.")
+@set_option
 @json_option
 @click.pass_context
-def spectrum(context: click.Context, source: Path, figure: Path | None, level: float, as_json: bool) -> None:
-    """Predict the autocovariance and the spectral density of the errors, exactly; of a BAG, also measure and test them.
+def spectrum(
+    context: click.Context, source: Path, *, figure: Path | None, level: float, changes: tuple[str, ...], as_json: bool
+) -> None:
+    """Predict autocovariance and spectrum, or test a bag.
+
+    Of a BAG they are also measured, and tested against the prediction.
 
     Exit code 0: predicted, or agrees, 1: disagrees, 3: data incomplete.
     """
+    from msg_analysis.common.files import require_place
     from msg_analysis.errors import ExitCode
-    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report.documents import measure_spectrum, predicted_spectrum
 
+    if changes and is_bag(source):
+        raise InputError(f"--set: not with the bag {source}, whose experiment is recorded: give an experiment file")
     require_place(figure)
     if figure:
         from msg_analysis.report.figures import require_format, spectrum_figure, write_spectrum
 
         require_format(figure)
-    found = measure_spectrum(source, level) if is_bag(source) else predicted_spectrum(Experiment.load(source))
+    found = measure_spectrum(source, level) if is_bag(source) else predicted_spectrum(load_experiment(source, changes))
     if figure:
         write_spectrum(spectrum_figure(found.predicted, found.log, found.density), figure)
     if as_json:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
 import textwrap
@@ -27,7 +28,7 @@ def names() -> list[str]:
 def text_of(name: str) -> str:
     """The file of an example; InputError: there is none of this name."""
     if name not in names():
-        raise InputError(f"{name}: no example of this name: expected one of {', '.join(names())}")
+        raise InputError(f"{name}: no example of this name: expected one of {_listed(name)}")
     return (FOLDER / f"{name}{SUFFIX}").read_text(encoding="utf-8")
 
 
@@ -62,9 +63,13 @@ def find(given: str | Path, folder: Path = Path()) -> Path:
         return FOLDER / f"{word}{SUFFIX}"
     if path.is_dir() or word == "":
         return path
-    raise InputError(
-        f"{word}: no such file, and no example of this name: expected a file, or one of {', '.join(names())}"
-    )
+    raise InputError(f"{word}: no such file, and no example of this name: expected a file, or one of {_listed(word)}")
+
+
+def _listed(word: str) -> str:
+    """All names, and the one that may be meant."""
+    close = difflib.get_close_matches(word, names(), 1)
+    return ", ".join(names()) + (f": did you mean {close[0]}?" if close else "")
 
 
 Kind = Literal["line", "ring", "star", "complete"]

@@ -8,6 +8,7 @@ Whatever a protocol raises or returns wrongly becomes an error that names the pr
 
 from __future__ import annotations
 
+import difflib
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -281,7 +282,9 @@ def _find(spec: ProtocolSpec) -> tuple[ChosenProtocol | None, list[str]]:
             wanted, remedy = "expected one package that offers it", "uninstall the others"
             return None, [problem("protocol.name", f"{show(spec.name)} of {known}", wanted, remedy)]
         wanted = f"expected one of {known}" if known else "expected a protocol, but no installed package offers any"
-        return None, [problem("protocol.name", show(spec.name), wanted, "correct it, or install its package")]
+        close = difflib.get_close_matches(spec.name, offers, 1)
+        remedy = f"did you mean {close[0]}?" if close else "correct it, or install its package"
+        return None, [problem("protocol.name", show(spec.name), wanted, remedy)]
     point = points[0]
     dist = point.dist
     package, version = (dist.name, dist.version) if dist else ("?", "?")

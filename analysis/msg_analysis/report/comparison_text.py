@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Comparisons, live estimates and differences in the terminal."""
+"""Comparisons and live estimates in words: sentences for terminal and report, and the terminal text."""
 
 from __future__ import annotations
 
@@ -13,36 +13,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from msg_analysis.common.text import (
-    agent_name,
-    agent_text,
-    counted,
-    listed,
-    measured_text,
-    number_text,
-    p_text,
-    percent,
-    with_names,
-    z_text,
-)
-from msg_analysis.experiment.problems import show
+from msg_analysis.common.text import agent_text, measured_text, number_text, p_text, percent, with_names, z_text
 from msg_analysis.inference.realtime_laws import SUPPORT
 from msg_analysis.model.run_record import RunRecord
-from msg_analysis.report.tables import ROWS, fact_table, first_rows, interval_text, number_table, print_table
-from msg_analysis.report.wording import (
-    QUANTILES,
-    REAL_TIME_LAWS,
-    TIMES,
-    agent_errors,
-    agent_order,
-    any_time_words,
-    gaps,
-    sentence,
-    timing_facts,
-    trust_words,
-    unheard_words,
-    verdict_line,
-)
+from msg_analysis.report.tables import fact_table, first_rows, gaps, interval_text, number_table, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 
 if TYPE_CHECKING:
@@ -50,49 +24,89 @@ if TYPE_CHECKING:
     from msg_analysis.inference.online_errors import LiveReport
 
 
+VERDICTS = {
+    "agrees": "The run agrees with the prediction.",
+    "disagrees": "The run disagrees with the prediction.",
+    "incomplete": "No verdict: the data are incomplete.",
+    "unpredicted": "No verdict, because there is no prediction. All available tests are ok.",
+}
+TIMES = {
+    "lateness_ms": "lateness [ms]",
+    "jitter_ms": "period jitter [ms]",
+    "staleness_ms": "age of values used [ms]",
+    "staleness_steps": "age of values used [steps]",
+}
+QUANTILES = {"p50": "median", "p95": "95 %", "p99": "99 %", "max": "largest"}
+REAL_TIME_LAWS = {key: LAW_NAMES[key] for key in ("pattern", "sequential", "continuous")}
+CORRECTED = "corrected for this run's graph sequence"
+SMALLER = "has a smaller error than"
+
 _STYLES = {"agrees": "bold green", "disagrees": "bold red", "incomplete": "bold yellow", "unpredicted": "bold"}
+_FEW_AGENTS, _WORST = 8, 5  # most agents of whom each has a row; rows of larger networks
 
 
-def print_comparison(document: dict[str, Any], console: Console) -> None:
-    """Print verdict, errors measured and predicted, tests and what is missing; a run's ``strangers``, if any."""
+def print_comparison(document: dict[str, Any], console: Console, *, verbose: bool = False) -> None:
+    """Print the verdict, what is wrong or missing, rejected tests and errors; with ``verbose`` everything.
+
+    ``document`` may be that of a run, with its rejected messages (``strangers``).
+    """
     console.print(verdict_line(document), style=_STYLES[document["verdict"]])
-    count = document["completeness"]
-    console.print(
-        f"{count['received']} of {count['expected']} states in {document['steps']} steps "
-        f"({number_text(document['simulated_time'])} units of time): {count['missing']} missing, "
-        f"{count['duplicates']} duplicates, {count['out_of_order']} out of order"
-    )
-    if (until := document.get("until")) is not None and until["ended_early"]:
-        step, why = document["steps"], until.get("reason") or f"--until {until['rule']}"
-        console.print(Text(f"The run ended in order at step {step} of {until['planned_steps']}: {why}."))
-    elif until is not None:
-        console.print(Text(f"--until {until['rule']}: {until.get('reason') or 'not reached before the planned end'}."))
-    for line in gaps(count):
+    for line in _facts(document):
         console.print(Text(line))
-    if document.get("unpredicted"):
-        console.print(Text(f"No prediction: {document['unpredicted']}."))
-    if document.get("transient"):
-        console.print(f"The errors leave out the first {document['transient']} steps (transient).")
-    for cause in (document.get("blame") or [])[:ROWS]:
+    for cause in document.get("blame") or []:
         console.print(Text(with_names(sentence(cause["words"]), document.get("names"))), style="bold red")
     for line in trust_words(document):
         console.print(Text(line))
     _print_bags(document.get("bags") or [], console)
-    _print_errors(document, console)
-    _print_tests(document, console)
-    for line in [*any_time_words(document), *agent_order(document)]:
-        console.print(Text(line))
+    _print_tests(document, console, verbose)
+    _print_errors(document, console, verbose)
+    if verbose or (document.get("any_time") or {}).get("disagrees"):
+        for line in any_time_words(document):
+            console.print(Text(line))
+    if document.get("laws"):
+        if verbose:
+            _print_timing(document["timing"], document["laws"], console)
+        for line in [with_names(document["laws"]["why"], document.get("names")), *lost_words(document)]:
+            console.print(Text(line))
+    _print_rejected(document.get("strangers") or [], console)
+    if verbose:
+        for line in _details(document):
+            console.print(Text(line))
+
+
+def _facts(document: dict[str, Any]) -> list[str]:
+    """How many states there are, how the run ended, and what its errors leave out."""
+    count = document["completeness"]
+    lines = [
+        f"{count['received']} of {count['expected']} states in {document['steps']} steps "
+        f"({number_text(document['simulated_time'])} units of time)"
+    ]
+    wrong = [f"{count[key]} {key.replace('_', ' ')}" for key in ("missing", "duplicates", "out_of_order") if count[key]]
+    lines[0] += f": {', '.join(wrong)}" if wrong else ""
+    if (until := document.get("until")) is not None:
+        step, why = document["steps"], until.get("reason") or f"--until {until['rule']}"
+        ended = f"The run ended in order at step {step} of {until['planned_steps']}: {why}."
+        missed = f"--until {until['rule']}: {until.get('reason') or 'not reached before the planned end'}."
+        lines.append(ended if until["ended_early"] else missed)
+    lines += gaps(count)
+    if document.get("unpredicted"):
+        lines.append(f"No prediction: {document['unpredicted']}.")
+    if document.get("transient"):
+        lines.append(f"The errors leave out the first {document['transient']} steps (transient).")
+    return lines
+
+
+def _details(document: dict[str, Any]) -> list[str]:
+    lines = agent_order(document)
     loss = document.get("loss") or {}
     if loss.get("lost") is not None:
-        console.print(f"{loss['lost']} messages lost, {loss['expected']:.6g} expected")
-    _print_timing(document, console)
-    _print_strangers(document.get("strangers") or [], console)
-    interval = document["batch_means"]["interval"]
-    measured = measured_text(document["system_error"]["measured"], interval)
-    console.print(f"System error without a model of the run (batch means): {measured}", style="dim")
+        lines.append(f"{loss['lost']} messages lost, {loss['expected']:.6g} expected")
+    measured = measured_text(document["system_error"]["measured"], document["batch_means"]["interval"])
+    lines.append(f"Model-free estimate of the system error (batch means): {measured}")
     continuous = document["continuous"]["system_error"]
     if continuous is not None and not document.get("laws"):
-        console.print(f"System error in continuous time, for reference: {number_text(continuous)}", style="dim")
+        lines.append(f"System error in continuous time, for reference: {number_text(continuous)}")
+    return lines
 
 
 def _print_bags(bags: Sequence[dict[str, Any]], console: Console) -> None:
@@ -117,44 +131,67 @@ def _print_bags(bags: Sequence[dict[str, Any]], console: Console) -> None:
         console.print(Text(f"Incomplete: {', '.join(torn)}. Leave them out for a verdict on the others."))
 
 
-def _print_strangers(strangers: Sequence[dict[str, Any]], console: Console) -> None:
-    if not strangers:
+def _print_tests(document: dict[str, Any], console: Console, verbose: bool) -> None:
+    """How many tests are ok, and all that are rejected; with ``verbose`` the others, too."""
+    tests = document.get("tests") or []
+    rejected = [test for test in tests if test["rejected"]]
+    known = [test["p_adjusted"] for test in tests if test["p_adjusted"] is not None]
+    if not known:
         return
-    console.print(Text("Refused messages", style="bold"))
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("node", "topic", "reason"):
-        table.add_column(heading, overflow="fold")
-    table.add_column("number", justify="right")
-    for entry in first_rows(table, strangers, "kinds"):
-        table.add_row(*(Text(str(entry[key])) for key in ("node", "topic", "reason", "count")))
-    console.print(table)
-
-
-def _print_errors(document: dict[str, Any], console: Console) -> None:
-    columns = ("measured", "95 % interval", "predicted", "z")
-    table = number_table(console, "Mean-square error over the run", "", *columns)
-
-    def row(label: str, entry: dict[str, Any] | None, end_section: bool = False) -> None:
-        entry = entry or {}
-        measured, predicted = number_text(entry.get("measured")), number_text(entry.get("predicted"))
-        cells = (Text(label), measured, interval_text(entry.get("interval")), predicted, z_text(entry.get("z")))
-        table.add_row(*cells, end_section=end_section)
-
-    given = document.get("given_path")
-    row("system", document["system_error"], end_section=not given)
-    if given:
-        row("system, given the path", given["system_error"], end_section=True)
-    agents, corrected = agent_errors(document)
-    for agent, entry in enumerate(first_rows(table, agents, "agents"), start=1):
-        row(agent_text(agent, document.get("names")) + (", given the path" if corrected else ""), entry)
+    count = f"{len(rejected)} of {len(known)} tests rejected" if rejected else f"{len(known)} of {len(known)} tests ok"
+    line = f"{count} (smallest adjusted p {min(known):.2g}"
+    line += f"; family-wise false-alarm rate {percent(document['level'])})" if rejected or verbose else ")"
+    if not rejected and not verbose:
+        console.print(line)
+        return
+    table = number_table(console, line, "test", "p", "p adjusted", "")
+    for test in [*rejected, *(test for test in tests if verbose and not test["rejected"])]:
+        name = Text(with_names(str(test["name"]), document.get("names")))
+        table.add_row(name, p_text(test["p"]), p_text(test["p_adjusted"]), _mark(test))
     print_table(console, table)
 
 
-def _print_timing(document: dict[str, Any], console: Console) -> None:
-    """How well a run in real time kept its time, and which laws it supports."""
-    timing, laws = document.get("timing"), document.get("laws")
-    if not timing or not laws:
-        return
+def _mark(test: dict[str, Any]) -> Text:
+    if test["p"] is None:
+        return Text("not tested", style="dim")
+    return Text("rejected", style="bold red") if test["rejected"] else Text("ok", style="green")
+
+
+def _print_errors(document: dict[str, Any], console: Console, verbose: bool) -> None:
+    """Of the system and of the agents; of large networks, those agents that are furthest from the prediction."""
+    table = Table(box=None, pad_edge=False, padding=(0, 1))
+    table.add_column("mean-square error")
+    for head in ("measured", "95 % interval", "predicted", "z"):
+        table.add_column(head, justify="right")
+
+    def row(label: str, entry: dict[str, Any] | None) -> None:
+        entry = entry or {}
+        measured, predicted = number_text(entry.get("measured")), number_text(entry.get("predicted"))
+        table.add_row(Text(label), measured, interval_text(entry.get("interval")), predicted, z_text(entry.get("z")))
+
+    row("system", document["system_error"])
+    given = document.get("given_path")
+    if given:
+        row("system, corrected*", given["system_error"])
+    agents, corrected = agent_errors(document)
+    shown: Sequence[int] = range(len(agents))
+    if len(agents) > _FEW_AGENTS and not verbose:
+        shown = furthest([agent["z"] for agent in agents], _WORST)
+    for place in shown:
+        row(agent_text(place + 1, document.get("names")) + (", corrected*" if corrected else ""), agents[place])
+    print_table(console, table)
+    if given:
+        console.print(f"* {CORRECTED}", style="dim")
+    if len(shown) < len(agents):
+        inside = sum(agent["z"] is not None and abs(agent["z"]) < 1.96 for agent in agents)
+        console.print(
+            f"{inside} of {len(agents)} agent errors have the prediction in their 95 % intervals; shown are the "
+            f"{len(shown)} that are furthest from it."
+        )
+
+
+def _print_timing(timing: dict[str, Any], laws: dict[str, Any], console: Console) -> None:
+    """How well a run in real time kept its time, and which models it supports."""
     table = number_table(console, "Timing: quantiles", "", *QUANTILES.values())
     for key, title in TIMES.items():
         values = timing[key]
@@ -164,34 +201,140 @@ def _print_timing(document: dict[str, Any], console: Console) -> None:
     for title, text in timing_facts(timing):
         facts.add_row(title, text)
     console.print(facts)
-    table = number_table(console, "Laws", "system error", "predicted", "z", "")
+    table = number_table(console, "Models", "system error", "predicted", "z", "")
     for key, title in REAL_TIME_LAWS.items():
         law = laws[key]
         error = law["system_error"]
         table.add_row(title, number_text(error["predicted"]), z_text(error["z"]), Text(SUPPORT[law["supported"]]))
     print_table(console, table)
-    for line in [with_names(laws["why"], document.get("names")), *unheard_words(document)]:
-        console.print(Text(line))
 
 
-def _print_tests(document: dict[str, Any], console: Console) -> None:
-    tests = document.get("tests") or []
-    if not tests:
+def _print_rejected(messages: Sequence[dict[str, Any]], console: Console) -> None:
+    if not messages:
         return
-    title = f"Tests (level {number_text(document.get('level'))} for all together)"
-    table = number_table(console, title, "test", "p", "p adjusted", "")
-    # Rejected tests first: with many agents the table is cut.
-    shown = [test for test in tests if test["rejected"]] + [test for test in tests if not test["rejected"]]
-    for test in first_rows(table, shown, "tests"):
-        name = with_names(str(test["name"]), document.get("names"))
-        table.add_row(Text(name), p_text(test["p"]), p_text(test["p_adjusted"]), _mark(test))
-    print_table(console, table)
+    console.print(Text("Rejected messages", style="bold"))
+    table = Table(box=box.SIMPLE_HEAD)
+    for heading in ("node", "topic", "reason"):
+        table.add_column(heading, overflow="fold")
+    table.add_column("number", justify="right")
+    for entry in first_rows(table, messages, "kinds"):
+        table.add_row(*(Text(str(entry[key])) for key in ("node", "topic", "reason", "count")))
+    console.print(table)
 
 
-def _mark(test: dict[str, Any]) -> Text:
-    if test["p"] is None:
-        return Text("not tested", style="dim")
-    return Text("rejected", style="bold red") if test["rejected"] else Text("passed", style="green")
+def verdict_line(document: dict[str, Any]) -> str:
+    """The verdict on one run or several; in real time with missed deadlines, which are not a disagreement."""
+    verdict = VERDICTS[document["verdict"]]
+    if document.get("bags"):
+        verdict = verdict.replace("The run agrees", "The runs agree").replace("The run disagrees", "The runs disagree")
+    deadlines = (document.get("timing") or {}).get("deadlines")
+    if not deadlines or not deadlines["missed"]:
+        return verdict
+    return f"{verdict.removesuffix('.')}; {percent(deadlines['share'])} of the deadlines were missed."
+
+
+def timing_facts(timing: dict[str, Any]) -> list[tuple[str, str]]:
+    """Counts of a run in real time, ``timing`` of a comparison: what was counted, and the numbers."""
+    deadlines, uses, graphs = timing["deadlines"], timing["ideal_uses"], timing["outdated_graph"]
+    facts = [
+        ("period", f"{number_text(timing['period_ms'])} ms"),
+        ("deadlines missed", f"{deadlines['missed']} of {deadlines['steps']} ({percent(deadlines['share'])})"),
+        ("neighbour values as recent as with ideal timers", percent(uses["share"])),
+        ("steps with an outdated graph", f"{graphs['steps']} of {deadlines['steps']} ({percent(graphs['share'])})"),
+    ]
+    if timing["never_heard"]:
+        facts.append(("uses of neighbours before their first message", str(timing["never_heard"])))
+    lost = timing.get("unheard")  # results of older versions have none
+    if lost:
+        numbers = f"{lost['unheard']} of {lost['messages']} ({percent(lost['share'])})"
+        facts.append(("late or lost messages", f"{numbers}; simulated loss {percent(lost['expected'])}"))
+    return facts
+
+
+def lost_words(document: dict[str, Any]) -> list[str]:
+    """That messages between agents were lost or late, in a sentence; empty where the experiment says so."""
+    words = ((document.get("timing") or {}).get("unheard") or {}).get("words")
+    return [with_names(sentence(words), document.get("names"))] if words else []
+
+
+def sentence(words: str) -> str:
+    """The words with a capital letter and a full stop."""
+    return f"{words[:1].upper()}{words[1:]}."
+
+
+def agent_errors(document: dict[str, Any]) -> tuple[list[dict[str, Any]], bool]:
+    """The agent errors, and whether they are corrected for the graph sequence.
+
+    They are where only these have intervals: in runs that are too short for intervals over all paths.
+    """
+    given = (document.get("given_path") or {}).get("node_errors") or []
+    corrected = bool(document["system_error"].get("standard_error") is None and given)
+    found = given if corrected else document["node_errors"] or []
+    return [{"p_adjusted": error.get("p_holm"), **error} for error in found], corrected  # results of before have p_holm
+
+
+def any_time_words(document: dict[str, Any]) -> list[str]:
+    """The sequential test in sentences; empty where there is none."""
+    seen = document.get("any_time")
+    if not seen:
+        return []
+    evidence, limit = seen["evidence"], f"threshold {seen['threshold']:g}"
+    shown = number_text(evidence, 2) if evidence is not None else "more than 1e300"
+    line = f"Sequential test: evidence {shown} against the prediction"
+    if not seen["disagrees"]:
+        return [f"{line} ({limit}, not exceeded). Valid at any stopping time."]
+    when = f" at t = {number_text(seen['crossed_at'])}" if seen["crossed_at"] is not None else ""
+    strongest = f"; strongest for: {seen['questions'][0]['about']}" if seen["questions"] else ""
+    line += f" ({limit}, exceeded{when}){strongest}. Valid at any stopping time."
+    return [with_names(line, document.get("names"))]
+
+
+def trust_words(document: dict[str, Any]) -> list[str]:
+    """Which errors to trust, where that is not obvious: with heavy tails, and in runs with few holding times."""
+    trust = document.get("trust")
+    return [trust["words"]] if trust and trust["reason"] in ("heavy_tails", "few_sojourns") else []
+
+
+def agent_order(document: dict[str, Any]) -> list[str]:
+    """Which agents have smaller errors than which, in sentences; empty where that is not known."""
+    if not document.get("order"):
+        return []
+    names = [agent_text(i, document.get("names")) for i in range(1, len(document["node_errors"]) + 1)]
+    return order_statements(document["order"], names, SMALLER)
+
+
+def order_statements(order: dict[str, Any], names: Sequence[str], relation: str, most: int = 12) -> list[str]:
+    """Which of ``names`` differ, in sentences with the ``relation`` of the better one; ``most`` pairs one by one."""
+
+    def named(pair: dict[str, Any]) -> str:
+        sure = pair["confidence"]
+        confidence = "> 99.99 %" if sure > 0.9999 else f"{100 * sure:.2f} %"
+        return f"{names[pair['better'] - 1]} {relation} {names[pair['worse'] - 1]} (confidence {confidence})"
+
+    lines = [
+        f"Order, smallest measured error first: {', '.join(names[i - 1] for i in order['ranking'])}. "
+        f"{order['distinguished']} of {order['pairs']} pairs differ significantly (family-wise level "
+        f"{order['level']:g})."
+    ]
+    # Of each, only the nearest one below it that differs significantly: those further down add little.
+    places = {number: place for place, number in enumerate(order["ranking"])}
+    nearest: dict[int, dict[str, Any]] = {}
+    for pair in sorted(order["distinctions"], key=lambda pair: places[pair["worse"]]):
+        nearest.setdefault(places[pair["better"]], pair)
+    for _, pair in sorted(nearest.items())[:most]:  # the name of a file keeps its first letter
+        lines.append(sentence(named(pair)) if named(pair).startswith("agent ") else f"{named(pair)}.")
+    if order["ties"] and order["distinguished"]:
+        ties = [f"{names[a - 1]} and {names[b - 1]}" for a, b in order["ties"][:most]]
+        lines.append(f"Not significantly different: {'; '.join(ties)}.")
+    for pair in order["contradictions"][:most]:
+        expected = "the opposite order" if pair["predicted"] is False else "equal errors"
+        lines.append(f"Unexpected: {named(pair)}; the theory predicts {expected}.")
+    return lines
+
+
+def furthest(z: Sequence[float | None], most: int) -> list[int]:
+    """Places, from 0, of the ``most`` estimates with the largest abs(z), largest first."""
+    return sorted(range(len(z)), key=lambda place: -abs(z[place] or 0.0))[:most]
 
 
 def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
@@ -223,20 +366,20 @@ def live_line(report: LiveReport, last: int, rate: float) -> str:
 
 
 def any_time_text(report: LiveReport) -> str:
-    """What is valid however often one looks: half-width of the interval, evidence; may be empty."""
+    """Half-width of the interval that is valid at all times, and the evidence; may be empty."""
     seen, parts = report.any_time, []
     if seen.half_width is not None:
-        parts.append(f"any time ± {number_text(seen.half_width, 2)}")
+        parts.append(f"at all times ± {number_text(seen.half_width, 2)}")
     if seen.log_evidence is not None:
         evidence = seen.to_json()["evidence"]
         shown = "more than 1e300" if evidence is None else number_text(evidence, 2)
-        limit = f"disagrees: {seen.strongest}" if seen.crossed else f"disagrees at {seen.threshold:g}"
+        limit = f"exceeded: {seen.strongest}" if seen.crossed else f"threshold {seen.threshold:g}"
         parts.append(f"evidence against the prediction {shown} ({limit})")
     return ", ".join(parts)
 
 
 def coverage(report: LiveReport) -> list[str]:
-    """Steps in the errors, incomplete ones, and refused messages by reason."""
+    """Steps in the errors, incomplete ones, and rejected messages by reason."""
     since = f" since step {report.first}" if report.first else ""
     parts = [f"{report.steps} steps{since}", f"{report.missing} missing"]
     return parts + [f"{reason}: {count}" for reason, count in report.refused.items()]
@@ -248,165 +391,3 @@ def error_text(estimate: Estimate) -> str:
     if estimate.predicted is not None:
         text += f", predicted {number_text(estimate.predicted)}"
     return text + (f", z = {z_text(estimate.z)}" if estimate.z is not None else "")
-
-
-_MOST_PERCENT = 5.0  # larger changes are factors
-_RATES = {"mean": "of means", "second_moment": "of second moments", "graph": "of graph probabilities"}
-
-
-def print_bag_difference(document: dict[str, Any], console: Console) -> None:
-    """Print a document of ``bag_difference``."""
-    a, b = document["a"], document["b"]
-    facts = number_table(console, "Runs", "", "A", "B")
-    for title, values in (
-        ("bag", [side["bag"] for side in (a, b)]),
-        ("experiment", [side["experiment"] for side in (a, b)]),
-        ("seed", [str(side["seed"]) for side in (a, b)]),
-        ("steps", [str(side["steps"]) for side in (a, b)]),
-        ("states missing", [_missing(side) for side in (a, b)]),
-        ("verdict", [side["verdict"] or "none" for side in (a, b)]),
-    ):
-        facts.add_row(title, *map(Text, values))
-    print_table(console, facts)
-    _print_keys("Experiment", document["keys"], console)
-    _print_keys("Versions", document["versions"], console)
-    for line in _states(document):
-        console.print(Text(line))
-    _print_error_differences(document["errors"], _names(document), console)
-    for name, side in (("A", a), ("B", b)):
-        if side["unpredicted"]:
-            console.print(Text(f"{name} has no prediction: {side['unpredicted']}"))
-
-
-def print_experiment_difference(document: dict[str, Any], console: Console) -> None:
-    """Print a document of ``experiment_difference``."""
-    a, b = document["a"], document["b"]
-    console.print(Text(f"A: {a['file']} ({a['name']})\nB: {b['file']} ({b['name']}); changes are from A to B"))
-    _print_keys("Keys", document["keys"], console)
-    for name, side in (("A", a), ("B", b)):
-        if side["unpredicted"]:
-            console.print(Text(f"{name} has no prediction: {side['unpredicted']}"))
-    for law, errors in document["predictions"].items():
-        table = number_table(
-            console, f"Mean-square error in the steady state, {LAW_NAMES[law]}", "", "A", "B", "change"
-        )
-        table.add_row("system", *_relative(errors["system_error"]), end_section=True)
-        for place, error in enumerate(first_rows(table, errors["node_errors"], "agents"), start=1):
-            table.add_row(Text(agent_text(place, _names(document))), *_relative(error))
-        print_table(console, table)
-    table = number_table(console, "Decay rates of the steps of the run", "", "A", "B", "change")
-    for key, title in _RATES.items():
-        table.add_row(title, *_relative(document["rates"][key]))
-    print_table(console, table)
-    leaders = number_table(console, "Leaders", "", "agents", "gain", "system error")
-    for name, key in (("A", "a"), ("B", "b")):
-        side, names = document["leaders"][key], document[key]["names"]
-        if side["agents"]:
-            leaders.add_row(name, *_leaders(side, names))
-        if side["best"]:
-            leaders.add_row(f"best of {name}", *_leaders(side["best"], names))
-        elif side["note"]:
-            leaders.caption = f"{leaders.caption or ''}{name}: {side['note']}. "
-    print_table(console, leaders)
-
-
-def _print_keys(title: str, keys: Sequence[dict[str, Any]], console: Console) -> None:
-    if not keys:
-        console.print(Text(f"{title}: no difference"))
-        return
-    table = fact_table(console, f"{title}: {counted(len(keys), 'difference')}")
-    for entry in keys:
-        table.add_row(Text(entry["key"]), Text(f"A: {_value(entry['a'])}\nB: {_value(entry['b'])}"))
-    console.print(table)
-
-
-def _value(value: Any) -> str:
-    return "-" if value is None else value if isinstance(value, str) else show(value)
-
-
-def _missing(side: dict[str, Any]) -> str:
-    count = side["completeness"]
-    graphs = f", graphs of {count['missing_modes']} steps" if count["missing_modes"] else ""
-    return f"{count['missing']} of {count['expected']}{graphs}"
-
-
-def _states(document: dict[str, Any]) -> list[str]:
-    """What is said of states and graphs."""
-    states, graphs = document["states"], document["graphs"]
-    if states["compared"] is None:
-        return [f"States: not comparable: {states['why']}"]
-    lines = []
-    first, largest, last, names = states["first"], states["largest"], states["last"], _names(document)
-    if states["equal"]:
-        lines.append(f"States: equal to the last bit, x(0) to x({states['compared']})")
-    elif first is None:
-        lines.append(f"States: equal to the last bit up to x({states['compared']}), where both runs have them")
-    else:
-        everybody = len(first["agents"]) == document["a"]["agents"]
-        agents = "all agents" if everybody else _agents(first["agents"], names)
-        agent = agent_text(largest["agent"], names)
-        lines += [
-            f"States: first difference at step {first['step']} (time {number_text(first['time'])}), {agents}, by "
-            f"{number_text(first['difference'])}",
-            f"  different: {counted(states['states'], 'state')} in {counted(states['steps'], 'step')} of "
-            f"{states['compared'] + 1}",
-            f"  largest: {number_text(largest['difference'])} at step {largest['step']}, {agent}, "
-            f"number {largest['number']}; at the last common step {last['step'] if last else '-'}: "
-            f"{number_text(last['difference'] if last else None)}",
-        ]
-    lines += [
-        f"  {states[key]} states only in {name}" for key, name in (("only_a", "A"), ("only_b", "B")) if states[key]
-    ]
-    if graphs:
-        lines.append(
-            f"Graphs: first difference at step {graphs['step']}: {graphs['a']} in A, {graphs['b']} in B; "
-            f"different in {counted(graphs['steps'], 'step')}"
-        )
-    else:
-        lines.append("Graphs: equal in all steps that both runs have")
-    return lines
-
-
-def _print_error_differences(errors: dict[str, Any], names: Sequence[str] | None, console: Console) -> None:
-    table = number_table(console, "Measured mean-square errors", "", "A", "B", "B - A", "in standard errors")
-    table.add_row("system", *_measured(errors["system"]), end_section=True)
-    for place, error in enumerate(first_rows(table, errors["agents"], "agents"), start=1):
-        table.add_row(Text(agent_text(place, names)), *_measured(error))
-    print_table(console, table)
-    if not errors["independent"]:
-        console.print(Text("Both runs have the same seed: their errors are not independent.", style="dim"))
-
-
-def _measured(error: dict[str, Any]) -> list[str]:
-    sides = (error["a"] or {}, error["b"] or {})
-    texts = [measured_text(side.get("measured"), (side.get("low"), side.get("high"))) for side in sides]
-    return [*(text.removesuffix(" (95 %)") for text in texts), number_text(error["difference"], 3), z_text(error["z"])]
-
-
-def _relative(pair: dict[str, Any]) -> list[str]:
-    a, b, change = pair["a"], pair["b"], pair["relative"]
-    if change is None:
-        text = "-"
-    elif change == 0.0:
-        text = "equal"
-    elif abs(change) > _MOST_PERCENT:
-        text = f"{number_text(b / a, 3)} times"
-    else:
-        text = f"{'+' if change > 0 else '-'}{percent(abs(change))}"
-    return [number_text(a), number_text(b), text]
-
-
-def _leaders(side: dict[str, Any], names: Sequence[str] | None) -> list[str | Text]:
-    agents = Text(listed([agent_name(agent, names) for agent in side["agents"]]))
-    gain = side["gain"]
-    return [agents, gain if gain == "inf" else number_text(gain), number_text(side["system_error"])]
-
-
-def _names(document: dict[str, Any]) -> list[str] | None:
-    """The names of the agents, where both have the same ones."""
-    names: list[str] | None = document["a"]["names"]
-    return names if names == document["b"]["names"] else None
-
-
-def _agents(agents: Sequence[int], names: Sequence[str] | None) -> str:
-    return f"{'agent' if len(agents) == 1 else 'agents'} {listed([agent_name(agent, names) for agent in agents])}"

@@ -1,34 +1,48 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Differences of two runs: experiments, bags, states."""
+"""Differences of two bags or two experiments: the documents of ``diff``, and their terminal text."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import Console
+from rich.text import Text
 
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray, release
 from msg_analysis.common.files import RESULT_FILE
 from msg_analysis.common.resources import tell
-from msg_analysis.common.text import HALF_WIDTH_95
+from msg_analysis.common.text import (
+    HALF_WIDTH_95,
+    agent_name,
+    agent_text,
+    counted,
+    listed,
+    measured_text,
+    number_text,
+    percent,
+    z_text,
+)
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.experiment.problems import show
 from msg_analysis.inference.comparison import flat
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.run import Run
-from msg_analysis.report.wording import agent_errors
+from msg_analysis.report.comparison_text import agent_errors
+from msg_analysis.report.tables import fact_table, first_rows, number_table, print_table
 from msg_analysis.runs import read_document, result_row, tested_error
 from msg_analysis.theory.leader_search import SearchProgress, ignore
 from msg_analysis.theory.leaders import AUTO_SETS, select_leaders
-from msg_analysis.theory.prediction import Moments, Prediction, predict
+from msg_analysis.theory.prediction import LAW_NAMES, Moments, Prediction, predict
 from msg_analysis.theory.settling import asymptotic_rates
 
 
@@ -38,7 +52,8 @@ def state_difference(a: Run, b: Run, *, block_numbers: int = BLOCK_NUMBERS) -> d
     States of a step count as equal if both are missing; +0 and -0 are different.
     """
     if a.states.shape[1:] != b.states.shape[1:]:
-        why = f"{_shape(a)} and {_shape(b)}"
+        shapes = [run.states.shape[1:] for run in (a, b)]
+        why = " and ".join(f"{agents} agents with {counted(width, 'number')} each" for agents, width in shapes)
         return {"compared": None, "why": why, "equal": None, **dict.fromkeys(_KEYS)}
     steps = min(len(a.states), len(b.states)) - 1
     found = _Differences(a.record.experiment.step_length)
@@ -72,11 +87,6 @@ def graph_difference(a: Run, b: Run) -> dict[str, Any] | None:
     return {"step": step, "a": names_a[a.modes[step]], "b": names_b[b.modes[step]], "steps": int(differs.sum())}
 
 
-def _shape(run: Run) -> str:
-    agents, width = run.states.shape[1:]
-    return f"{agents} agents with {width} {'number' if width == 1 else 'numbers'} each"
-
-
 _KEYS = ("first", "largest", "last", "steps", "states", "only_a", "only_b")
 
 
@@ -95,7 +105,7 @@ class _Differences:
 
     def add(self, begin: int, a: FloatArray, b: FloatArray) -> None:
         """Take the states (steps, agents, width) of both runs, from step ``begin`` on."""
-        has_a, has_b = _there(a), _there(b)
+        has_a, has_b = (np.asarray(~np.isnan(states).any(axis=2)) for states in (a, b))  # (steps, agents)
         self.only_a += int((has_a & ~has_b).sum())
         self.only_b += int((has_b & ~has_a).sum())
         both = has_a & has_b
@@ -122,11 +132,6 @@ class _Differences:
         if self.largest is None or size > self.largest["difference"]:
             place = [int(index) for index in np.unravel_index(int(np.argmax(sizes)), sizes.shape)]
             self.largest = {"step": begin + place[0], "agent": place[1] + 1, "number": place[2] + 1, "difference": size}
-
-
-def _there(states: FloatArray) -> BoolArray:
-    """(steps, agents) which states are not missing."""
-    return np.asarray(~np.isnan(states).any(axis=2))
 
 
 def differing(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -174,8 +179,7 @@ def experiment_difference(a: Experiment, b: Experiment, watch: SearchProgress = 
     rates = [_rates(prediction) if isinstance(prediction, Prediction) else {} for prediction in found]
     return {
         "kind": "experiments",
-        "a": _side(a, found[0]),
-        "b": _side(b, found[1]),
+        **{name: _side(*each) for name, each in zip("ab", zip(pair, found, strict=True), strict=True)},
         "keys": differing(*(flat(experiment.to_document()) for experiment in pair)),
         "predictions": {law: _errors(*(side.get(law) for side in laws)) for law in {**laws[0], **laws[1]}},
         "rates": {key: relative(*(side.get(key) for side in rates)) for key in _RATES},
@@ -207,23 +211,16 @@ def _prediction(experiment: Experiment) -> Prediction | str:
 def _laws(prediction: Prediction) -> dict[str, Moments]:
     """By their names in ``msg-analysis predict --json``."""
     steps = "discrete" if prediction.experiment.time == "discrete" else "emulated"
-    laws = {
-        "continuous": prediction.continuous_moments,
-        steps: prediction.emulated,
-        "static": prediction.static_moments,
-    }
+    laws = {"continuous": prediction.continuous_moments, steps: prediction.emulated}
+    laws["static"] = prediction.static_moments
     return {name: moments for name, moments in laws.items() if moments is not None}
 
 
 def _errors(a: Moments | None, b: Moments | None) -> dict[str, Any]:
     nodes_a, nodes_b = (moments.node_errors.tolist() if moments else [] for moments in (a, b))
-    return {
-        "system_error": relative(*(moments.system_error if moments else None for moments in (a, b))),
-        # Agents of networks of different sizes have nothing in common but their numbers.
-        "node_errors": [relative(*pair) for pair in zip(nodes_a, nodes_b, strict=True)]
-        if len(nodes_a) == len(nodes_b)
-        else [],
-    }
+    pairs = zip(nodes_a, nodes_b, strict=True) if len(nodes_a) == len(nodes_b) else ()  # else not the same agents
+    system = relative(*(moments.system_error if moments else None for moments in (a, b)))
+    return {"system_error": system, "node_errors": [relative(*pair) for pair in pairs]}
 
 
 def _rates(prediction: Prediction) -> dict[str, float | None]:
@@ -242,13 +239,9 @@ def _leaders(
         own = experiment.spec.leaders
         pattern = own or other.spec.leaders
         count, gain = (len(pattern.agents), pattern.gain) if pattern else (1, math.inf)
-        side: dict[str, Any] = {
-            "agents": list(own.agents) if own else None,
-            "gain": _gain(own.gain) if own else None,
-            "system_error": None,
-            "best": None,
-            "note": None,
-        }
+        side: dict[str, Any] = dict.fromkeys(("agents", "gain", "system_error", "best", "note"))
+        if own:
+            side |= {"agents": list(own.agents), "gain": "inf" if math.isinf(own.gain) else own.gain}
         sides.append(side)
         if isinstance(prediction, str):
             side["note"] = "no prediction"
@@ -261,19 +254,10 @@ def _leaders(
                 side["note"] = str(error)
                 continue
             document = selection.to_json()
-            best = document["sets"][0]
-            side["best"] = {
-                "agents": best["agents"],
-                "system_error": best["system_error"],
-                "gain": document["gain"],
-                "law": document["law"],
-            }
+            best = {key: document["sets"][0][key] for key in ("agents", "system_error")}
+            side["best"] = best | {key: document[key] for key in ("gain", "law")}
             side["system_error"] = document["present"]["system_error"] if document["present"] else None
     return sides
-
-
-def _gain(gain: float) -> float | str:
-    return "inf" if math.isinf(gain) else gain
 
 
 _NUMBERS = ("measured", "standard_error", "predicted")
@@ -300,7 +284,7 @@ def bag_difference(a: Path, b: Path) -> dict[str, Any]:
         "errors": {
             "independent": one.experiment.run.seed != other.experiment.run.seed,
             "system": measured(*(side["system_error"] for side in sides)),
-            "agents": _agents(*(_agent_errors(result) for result in results)),
+            "agents": _agents(*results),
         },
     }
 
@@ -344,15 +328,11 @@ def _result(path: Path, run: Run) -> dict[str, Any]:
         return {"verdict": None, "unpredicted": str(error)}
 
 
-def _agent_errors(result: dict[str, Any]) -> list[dict[str, Any]]:
-    if "node_errors" not in result:
-        return []
-    return [_with_interval(node) for node in agent_errors(result)[0]]
-
-
-def _agents(a: list[dict[str, Any]], b: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Side by side, where both runs have as many agents; empty otherwise."""
-    return [measured(*pair) for pair in zip(a, b, strict=True)] if len(a) == len(b) else []
+def _agents(*results: dict[str, Any]) -> list[dict[str, Any]]:
+    """The agent errors side by side, where both runs have as many agents; empty otherwise."""
+    a, b = (agent_errors(result)[0] if "node_errors" in result else [] for result in results)
+    pairs = zip(a, b, strict=True) if len(a) == len(b) else ()
+    return [measured(*map(_with_interval, pair)) for pair in pairs]
 
 
 def _with_interval(error: dict[str, Any]) -> dict[str, Any]:
@@ -363,3 +343,156 @@ def _with_interval(error: dict[str, Any]) -> dict[str, Any]:
         return numbers | {"low": None, "high": None}
     half = HALF_WIDTH_95 * deviation
     return numbers | {"low": value - half, "high": value + half}
+
+
+_MOST_PERCENT = 5.0  # larger changes are factors
+_RATE_WORDS = {"mean": "of means", "second_moment": "of second moments", "graph": "of graph probabilities"}
+
+
+def print_bag_difference(document: dict[str, Any], console: Console) -> None:
+    """Print a document of ``bag_difference``."""
+    a, b = document["a"], document["b"]
+    facts = number_table(console, "Runs", "", "A", "B")
+    for key in ("bag", "experiment", "seed", "steps"):
+        facts.add_row(key, *(Text(str(side[key])) for side in (a, b)))
+    facts.add_row("states missing", *(Text(_missing(side)) for side in (a, b)))
+    facts.add_row("verdict", *(Text(side["verdict"] or "none") for side in (a, b)))
+    print_table(console, facts)
+    _print_keys("Experiment", document["keys"], console)
+    _print_keys("Versions", document["versions"], console)
+    for line in _states(document):
+        console.print(Text(line))
+    _print_error_differences(document["errors"], _names(document), console)
+    _print_unpredicted(document, console)
+
+
+def _print_unpredicted(document: dict[str, Any], console: Console) -> None:
+    for name in "ab":
+        if reason := document[name]["unpredicted"]:
+            console.print(Text(f"{name.upper()} has no prediction: {reason}"))
+
+
+def print_experiment_difference(document: dict[str, Any], console: Console) -> None:
+    """Print a document of ``experiment_difference``."""
+    a, b = document["a"], document["b"]
+    console.print(Text(f"A: {a['file']} ({a['name']})\nB: {b['file']} ({b['name']}); changes are from A to B"))
+    _print_keys("Keys", document["keys"], console)
+    _print_unpredicted(document, console)
+    for law, errors in document["predictions"].items():
+        table = number_table(
+            console, f"Mean-square error in the steady state, {LAW_NAMES[law]}", "", "A", "B", "change"
+        )
+        table.add_row("system", *_relative(errors["system_error"]), end_section=True)
+        for place, error in enumerate(first_rows(table, errors["node_errors"], "agents"), start=1):
+            table.add_row(Text(agent_text(place, _names(document))), *_relative(error))
+        print_table(console, table)
+    table = number_table(console, "Decay rates of the steps of the run", "", "A", "B", "change")
+    for key, title in _RATE_WORDS.items():
+        table.add_row(title, *_relative(document["rates"][key]))
+    print_table(console, table)
+    leaders = number_table(console, "Leaders", "", "agents", "gain", "system error")
+    for name, key in (("A", "a"), ("B", "b")):
+        side, names = document["leaders"][key], document[key]["names"]
+        if side["agents"]:
+            leaders.add_row(name, *_leader_cells(side, names))
+        if side["best"]:
+            leaders.add_row(f"best of {name}", *_leader_cells(side["best"], names))
+        elif side["note"]:
+            leaders.caption = f"{leaders.caption or ''}{name}: {side['note']}. "
+    print_table(console, leaders)
+
+
+def _print_keys(title: str, keys: Sequence[dict[str, Any]], console: Console) -> None:
+    if not keys:
+        console.print(Text(f"{title}: no difference"))
+        return
+    table = fact_table(console, f"{title}: {counted(len(keys), 'difference')}")
+    for entry in keys:
+        values = (entry["a"], entry["b"])
+        texts = ["-" if value is None else value if isinstance(value, str) else show(value) for value in values]
+        table.add_row(Text(entry["key"]), Text("A: {}\nB: {}".format(*texts)))
+    console.print(table)
+
+
+def _missing(side: dict[str, Any]) -> str:
+    count = side["completeness"]
+    graphs = f", graphs of {count['missing_modes']} steps" if count["missing_modes"] else ""
+    return f"{count['missing']} of {count['expected']}{graphs}"
+
+
+def _states(document: dict[str, Any]) -> list[str]:
+    """What is said of states and graphs."""
+    states, graphs = document["states"], document["graphs"]
+    if states["compared"] is None:
+        return [f"States: not comparable: {states['why']}"]
+    lines = []
+    first, largest, last, names = states["first"], states["largest"], states["last"], _names(document)
+    if states["equal"]:
+        lines.append(f"States: equal to the last bit, x(0) to x({states['compared']})")
+    elif first is None:
+        lines.append(f"States: equal to the last bit up to x({states['compared']}), where both runs have them")
+    else:
+        everybody = len(first["agents"]) == document["a"]["agents"]
+        agents = "all agents" if everybody else _agent_list(first["agents"], names)
+        agent = agent_text(largest["agent"], names)
+        lines += [
+            f"States: first difference at step {first['step']} (time {number_text(first['time'])}), {agents}, by "
+            f"{number_text(first['difference'])}",
+            f"  different: {counted(states['states'], 'state')} in {counted(states['steps'], 'step')} of "
+            f"{states['compared'] + 1}",
+            f"  largest: {number_text(largest['difference'])} at step {largest['step']}, {agent}, "
+            f"number {largest['number']}; at the last common step {last['step'] if last else '-'}: "
+            f"{number_text(last['difference'] if last else None)}",
+        ]
+    lines += [
+        f"  {states[key]} states only in {name}" for key, name in (("only_a", "A"), ("only_b", "B")) if states[key]
+    ]
+    if graphs:
+        lines.append(
+            f"Graphs: first difference at step {graphs['step']}: {graphs['a']} in A, {graphs['b']} in B; "
+            f"different in {counted(graphs['steps'], 'step')}"
+        )
+    else:
+        lines.append("Graphs: equal in all steps that both runs have")
+    return lines
+
+
+def _print_error_differences(errors: dict[str, Any], names: Sequence[str] | None, console: Console) -> None:
+    table = number_table(console, "Measured mean-square errors", "", "A", "B", "B - A", "in standard errors")
+    table.add_row("system", *_measured(errors["system"]), end_section=True)
+    for place, error in enumerate(first_rows(table, errors["agents"], "agents"), start=1):
+        table.add_row(Text(agent_text(place, names)), *_measured(error))
+    print_table(console, table)
+    if not errors["independent"]:
+        console.print(Text("Both runs have the same seed: their errors are not independent.", style="dim"))
+
+
+def _measured(error: dict[str, Any]) -> list[str]:
+    sides = (error["a"] or {}, error["b"] or {})
+    texts = [measured_text(side.get("measured"), (side.get("low"), side.get("high"))) for side in sides]
+    return [*(text.removesuffix(" (95 %)") for text in texts), number_text(error["difference"], 3), z_text(error["z"])]
+
+
+def _relative(pair: dict[str, Any]) -> list[str]:
+    a, b, change = pair["a"], pair["b"], pair["relative"]
+    text = "-" if change is None else "equal"
+    if change:
+        factor = abs(change) > _MOST_PERCENT
+        text = f"{number_text(b / a, 3)} times" if factor else f"{'+' if change > 0 else '-'}{percent(abs(change))}"
+    return [number_text(a), number_text(b), text]
+
+
+def _leader_cells(side: dict[str, Any], names: Sequence[str] | None) -> list[str | Text]:
+    agents = Text(listed([agent_name(agent, names) for agent in side["agents"]]))
+    gain = side["gain"]
+    return [agents, gain if gain == "inf" else number_text(gain), number_text(side["system_error"])]
+
+
+def _names(document: dict[str, Any]) -> list[str] | None:
+    """The names of the agents, where both have the same ones."""
+    names: list[str] | None = document["a"]["names"]
+    return names if names == document["b"]["names"] else None
+
+
+def _agent_list(agents: Sequence[int], names: Sequence[str] | None) -> str:
+    return f"{'agent' if len(agents) == 1 else 'agents'} {listed([agent_name(agent, names) for agent in agents])}"

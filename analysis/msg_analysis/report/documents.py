@@ -11,18 +11,17 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.common.text import agent_name, markdown_table
+from msg_analysis.common.text import agent_name
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import loading, validation
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graphs import Graph
-from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
 from msg_analysis.inference.autocovariance import (
     LoggedAutocovariance,
     LoggedDensity,
@@ -30,7 +29,6 @@ from msg_analysis.inference.autocovariance import (
     why_not_tested,
 )
 from msg_analysis.inference.observation import Observation
-from msg_analysis.protocol import Protocol
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.facts import check_facts
 from msg_analysis.theory.graph_indices import algebraic_connectivity, error_bounds, graph_indices
@@ -44,74 +42,6 @@ from msg_analysis.theory.two_graphs import two_topology
 if TYPE_CHECKING:
     from msg_analysis.bags.files import FileInventory, Inventory
     from msg_analysis.bags.salvage import SalvageReport
-
-
-Pace = Literal["lockstep", "realtime"]
-
-_OWN, _BURSTS = {"loss": 0.2}, {"loss": 0.2, "burst": 5}
-_BY_LINK = {"loss": {"default": 0.1, "arcs": [[1, 2, 0.5]]}}
-_HOLD: dict[str, Any] = {"on_loss": "hold"}
-MESSAGES: dict[str, dict[str, Any]] = {
-    "as they are": {},
-    "`broadcast` noise": {"broadcast": 0.5},
-    "`link` noise": {"link": 0.5},
-    "`loss`, own value": _OWN,
-    "`loss`, last value heard": _OWN | _HOLD,
-    "`loss` by link, own value": _BY_LINK,
-    "`loss` by link, last value heard": _BY_LINK | _HOLD,
-    "`loss` in bursts, own value": _BURSTS,
-    "`loss` in bursts, last value heard": _BURSTS | _HOLD,
-    "`delay`": {"delay": 2},
-    "all of these, own value": {"broadcast": 0.5, "link": 0.5, "delay": 2, **_BY_LINK, "burst": 5},
-    "all of these, last value heard": {"broadcast": 0.5, "link": 0.5, "delay": 2, **_BY_LINK, "burst": 5, **_HOLD},
-}
-"""Sections ``noise``, beside the process noise, by what they make of messages."""
-
-LAWS: dict[str, dict[str, Any]] = {
-    "consensus": {},
-    "leaders": {"problem": "tracking", "leaders": {"agents": [1], "gain": 1.0}},
-    "leaders held at the reference": {"problem": "tracking", "leaders": {"agents": [1], "gain": "inf"}},
-    "linear protocol": {},
-    "protocol that is not linear": {"run": {"start": "zero"}},
-}
-PROCESS_NOISE: tuple[Any, ...] = (0.0, 1.0, [1.0, 0.5], [[1.0, 0.2], [0.0, 1.0]], {"a": 1.0, "b": 2.0})
-
-
-def experiment(messages: str, law: str, pace: Pace, process: Any = 1.0) -> Experiment:
-    """One with these messages and this law; only asked what is available, since its protocol does nothing."""
-    document: dict[str, Any] = {"name": "any", "graphs": {"a": {"path": [1, 2]}, "b": {"arcs": [[1, 2], [2, 1]]}}}
-    document |= {"switching": {"generator": [[-1, 1], [1, -1]]}, **LAWS[law]}
-    document["noise"] = {"process": process, **MESSAGES[messages]}
-    document["run"] = {"pace": pace, **document.get("run", {})}
-    found = Experiment.parse(document)
-    if "protocol" not in law:
-        return found
-    info = ProtocolInfo(name="any", package="any", version="1", linear=law == "linear protocol")
-    return dataclasses.replace(found, protocol=ChosenProtocol(info, kind=Protocol))
-
-
-def availability_table() -> str:
-    """As Markdown; every kind of process noise is in every cell."""
-    head = ("messages", "lockstep: run, twin", "lockstep: predicted", "real time: run, twin", "real time: predicted")
-    paces: tuple[Pace, ...] = ("lockstep", "realtime")
-    rows = [
-        (messages, *(_cell(messages, pace, purpose) for pace in paces for purpose in ("run", "predict")))
-        for messages in MESSAGES
-    ]
-    return markdown_table(head, rows, names=len(head))
-
-
-def _cell(messages: str, pace: Pace, purpose: Any) -> str:
-    missing = [
-        law
-        for law in LAWS
-        if any(experiment(messages, law, pace, process).unavailable(purpose) for process in PROCESS_NOISE)
-    ]
-    if not missing:
-        return "all laws"
-    if len(missing) == len(LAWS):
-        return "no"
-    return "linear laws" if missing == ["protocol that is not linear"] else "all but " + ", ".join(missing)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -300,12 +230,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     document = experiment.to_document()
     chain = experiment.chain
     states, matrices = loading.memory_needed(
-        experiment.agents,
-        chain.modes,
-        experiment.steps,
-        experiment.width,
-        experiment.noise.delay,
-        experiment.truth,
+        experiment.agents, chain.modes, experiment.steps, experiment.width, experiment.noise.delay, experiment.truth
     )
     limits = [_stability_limit(experiment, graph) for graph in experiment.graph_list]
     return {

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Drawings of graphs and intervals as SVG."""
+"""The experiment and its graphs in words and as SVG drawings; intervals as bars."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.common.text import agent_name, z_text
+from msg_analysis.common.text import agent_name, listed, z_text
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.report.figures import LABELLED, places, shorten
-from msg_analysis.report.plot_style import NOBODY, Accused, graph_variable
+from msg_analysis.report.plot_style import NOBODY, Candidates, graph_variable
+from msg_analysis.theory.graph_indices import algebraic_connectivity
 
 _LEAST_REACH = 0.02  # relative deviation at the ends of the narrowest scale
 
@@ -83,17 +84,17 @@ MOST_GRAPHS = 8
 """Most graphs that are drawn."""
 MOST_MODES = 6
 """Most graphs whose chain is drawn; with more, the report has a table of the rates."""
-MARK = ' class="accused"'
+MARK = ' class="candidate"'
 _SIDE = 200.0
 _WEIGHTS = 5  # different line widths
 
 
-def graph_drawings(experiment: Experiment, accused: Accused = NOBODY) -> list[Markup]:
+def graph_drawings(experiment: Experiment, candidates: Candidates = NOBODY) -> list[Markup]:
     """The first ``MOST_GRAPHS`` graphs, each agent at the same place in all of them; leaders are squares."""
     where = _scaled(places(experiment.graph_list), experiment.agents)
     leaders = set(experiment.spec.leaders.agents) if experiment.spec.leaders else set()
     return [
-        _graph(graph, where, graph_variable(mode), leaders, accused, experiment.names)
+        _graph(graph, where, graph_variable(mode), leaders, candidates, experiment.names)
         for mode, graph in enumerate(experiment.graph_list[:MOST_GRAPHS])
     ]
 
@@ -109,7 +110,7 @@ def _scaled(where: Mapping[int, FloatArray], agents: int) -> FloatArray:
 
 
 def _graph(
-    graph: Graph, where: FloatArray, colour: str, leaders: set[int], accused: Accused, names: Sequence[str] | None
+    graph: Graph, where: FloatArray, colour: str, leaders: set[int], candidates: Candidates, names: Sequence[str] | None
 ) -> Markup:
     radius = 11.0 if graph.agents <= 12 else 8.0 if graph.agents <= LABELLED else 3.0
     links = graph.edges if graph.symmetric else graph.arcs
@@ -117,7 +118,7 @@ def _graph(
         f'<svg viewBox="0 0 {_SIDE:g} {_SIDE:g}" role="img" aria-label="{escape(graph.name)}: {len(links)} links" '
         'xmlns="http://www.w3.org/2000/svg">',
         *_links(links, where, colour, radius, directed=not graph.symmetric),
-        *_marked_links(accused.links_of(graph.name), links, where),
+        *_marked_links(candidates.links_of(graph.name), links, where),
     ]
     for agent, (x, y) in enumerate(where, start=1):
         name = agent_name(agent, names)
@@ -127,15 +128,16 @@ def _graph(
             if agent in leaders
             else f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}"'
         )
-        hears: list[int] = (np.flatnonzero(graph.adjacency[agent - 1]) + 1).tolist()
-        heard = (
-            ", ".join(agent_name(other, names) for other in hears[:20]) + (", …" if len(hears) > 20 else "")
-            if hears
+        senders: list[int] = (np.flatnonzero(graph.adjacency[agent - 1]) + 1).tolist()
+        named = (
+            ", ".join(agent_name(other, names) for other in senders[:20]) + (", …" if len(senders) > 20 else "")
+            if senders
             else "no agent"
         )
         parts.append(
             f'<g>{shape} fill="var(--page)" stroke="{colour}" stroke-width="1.5"'
-            f"{MARK if agent in accused.agents else ''}/><title>{escape(f'{kind} {name} hears {heard}')}</title>"
+            f"{MARK if agent in candidates.agents else ''}/>"
+            f"<title>{escape(f'{kind} {name} receives from {named}')}</title>"
         )
         if graph.agents <= LABELLED:
             size = radius * min(1.0, 2.4 / len(name)) if names else radius if agent < 100 else 0.8 * radius
@@ -176,7 +178,7 @@ def _marked_links(marked: set[tuple[int, int]], links: list[tuple[int, int, floa
     """The links that the verdict names, on top of the others."""
     there = {(source, target) for source, target, _ in links}
     return [
-        f'<path class="accused" d="M{_at(where[first - 1])}L{_at(where[second - 1])}" fill="none">'
+        f'<path class="candidate" d="M{_at(where[first - 1])}L{_at(where[second - 1])}" fill="none">'
         f"<title>named by the verdict: {first}-{second}</title></path>"
         for first, second in sorted(marked)
         if {(first, second), (second, first)} & there
@@ -192,7 +194,7 @@ def _at(point: FloatArray) -> str:
     return f"{point[0]:.1f} {point[1]:.1f}"
 
 
-def chain_drawing(experiment: Experiment, accused: Accused = NOBODY) -> Markup | None:
+def chain_drawing(experiment: Experiment, candidates: Candidates = NOBODY) -> Markup | None:
     """The chain: a circle per graph, an arrow per rate (or probability) from one to another.
 
     None for a single graph, and for more than ``MOST_MODES``.
@@ -216,7 +218,7 @@ def chain_drawing(experiment: Experiment, accused: Accused = NOBODY) -> Markup |
         for j in range(modes):
             if i != j and chain.matrix[i, j] > 0:
                 title = f"{unit} from {names[i]} to {names[j]}: {chain.matrix[i, j]:g}"
-                mark = MARK if accused.jump(names[i], names[j]) else ""
+                mark = MARK if candidates.jump(names[i], names[j]) else ""
                 parts.append(_jump(centres[i], centres[j], radius, f"{chain.matrix[i, j]:.4g}", title, mark))
     for mode, (x, y) in enumerate(centres):
         share = f"{100 * chain.stationary[mode]:.3g} %"
@@ -261,3 +263,117 @@ def _jump(a: FloatArray, b: FloatArray, radius: float, label: str, title: str, m
 
 def _unit(vector: FloatArray) -> FloatArray:
     return np.asarray(vector / max(float(np.hypot(*vector)), 1e-9))
+
+
+def explain(experiment: Experiment) -> list[str]:
+    """What the agents do, what switches, what is random, and what was run: a short paragraph each."""
+    return [_task(experiment), _switching(experiment), _noise(experiment), _run(experiment)]
+
+
+def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
+    """Of every graph: ``name``, ``links``, ``directed``, ``connectivity``, ``share`` (predicted, of time), ``held``.
+
+    ``held`` is the mean holding time [units of simulated time]; None for a graph that is never left.
+    """
+    rows = zip(experiment.graph_list, experiment.chain.stationary, experiment.chain.holding_times, strict=True)
+    return [
+        {
+            "name": graph.name,
+            "links": len(graph.edges if graph.symmetric else graph.arcs),
+            "directed": not graph.symmetric,
+            "connectivity": algebraic_connectivity(graph),
+            "share": float(share),
+            "held": held,
+        }
+        for graph, share, held in rows
+    ]
+
+
+def _task(experiment: Experiment) -> str:
+    agents, leaders = experiment.agents, experiment.spec.leaders
+    if experiment.protocol:
+        info = experiment.protocol.info
+        kind = "linear" if info.linear else "not linear, so there is no prediction"
+        return f"{agents} agents follow the protocol {info.name} of the package {info.package} ({kind})."
+    text = f"Each of {agents} agents has a number as its state and moves it towards the states that it receives"
+    if leaders is None:
+        return (
+            f"{text} (consensus). An agent error is the mean square of the distance of a state from the average of all "
+            "states; the system error is the sum of the agent errors."
+        )
+    named = listed([agent_name(agent, experiment.names) for agent in leaders.agents])
+    who = f"leader, agent {named}, is" if len(leaders.agents) == 1 else f"leaders, agents {named}, are"
+    pull = "held at" if math.isinf(leaders.gain) else f"pulled with gain {leaders.gain:g} to"
+    return (
+        f"{text}; the {who} {pull} the reference {leaders.reference:g} (tracking). An agent error is the mean square "
+        "of the distance of a state from the reference; the system error is the sum of the agent errors."
+    )
+
+
+def _switching(experiment: Experiment) -> str:
+    modes, chain = len(experiment.graph_list), experiment.chain
+    if modes == 1:
+        return f"The graph is always {experiment.graph_list[0].name}."
+    first = experiment.switching.initial
+    begin = (
+        "The first graph is drawn from the stationary distribution."
+        if first == "stationary"
+        else f"The first graph is {first}."
+    )
+    if chain.time == "discrete":
+        return f"The graph switches between {modes} graphs: a Markov chain that may jump in every step. {begin}"
+    times = [time for time in experiment.chain.holding_times if time is not None]
+    held = f"{min(times):.3g}" if max(times) - min(times) < 1e-9 else f"{min(times):.3g} to {max(times):.3g}"
+    return (
+        f"The graph switches between {modes} graphs: a Markov chain in continuous time, with mean holding time "
+        f"{held} [units of simulated time]. {begin}"
+    )
+
+
+def _noise(experiment: Experiment) -> str:
+    noise = experiment.noise
+    process = noise.process
+    size = f"gain {process:g}" if isinstance(process, float | int) else "a gain matrix"
+    if isinstance(process, dict):
+        size = "a gain that depends on the graph"
+    elif isinstance(process, list) and not isinstance(process[0], list):
+        size = "a different gain for each agent"
+    parts = [f"Process noise with {size} acts on the states"]
+    if noise.broadcast:
+        parts.append(f"published values have noise of standard deviation {noise.broadcast:g}, equal for all receivers")
+    if noise.link:
+        parts.append(f"each receiver adds noise of standard deviation {noise.link:g}")
+    if noise.loss.any:
+        parts.append(_losses(experiment))
+    if noise.delay:
+        parts.append(f"received values are {noise.delay} steps old")
+    return "; ".join(parts) + "."
+
+
+def _losses(experiment: Experiment) -> str:
+    noise, loss = experiment.noise, experiment.noise.loss
+    text = f"{100 * loss.default:.3g} % of the messages are lost"
+    if special := [probability for *_, probability in (*loss.arcs, *loss.edges)]:
+        span = " to ".join(sorted({f"{100 * p:.3g}" for p in (min(special), max(special))}, key=float))
+        text += f", and {span} % of those of {len(special)} link{'s' if len(special) > 1 else ''}"
+    if noise.burst is not None:
+        text += f", on average {noise.burst:.3g} of a link in a row"
+    return text + (", and the last received value takes the place of a lost one" if noise.holds else "")
+
+
+def _run(experiment: Experiment) -> str:
+    run = experiment.run
+    replicas = "1 replica" if run.replicas == 1 else f"{run.replicas} independent replicas on the same graph path"
+    start = {"stationary": "the steady state", "zero": "0"}
+    begun = start[run.start] if isinstance(run.start, str) else "given values"
+    if run.pace == "realtime":
+        pace = (
+            f"Real time: the timer of each agent starts {run.speed / experiment.step_length:.3g} steps per second, "
+            "with the newest values received."
+        )
+    else:
+        pace = "Lockstep: all agents use values of the same step."
+    return (
+        f"The run has {experiment.steps} steps of {experiment.step_length:g} ({run.duration:g} units of simulated "
+        f"time) and {replicas}, and starts from {begun}. {pace}"
+    )

@@ -28,6 +28,7 @@ from bokeh.palettes import interp_palette
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray, release
 from msg_analysis.common.text import HALF_WIDTH_95, agent_name
+from msg_analysis.report.comparison_text import TIMES
 from msg_analysis.report.plot_style import (
     BLACK,
     BLUE,
@@ -40,7 +41,7 @@ from msg_analysis.report.plot_style import (
     SANS,
     SKY,
     VERMILLION,
-    Accused,
+    Candidates,
     agent_ticker,
     mark_agents,
     name_agents,
@@ -48,7 +49,6 @@ from msg_analysis.report.plot_style import (
     place_legend,
     plain_legend,
 )
-from msg_analysis.report.wording import TIMES
 
 MOST_DECADES = 12  # of evidence, shown either way
 MOST_LINES = 8  # agents whose convergence is drawn at once
@@ -83,12 +83,12 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
 
 
 def evidence(time: FloatArray, logarithms: FloatArray, threshold: float, crossed: float | None) -> UIElement:
-    """The evidence against the law after some steps, (points,) each, its threshold, and when it was passed first."""
+    """The evidence against the prediction after some steps, (points,) each, its threshold, and when it was exceeded."""
     shown = np.clip(logarithms, -MOST_DECADES * np.log(10.0), MOST_DECADES * np.log(10.0))
     plot = new_figure(
         230,
         x_axis_label="simulated time",
-        y_axis_label="evidence against the law",
+        y_axis_label="evidence",
         x_range=(0.0, float(time[-1])),
         y_axis_type="log",
     )
@@ -105,12 +105,15 @@ def evidence(time: FloatArray, logarithms: FloatArray, threshold: float, crossed
 
 
 def node_errors(
-    nodes: Sequence[Mapping[str, Any]], level: float, accused: Accused = NOBODY, names: Sequence[str] | None = None
+    nodes: Sequence[Mapping[str, Any]],
+    level: float,
+    candidates: Candidates = NOBODY,
+    names: Sequence[str] | None = None,
 ) -> UIElement:
     """Node errors with 95 % intervals next to the predicted ones; marked if p < ``level``; agents can be chosen."""
     agents = np.arange(1, len(nodes) + 1)
     measured, predicted, error = (_column(nodes, key) for key in ("measured", "predicted", "standard_error"))
-    apart = np.nan_to_num(_column(nodes, "p_holm"), nan=1.0) < level
+    apart = np.nan_to_num(_column(nodes, "p_adjusted"), nan=1.0) < level
     half = HALF_WIDTH_95 * error
     data = {
         "agent": agents,
@@ -122,7 +125,7 @@ def node_errors(
         "low": measured - half,
         "high": measured + half,
         "z": _column(nodes, "z"),
-        "p": _column(nodes, "p_holm"),
+        "p": _column(nodes, "p_adjusted"),
         "colour": np.where(apart, VERMILLION, BLUE),
         "marker": np.where(apart, "square", "circle"),
     }
@@ -137,7 +140,7 @@ def node_errors(
     plot.xaxis.ticker = agent_ticker()
     plot.xgrid.grid_line_color = None
     name_agents(plot.xaxis, names)
-    mark_agents(plot, accused.involved)
+    mark_agents(plot, candidates.involved)
     rows = [("agent", "@name"), ("measured", "@measured{0.0000}")]
     size = float(np.clip(220 / len(nodes), 5, 11))
     if not np.isnan(predicted).all():
@@ -225,10 +228,10 @@ def agent_convergence(
 def innovation_sizes(
     ratios: FloatArray,  # (m,); NaN for an agent without noise
     samples: int,  # innovations per agent
-    accused: Accused = NOBODY,
+    candidates: Candidates = NOBODY,
     names: Sequence[str] | None = None,
 ) -> UIElement:
-    """Variance of each agent's innovations relative to the predicted one, and where 95 % of such ratios lie."""
+    """Variance of each agent's one-step residuals relative to the predicted one, and where 95 % of such ratios lie."""
     agents = np.arange(1, len(ratios) + 1)
     half = HALF_WIDTH_95 * np.sqrt(2.0 / max(samples, 1))
     inside = np.abs(ratios - 1.0) <= half
@@ -243,7 +246,7 @@ def innovation_sizes(
     plot.xaxis.ticker = agent_ticker()
     plot.xgrid.grid_line_color = None
     name_agents(plot.xaxis, names)
-    mark_agents(plot, accused.agents)
+    mark_agents(plot, candidates.agents)
     ends = np.array([0.3, len(ratios) + 0.7])
     plot.varea(ends, np.full(2, 1 - half), np.full(2, 1 + half), color=SKY, alpha=0.3, legend_label="95 % band")
     plot.line(ends, np.ones(2), color=BLACK, line_dash="dashed", legend_label="predicted")
@@ -321,7 +324,7 @@ def covariances(
     measured: FloatArray | None,
     predicted: FloatArray | None,
     z: FloatArray | None,
-    accused: Accused = NOBODY,
+    candidates: Candidates = NOBODY,
     names: Sequence[str] | None = None,
 ) -> dict[str, UIElement]:
     """Heat maps of the matrices (m, m) that exist, by name; ``z``: measured - predicted in standard errors."""
@@ -342,7 +345,7 @@ def covariances(
     across, down = Range1d(0.5, agents + 0.5), Range1d(agents + 0.5, 0.5)
     return {
         f"covariance_{key}": _panel(
-            key, matrix, mappers["z" if key == "z" else "moments"], source, rows, (across, down), accused, names
+            key, matrix, mappers["z" if key == "z" else "moments"], source, rows, (across, down), candidates, names
         )
         for key, matrix in known.items()
     }
@@ -360,7 +363,7 @@ def _panel(
     source: ColumnDataSource,
     rows: list[tuple[str, str]],
     ranges: tuple[Range1d, Range1d],
-    accused: Accused,
+    candidates: Candidates,
     names: Sequence[str] | None,
 ) -> UIElement:
     agents = len(matrix)
@@ -376,7 +379,7 @@ def _panel(
     panel.add_tools(HoverTool(renderers=[image], tooltips=rows))
     if agents <= _NUMBERED:
         _write_numbers(panel, matrix, mapper.high, 1 if key == "z" else None)
-    _mark(panel, agents, accused)
+    _mark(panel, agents, candidates)
     bar = ColorBar(color_mapper=mapper, width=8, label_standoff=5, border_line_color=None, padding=3)
     bar.major_label_text_font, bar.major_label_text_color, bar.background_fill_color = SANS, INK, None
     panel.add_layout(bar, "right")
@@ -398,14 +401,14 @@ def _write_numbers(panel: Any, matrix: FloatArray, limit: float, decimals: int |
     )
 
 
-def _mark(panel: Any, agents: int, accused: Accused) -> None:
+def _mark(panel: Any, agents: int, candidates: Candidates) -> None:
     """Frames around rows and columns of the agents, and entries of the links, that the verdict names."""
-    frames = [(agent, agent, 1, agents) for agent in accused.agents] + [
-        (1, agents, agent, agent) for agent in accused.agents
+    frames = [(agent, agent, 1, agents) for agent in candidates.agents] + [
+        (1, agents, agent, agent) for agent in candidates.agents
     ]
-    for first, second in accused.entries:
+    for first, second in candidates.entries:
         frames += [(first, first, second, second), (second, second, first, first)]
     for top, bottom, left, right in frames:
-        frame = BoxAnnotation(top=bottom + 0.5, bottom=top - 0.5, left=left - 0.5, right=right + 0.5, name="accused")
+        frame = BoxAnnotation(top=bottom + 0.5, bottom=top - 0.5, left=left - 0.5, right=right + 0.5, name="candidates")
         frame.fill_color, frame.line_color, frame.line_width, frame.line_alpha = None, VERMILLION, 2.5, 1.0
         panel.add_layout(frame)

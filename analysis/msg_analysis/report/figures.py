@@ -25,7 +25,7 @@ from msg_analysis.experiment.graphs import Graph
 from msg_analysis.inference.autocovariance import LoggedAutocovariance, LoggedDensity
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.model.run import Run
-from msg_analysis.report.wording import agent_errors, verdict_line
+from msg_analysis.report.comparison_text import agent_errors, verdict_line
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.spectrum import Spectrum
 
@@ -245,7 +245,7 @@ def comparison_figure(comparison: Comparison) -> NotebookFigure:
         above.legend(loc="upper right", ncols=3, fontsize=8)
         numbers = np.arange(1, len(nodes) + 1)
         measured, wanted, spread = (_column(nodes, key) for key in ("measured", "predicted", "standard_error"))
-        apart = np.nan_to_num(_column(nodes, "p_holm"), nan=1.0) < comparison.level
+        apart = np.nan_to_num(_column(nodes, "p_adjusted"), nan=1.0) < comparison.level
         below.hlines(wanted, numbers - 0.32, numbers + 0.32, color=BLACK, lw=1.5, label="predicted")
         for which, colour, label in ((~apart, BLUE, "measured, 95 % interval"), (apart, VERMILLION, "rejected")):
             if which.any():
@@ -253,7 +253,7 @@ def comparison_figure(comparison: Comparison) -> NotebookFigure:
                     numbers[which], measured[which], np.nan_to_num(HALF_WIDTH_95 * spread[which]),
                     fmt="o", ms=4, color=colour, mec="white", mew=0.5, elinewidth=1.1, capsize=2.5, label=label,
                 )  # fmt: skip
-        below.set_ylabel("mean-square error" + (", given the path" if given_path else ""))
+        below.set_ylabel("mean-square error" + (", corrected for graphs" if given_path else ""))
         _name_agents(below, experiment)
         below.legend(loc="best", ncols=3, fontsize=8)
     return figure

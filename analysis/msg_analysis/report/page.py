@@ -28,7 +28,7 @@ from jinja2.bccache import Bucket
 from markupsafe import Markup
 
 from msg_analysis.common.files import write_whole
-from msg_analysis.common.text import counted, p_text, with_names
+from msg_analysis.common.text import counted, p_text, percent, with_names
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
@@ -37,26 +37,24 @@ from msg_analysis.inference.realtime_laws import SUPPORT
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.report import drawings, error_plots, plot_style, run_plots
-from msg_analysis.report.drawings import interval_bars, plus_minus
-from msg_analysis.report.error_plots import covariances
-from msg_analysis.report.plot_style import Accused
-from msg_analysis.report.run_plots import Event, run_events
-from msg_analysis.report.wording import (
+from msg_analysis.report.comparison_text import (
     QUANTILES,
     REAL_TIME_LAWS,
     TIMES,
     agent_errors,
     agent_order,
     any_time_words,
-    explain,
     furthest,
-    graph_facts,
+    lost_words,
     sentence,
     timing_facts,
     trust_words,
-    unheard_words,
     verdict_line,
 )
+from msg_analysis.report.drawings import explain, graph_facts, interval_bars, plus_minus
+from msg_analysis.report.error_plots import covariances
+from msg_analysis.report.plot_style import Candidates
+from msg_analysis.report.run_plots import Event, run_events
 from msg_analysis.theory.prediction import LAW_NAMES
 
 
@@ -249,9 +247,9 @@ def render(
     experiment = trajectory.record.experiment
     filters: dict[str, Callable[..., Any]] = {"number": _number, "p": _p, "named": _namer(experiment)}
     names = [graph.name for graph in experiment.graph_list]
-    accused = Accused.of(document["blame"])
+    candidates = Candidates.of(document["blame"])
     happened, more_events = run_events(trajectory, events)
-    models, drawn = _models(document, comparison, trajectory, accused, happened)
+    models, drawn = _models(document, comparison, trajectory, candidates, happened)
     places, packed = pack(models)
     timing = document["timing"]
     return page_template("report.html.j2", filters).render(
@@ -260,11 +258,11 @@ def render(
         run_facts=run_facts(comparison, wall_time),
         symbol=SYMBOLS[document["verdict"]],
         restarts=restarts,
-        strangers=strangers,
+        rejected_messages=strangers,
         channel=channel,
         headline=verdict_line(document),
         timing_facts=timing_facts(timing) if timing else [],
-        unheard_words=unheard_words(document),
+        lost_words=lost_words(document),
         times=TIMES,
         quantiles=QUANTILES,
         laws=REAL_TIME_LAWS,
@@ -285,27 +283,27 @@ def render(
         versions=trajectory.record.versions,
         plots=places,
         packed=packed,
-        first_agents=_first_agents(document, accused.involved),
+        first_agents=_first_agents(document, candidates.involved),
         line_colours=plot_style.LINES,
         graph_colours=plot_style.GRAPHS,
         dark=plot_style.DARK,
         most_lines=error_plots.MOST_LINES,
         drawn=drawn,
-        shown=_shown_agents(experiment.agents, accused.involved),
-        accused=accused,
+        shown=_shown_agents(experiment.agents, candidates.involved),
+        candidates=candidates,
         events=happened,
         more_events=more_events,
         step_length=experiment.step_length,
         room=run_plots.OTHER_REPLICAS,
         explained=explain(experiment),
-        drawings=drawings.graph_drawings(experiment, accused),
+        drawings=drawings.graph_drawings(experiment, candidates),
         graph_facts=graph_facts(experiment),
-        chain=drawings.chain_drawing(experiment, accused),
+        chain=drawings.chain_drawing(experiment, candidates),
         yaml=yaml.safe_dump(experiment.to_document(), sort_keys=False, allow_unicode=True, default_flow_style=None),
         host=host or platform.node() or "unnamed host",
         tests=[
             test | {"name": with_names(test["name"], experiment.names)}
-            for test in document["tests"]
+            for test in sorted(document["tests"], key=lambda test: not test["rejected"])
             if not test["name"].startswith(_NODE_TEST)
         ],
         agent_names=experiment.names,
@@ -322,7 +320,7 @@ def _models(
     document: dict[str, Any],
     comparison: Comparison,
     trajectory: Run,
-    accused: Accused,
+    candidates: Candidates,
     events: Sequence[Event],
 ) -> tuple[dict[str, UIElement], run_plots.Drawn]:
     """The figures that exist, by name, and what of the run is in those of the trajectories."""
@@ -330,12 +328,12 @@ def _models(
     covariance, ratios = document["covariance"], document["innovations"]["ratios"]
     predicted = document["system_error"]["predicted"]
     models: dict[str, UIElement | None] = {
-        "nodes": error_plots.node_errors(agent_errors(document)[0], document["level"], accused, experiment.names),
+        "nodes": error_plots.node_errors(agent_errors(document)[0], document["level"], candidates, experiment.names),
         **covariances(
             _matrix(covariance["measured"]),
             _matrix(covariance["predicted"]),
             _matrix(covariance["z"]),
-            accused,
+            candidates,
             experiment.names,
         ),
     }
@@ -359,7 +357,7 @@ def _models(
     if ratios is not None and any(ratio is not None for ratio in ratios):
         sizes = np.array(ratios, dtype=float)  # None: nan
         models["innovations"] = error_plots.innovation_sizes(
-            sizes, document["innovations"]["samples"], accused, experiment.names
+            sizes, document["innovations"]["samples"], candidates, experiment.names
         )
     if document["timing"]:
         models["lateness"] = error_plots.lateness(document["timing"])
@@ -367,16 +365,16 @@ def _models(
     return {name: model for name, model in models.items() if model is not None}, drawn
 
 
-def _shown_agents(agents: int, accused: Sequence[int]) -> list[int]:
-    """The agents (from 1) whose trajectories are drawn at first: the accused, and the first ones."""
-    others = [agent for agent in range(1, agents + 1) if agent not in accused]
-    return sorted([*accused[:_FIRST_TRAJECTORIES], *others[: max(_FIRST_TRAJECTORIES - len(accused), 0)]])
+def _shown_agents(agents: int, candidates: Sequence[int]) -> list[int]:
+    """The agents (from 1) whose trajectories are drawn at first: the candidates, and the first ones."""
+    others = [agent for agent in range(1, agents + 1) if agent not in candidates]
+    return sorted([*candidates[:_FIRST_TRAJECTORIES], *others[: max(_FIRST_TRAJECTORIES - len(candidates), 0)]])
 
 
-def _first_agents(document: dict[str, Any], accused: Sequence[int]) -> list[int]:
-    """The agents (from 1) whose convergence is drawn at first: the accused, then those with the largest abs(z)."""
+def _first_agents(document: dict[str, Any], candidates: Sequence[int]) -> list[int]:
+    """The agents (from 1) whose convergence is drawn at first: the candidates, then those with the largest abs(z)."""
     known = [agent + 1 for agent in furthest([node["z"] for node in agent_errors(document)[0]], _FIRST_LINES)]
-    return sorted(list(dict.fromkeys([*accused, *known]))[:_FIRST_LINES])
+    return sorted(list(dict.fromkeys([*candidates, *known]))[:_FIRST_LINES])
 
 
 def _explanation(document: dict[str, Any]) -> str:
@@ -394,13 +392,13 @@ def _explanation(document: dict[str, Any]) -> str:
         )
         return f"Missing: {' and '.join(filter(None, lost))}. {numbers}"
     if document["unpredicted"]:
-        results = [f"{test['name']}: {'rejected' if test['rejected'] else 'passed'}" for test in tests]
+        results = [f"{test['name']}: {'rejected' if test['rejected'] else 'ok'}" for test in tests]
         cut = f" Errors are measured from step {document['transient']} on." if document["transient"] else ""
         return f"No prediction: {document['unpredicted']}. Tests: {', '.join(results) or 'none'}.{cut}"
-    chance = f"If the run follows the predicted law, the probability of a rejected test is at most {level:.2g}."
+    chance = f"A correct run fails a test with probability at most {percent(level)}."
     rejected = [test for test in tests if test["rejected"]]
     if not rejected:
-        return f"All {len(tests)} tests passed. {chance}"
+        return f"All {len(tests)} tests are ok. {chance}"
     names = document["names"]
     named = ", ".join(f"{with_names(test['name'], names)} (p = {_p(test['p_adjusted'])})" for test in rejected[:6])
     more = f" and {len(rejected) - 6} more" if len(rejected) > 6 else ""

@@ -25,7 +25,7 @@ from msg_analysis.report.figures import shorten
 
 
 @dataclass(frozen=True, slots=True)
-class Accused:
+class Candidates:
     """Agents (from 1), links and jumps that the causes name, the first cause first."""
 
     agents: tuple[int, ...] = ()  # by themselves
@@ -34,7 +34,7 @@ class Accused:
     jumps: tuple[tuple[str, str | None], ...] = ()  # from a graph to another, None: to any
 
     @classmethod
-    def of(cls, blame: Sequence[Mapping[str, Any]]) -> Accused:
+    def of(cls, blame: Sequence[Mapping[str, Any]]) -> Candidates:
         """Of the causes of a comparison's document."""
         links = [(cause, tuple(cause["link"])) for cause in blame if cause["link"]]
         return cls(
@@ -68,7 +68,7 @@ class Accused:
         return any(first == origin and second in (None, to) for first, second in self.jumps)
 
 
-NOBODY = Accused()
+NOBODY = Candidates()
 
 
 BLUE, ORANGE, GREEN, PURPLE = "#0072b2", "#b97a00", "#00875f", "#b4598c"
@@ -146,7 +146,7 @@ def agent_ticker() -> BasicTicker:
 def mark_agents(plot: Any, agents: Iterable[int]) -> None:
     """Shade the agents, along the horizontal axis, that the verdict names."""
     for agent in agents:
-        mark = BoxAnnotation(left=agent - 0.5, right=agent + 0.5, level="underlay", name=f"accused {agent}")
+        mark = BoxAnnotation(left=agent - 0.5, right=agent + 0.5, level="underlay", name=f"candidates {agent}")
         mark.fill_color, mark.fill_alpha, mark.line_color = VERMILLION, 0.18, None
         plot.add_layout(mark)
 

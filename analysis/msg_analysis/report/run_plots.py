@@ -172,8 +172,8 @@ def _name_graphs(plot: Any, names: Sequence[str]) -> None:
 
 
 OTHER_REPLICAS = 1_000_000  # bytes of the page for the replicas after the first
-MOST_SOJOURNS = 20_000  # of a run, that are drawn
-_WHOLE, _FIRST_SOJOURNS = 1500, 30  # steps of a run that is seen whole at first; sojourns visible at first of others
+MOST_INTERVALS = 20_000  # of a run, that are drawn
+_WHOLE, _FIRST_INTERVALS = 1500, 30  # steps of a run that is seen whole at first; intervals visible at first of others
 _LEAST_BINS = 250  # of a replica after the first, if the run has as many steps
 _UNKNOWN = 65_535  # stands for NaN among whole numbers of 16 bits
 _LEFT, _RIGHT = 76, 14  # pixels beside every figure: equal, so that they have one time axis
@@ -192,8 +192,8 @@ _TOOLS = "xpan,xbox_zoom,xwheel_zoom,reset,save"
 class Drawn:
     """What of a run is in the figures."""
 
-    sojourns: int = 0
-    all_sojourns: int = 0  # of the run
+    intervals: int = 0
+    all_intervals: int = 0  # of the run
     replicas: int = 0
 
 
@@ -212,13 +212,13 @@ def trajectory_plots(
     names = [graph.name for graph in experiment.graph_list]
     starts = np.flatnonzero(np.diff(modes, prepend=-2))
     time = Range1d(*_first_view(starts, len(modes), events, dt), bounds=(0.0, float(len(modes) * dt)), name="time")
-    shown = min(len(starts), MOST_SOJOURNS)
+    shown = min(len(starts), MOST_INTERVALS)
     end = int(starts[shown]) if shown < len(starts) else len(modes)
     data = _data(first, experiment.agents, dt)
     for number, thinned in enumerate(others, start=2):
         data += _coded(thinned, experiment.agents, dt, number)
     data.append(
-        _source("sojourns", start=np.append(starts[:shown], end) * dt, graph=np.append(modes[starts[:shown]], -1))
+        _source("intervals", start=np.append(starts[:shown], end) * dt, graph=np.append(modes[starts[:shown]], -1))
     )
     data.append(_source("graphs", name=names, colour=[graph_colour(mode) for mode in range(len(names))]))
     figures = {
@@ -240,11 +240,11 @@ def _room(count: int, agents: int, replicas: int) -> tuple[int, int]:
 
 
 def _first_view(starts: IntArray, steps: int, events: Sequence[Event], dt: float) -> tuple[float, float]:
-    """What is visible at first: so little that single sojourns can be seen, and the first process that was killed."""
+    """What is visible at first: so little that single intervals can be seen, and the first process that was killed."""
     if steps <= _WHOLE:
         return 0.0, float(steps * dt)
-    sojourns = int(starts[_FIRST_SOJOURNS]) if len(starts) > _FIRST_SOJOURNS else steps
-    length = min(max(sojourns, _WHOLE // 3), steps)
+    intervals = int(starts[_FIRST_INTERVALS]) if len(starts) > _FIRST_INTERVALS else steps
+    length = min(max(intervals, _WHOLE // 3), steps)
     killed = next((event.first for event in events if event.kind == "killed"), 0)
     first = min(max(killed - length // 3, 0), steps - length)
     return float(first * dt), float((first + length) * dt)

@@ -20,14 +20,14 @@ from msg_analysis.common.files import RESULT_FILE
 from msg_analysis.common.text import half_width_text, markdown_table, measured_text, number_text, p_text, z_text
 from msg_analysis.inference.estimates import Estimate, Ranking, rank_estimates
 from msg_analysis.inference.statistics import two_sided
-from msg_analysis.report.tables import number_table, print_table, room_for_names
-from msg_analysis.report.wording import order_statements
+from msg_analysis.report.comparison_text import order_statements
+from msg_analysis.report.tables import number_table, print_table, that_fit
 from msg_analysis.runs import Result
 
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """Results of the same law as one; every unit of simulated time has the same weight."""
+    """Results of one experiment, apart from the seeds, as one; every unit of simulated time has the same weight."""
 
     experiment: str  # name in the first
     files: tuple[str, ...]
@@ -40,7 +40,7 @@ class Merged:
 
 
 def merge_results(rows: Sequence[Result]) -> list[Merged]:
-    """Results of the same law as one, where there are two or more.
+    """Results of one experiment as one, where there are two or more.
 
     Left out: those without a number, and those with the seed of an earlier row.
     """
@@ -110,21 +110,20 @@ def to_markdown(rows: Sequence[Result]) -> str:
     return markdown_table(heads, body, names=4)
 
 
+_OPTIONAL = ("smallest p", "time", "seed", "experiment", "leaders", "± (95 %)")  # as in ``that_fit``
+
+
 def print_results(rows: Sequence[Result], level: float, console: Console) -> None:
     """Print the results as a table, and which system errors differ at ``level`` (all pairs together)."""
     heads, body = _shown(rows)
-    wide = ("experiment", "seed", "time", "smallest p")  # too much for 80 columns
-    kept = [place for place, head in enumerate(heads) if head not in wide and {line[place] for line in body} != {"-"}]
-    table = number_table(console, "Results", *(heads[place] for place in kept))
-    numbers = [[line[place] for place in kept[1:]] for line in body]
-    room = room_for_names(console, [heads[place] for place in kept[1:]], numbers)
-    names = [
-        name if len(name) <= room else f"…{name[1 - room :]}"  # the end tells them apart
-        for name in short_names([row.file for row in rows])
-    ]
-    table.columns[0].min_width = max(map(len, names), default=0)
-    for line, name in zip(numbers, names, strict=True):
-        table.add_row(Text(name), *map(Text, line))
+    columns: dict[str, Sequence[str]] = dict(zip(heads, zip(*body, strict=True), strict=True))
+    if console.is_terminal:
+        columns["result"] = short_names([row.file for row in rows])
+    columns = that_fit(console, columns, _OPTIONAL)
+    table = number_table(console, "Results", *columns)
+    table.columns[0].min_width = max(map(len, columns["result"]))
+    for line in zip(*columns.values(), strict=True):
+        table.add_row(*map(Text, line))
     print_table(console, table)
     for row in rows:
         if row.blame:

@@ -1,15 +1,17 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Plots of a sweep: lines with intervals over one key, heat maps over two. Hover shows values, as do arrow keys."""
+"""Plots of a sweep: interactive lines and heat maps over its keys for the page, and a figure for the files."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from bokeh.models import (
     ColorBar,
@@ -24,11 +26,24 @@ from bokeh.models import (
     Whisker,
 )
 from bokeh.palettes import interp_palette
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import measured_text, number_text
 from msg_analysis.experiment.problems import show
-from msg_analysis.report.figures import shifted, shorten
+from msg_analysis.report.figures import (
+    DARK_GREY,
+    MODE_COLOURS,
+    STYLE,
+    NotebookFigure,
+    plain,
+    rendered,
+    shifted,
+    shorten,
+)
 from msg_analysis.report.plot_style import BLACK, DARK_SCALE, GREY, INK, LINES, SANS, SCALE, new_figure
 from msg_analysis.sweeps.figure_series import Picture, Place, Series, value_text
 from msg_analysis.sweeps.grid import axis_name, column_words, key_words
@@ -148,12 +163,7 @@ def _series(plot: Any, picture: Picture, source: ColumnDataSource, number: int) 
         plot.line("x", "value", source=source, color=colour, line_width=1.8)
         plot.line("x", "reference", source=source, color=colour, line_dash="dashed")
     return plot.scatter(
-        "beside" if picture.measured else "x",
-        "value",
-        source=source,
-        marker=marker,
-        size=7,
-        color=colour,
+        "beside" if picture.measured else "x", "value", source=source, marker=marker, size=7, color=colour
     )
 
 
@@ -183,20 +193,22 @@ def heat_map(picture: Picture, panel: Panel, name: str) -> UIElement:
         palette=interp_palette(SCALE, 255), low=low, high=high if high > low else low + 1.0,
         nan_color="rgba(0, 0, 0, 0)", tags=[interp_palette(DARK_SCALE, 255)],
     )  # fmt: skip
-    cells: dict[str, list[Any]] = {
-        key: [] for key in ("x", "y", "value", "words", "text", "along", "second", "shown", "expected")
-    }
-    for row, series in enumerate(panel.series):
-        for place in series.places:
-            cells["x"].append(columns.index(show(place.x)))
-            cells["y"].append(row)
-            cells["value"].append(math.nan if place.value is None else place.value)
-            cells["words"].append(_place_words(picture, series, place))
-            cells["text"].append("×" if place.value is None else f"{place.value:.3g}")
-            cells["along"].append(value_text(place.x))
-            cells["second"].append(down[row])
-            cells["shown"].append(_value_words(place))
-            cells["expected"].append(number_text(place.predicted if picture.measured else place.reference))
+    found = [
+        {
+            "x": columns.index(show(place.x)),
+            "y": row,
+            "value": math.nan if place.value is None else place.value,
+            "words": _place_words(picture, series, place),
+            "text": "×" if place.value is None else f"{place.value:.3g}",
+            "along": value_text(place.x),
+            "second": down[row],
+            "shown": _value_words(place),
+            "expected": number_text(place.predicted if picture.measured else place.reference),
+        }
+        for row, series in enumerate(panel.series)
+        for place in series.places
+    ]
+    cells: dict[str, list[Any]] = {key: [cell[key] for cell in found] for key in found[0]}
     if len(columns) > _NUMBERED:  # no room for numbers
         cells["text"] = ["×" if text == "×" else "" for text in cells["text"]]
     plot = new_figure(
@@ -319,3 +331,105 @@ def _place_words(picture: Picture, series: Series, place: Place) -> str:
     if place.reference is not None:
         text += f", {LAW_NAMES['continuous']} {number_text(place.reference)}"
     return text
+
+
+FORMATS = ("svg", "png")
+_DPI = 150
+_SIZE = (7.2, 4.2)  # inches
+_SHAPES = "os^Dv<>p"
+_IN_LEGEND = 8
+"""Most series in the legend; of more, it has some, and colours go from dark to light."""
+
+
+def write_figure(picture: Picture, title: str, directory: Path) -> list[Path]:
+    """Write ``figure.svg`` and ``figure.png``, each whole or not at all."""
+    with mpl.rc_context(STYLE):
+        figure = draw(picture, title)
+        return [write_whole(directory / f"figure.{name}", rendered(figure, name, _DPI)) for name in FORMATS]
+
+
+def draw(picture: Picture, title: str) -> NotebookFigure:
+    """The figure; the caller sets the style."""
+    figure = NotebookFigure(figsize=_SIZE, layout="constrained")
+    axes = figure.subplots()
+    labels = list(dict.fromkeys(show(place.x) for series in picture.series for place in series.places))
+    numbers = picture.numeric
+    count = len(picture.series)
+    colours = _series_colours(count)
+    along = [_along(picture, series, labels) for series in picture.series]
+    every, logarithmic = np.concatenate(along), numbers and picture.logarithmic
+    for number, (series, x, colour) in enumerate(zip(picture.series, along, colours, strict=True)):
+        beside = shifted(x, every, number, count, logarithmic=logarithmic)
+        _draw_series(axes, picture, series, x, beside, colour, _SHAPES[number % len(_SHAPES)])
+    if not numbers:
+        axes.set_xticks(range(len(labels)), [plain(label) for label in labels])
+        axes.set_xlim(-0.5, len(labels) - 0.5)
+    elif picture.logarithmic:
+        axes.set_xscale("log")
+    _mark_failures(axes, picture, labels, numbers)
+    axes.set(xlabel=plain(axis_name(picture.x, picture.names)), ylabel=plain(column_words(picture.y, picture.names)))
+    axes.set_title(plain(title), loc="left")
+    axes.margins(y=0.08)
+    _add_legend(figure, axes, picture, colours)
+    return figure
+
+
+def _draw_series(
+    axes: Axes,
+    picture: Picture,
+    series: Series,
+    x: FloatArray,
+    beside: FloatArray,  # the same, shifted sideways for intervals
+    colour: Any,
+    marker: str,
+) -> None:
+    order = np.argsort(x, kind="stable")
+    values, predicted, reference = (_column(series.places, key)[order] for key in ("value", "predicted", "reference"))
+    x, beside = x[order], beside[order]
+    if picture.measured:
+        low, high = (_column(series.places, key)[order] for key in ("low", "high"))
+        axes.plot(x, predicted, color=colour, lw=1.2, alpha=0.8)
+        bars = np.abs(np.array([values - low, high - values]))
+        axes.errorbar(
+            beside, values, bars, fmt=marker, ms=4.5, color=colour, mec="white", mew=0.5, elinewidth=1.1, capsize=2.5
+        )
+        return
+    few = len(x) <= 40
+    axes.plot(x, values, color=colour, lw=1.5, marker=marker if few else None, ms=4, mec="white", mew=0.5)
+    axes.plot(x, reference, color=colour, lw=1.0, ls=(0, (4, 2)))
+
+
+def _mark_failures(axes: Axes, picture: Picture, labels: Sequence[str], numbers: bool) -> None:
+    """A cross at the foot of the axes for every place without a result."""
+    lost = [place.x for series in picture.series for place in series.places if place.value is None]
+    if lost:
+        x = [float(place) if numbers else labels.index(show(place)) for place in lost]
+        axes.plot(
+            x, [0.015] * len(x), "x", color=BLACK, ms=5, transform=axes.get_xaxis_transform(), clip_on=False, zorder=5
+        )
+
+
+def _add_legend(figure: Figure, axes: Axes, picture: Picture, colours: Sequence[Any]) -> None:
+    """Above the axes: what lines and points mean; next to them: the colours of the series."""
+    entries: list[tuple[Line2D, str]] = []
+    if picture.measured:
+        entries.append((Line2D([], [], color=DARK_GREY, marker="o", ls="", ms=4.5), "measured, 95 % interval"))
+        entries.append((Line2D([], [], color=DARK_GREY, lw=1.2), "predicted"))
+    elif any(place.reference is not None for series in picture.series for place in series.places):
+        entries.append((Line2D([], [], color=DARK_GREY, marker="o", lw=1.5, ms=4), LAW_NAMES["emulated"]))
+        entries.append((Line2D([], [], color=DARK_GREY, lw=1.0, ls=(0, (4, 2))), LAW_NAMES["continuous"]))
+    if any(place.value is None for series in picture.series for place in series.places):
+        entries.append((Line2D([], [], color=BLACK, marker="x", ls="", ms=5), "no result"))
+    if entries:
+        figure.legend(*zip(*entries, strict=True), loc="outside upper right", ncols=3)
+    if len(picture.series) > 1:
+        chosen = np.unique(np.linspace(0, len(picture.series) - 1, _IN_LEGEND).round().astype(int))
+        handles = [Line2D([], [], color=colours[i], marker=_SHAPES[i % len(_SHAPES)], ms=4.5, lw=1.2) for i in chosen]
+        names = [plain(picture.words(picture.series[i].values)) for i in chosen]
+        axes.legend(handles, names, loc="upper left", bbox_to_anchor=(1.0, 1.02), borderaxespad=0.4)
+
+
+def _series_colours(count: int) -> list[Any]:
+    if count <= _IN_LEGEND:
+        return list(MODE_COLOURS[:count])
+    return list(mpl.colormaps["viridis"](np.linspace(0, 0.92, count)))

@@ -19,7 +19,6 @@ from rich.text import Text
 
 from msg_analysis.common.text import agent_name, counted, half_width_text, listed, number_text, p_text, z_text
 from msg_analysis.experiment.loading import amount
-from msg_analysis.report.wording import gaps
 from msg_analysis.runs import RunEntry
 from msg_analysis.sweeps.figure_series import Picture, value_text
 from msg_analysis.sweeps.grid import Sweep
@@ -47,27 +46,46 @@ def number_table(console: Console, title: str, first: str, *numbers: str) -> Tab
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Print a table of ``number_table``: a narrow terminal folds words and headings, but never cuts a number."""
+    """Print a table of ``number_table``: a narrow terminal folds words and headings, but never cuts a number.
+
+    Where there is no terminal, nothing is folded.
+    """
     heads = [str(column.header) for column in table.columns]
     cells = [[str(cell) for cell in column.cells] for column in table.columns]
-    widest = sum(MARGIN + max(map(cell_len, [head, *column])) for head, column in zip(heads, cells, strict=True))
-    width = console.width
-    if widest > console.width:
+    widest = 1 + sum(MARGIN + max(map(cell_len, [head, *column])) for head, column in zip(heads, cells, strict=True))
+    if widest <= console.width or not console.is_terminal:
+        print_wide(console, table, widest)
+    else:
         for column, head, texts in zip(table.columns[1:], heads[1:], cells[1:], strict=True):
             column.min_width = _least_width(head, texts)
             if all(map(_NUMBER.fullmatch, texts)):
                 column.width = column.min_width
         least = 1 + sum(MARGIN + (column.min_width or 0) for column in table.columns[1:])
-        console.width = max(width, least + MARGIN + (table.columns[0].min_width or LEAST_NAME))
+        print_wide(console, table, least + MARGIN + (table.columns[0].min_width or LEAST_NAME))
+
+
+def table_width(columns: Mapping[str, Sequence[str]]) -> int:
+    """Width of a ``number_table`` with these headings and cells, if nothing is folded."""
+    return 1 + sum(MARGIN + max(map(cell_len, (head, *cells))) for head, cells in columns.items())
+
+
+def that_fit(
+    console: Console, columns: Mapping[str, Sequence[str]], optional: Sequence[str]
+) -> dict[str, Sequence[str]]:
+    """The columns without empty ones and, on a terminal that is too narrow, without optional ones, first ones first."""
+    kept = {head: cells for head, cells in columns.items() if set(cells) != {"-"}}
+    for head in optional if console.is_terminal else ():
+        if table_width(kept) > console.width:
+            kept.pop(head, None)
+    return kept
+
+
+def print_wide(console: Console, table: Table, least: int) -> None:
+    """Print a table with at least this width, wider than the terminal if need be."""
+    width = console.width
+    console.width = max(width, least)
     console.print(table)
     console.width = width
-
-
-def room_for_names(console: Console, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> int:
-    """Characters for each name of a ``number_table`` with these columns of numbers, and rows without the name."""
-    columns = list(zip(*rows, strict=True))
-    numbers = sum(MARGIN + _least_width(head, column) for head, column in zip(heads, columns, strict=True))
-    return max(LEAST_NAME, console.width - numbers - MARGIN - 1)
 
 
 def _least_width(head: str, cells: Sequence[str]) -> int:
@@ -149,7 +167,26 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     for line in document["unavailable"]:
         console.print(Text(line, style="yellow"))
     if document["predicted_system_error"]:
-        console.print("How long to run it, and what it will find: msg-analysis plan", style="dim")
+        console.print(f"Required length and detectable faults: msg-analysis plan {document['name']}", style="dim")
+
+
+def gaps(count: dict[str, Any]) -> list[str]:
+    """Gaps of a log and rejected messages, of ``completeness`` of a comparison; empty for a whole log."""
+    lines = []
+    if count["missing"]:
+        first, last = count.get("stretch") or (None, None)
+        if first is None:
+            lines.append("No step has the states of all agents.")
+        elif first == 0:
+            lines.append(f"All steps up to step {last} are complete.")
+        else:
+            lines.append(
+                f"The longest part without gaps is steps {first} to {last}; errors are computed only from step 0 on."
+            )
+    if count.get("refused"):
+        reasons = ", ".join(f"{number} x {reason}" for reason, number in count["refused"].items())
+        lines.append(f"Rejected messages: {reasons}")
+    return lines
 
 
 def add_protocol(facts: Table, protocol: dict[str, Any] | None) -> None:
@@ -233,7 +270,7 @@ def _add_run(facts: Table, document: dict[str, Any]) -> None:
     facts.add_row("duplicates, out of order", f"{count['duplicates']}, {count['out_of_order']}")
     facts.add_row("steps without a graph", str(count["missing_modes"]))
     for reason, number in count["refused"].items():
-        facts.add_row("refused", Text(f"{number}: {reason}"))
+        facts.add_row("rejected", Text(f"{number}: {reason}"))
 
 
 def _state_of(file: dict[str, Any]) -> str:
@@ -278,12 +315,14 @@ def print_salvage(document: dict[str, Any], console: Console) -> None:
 _STYLES = {"agrees": "green", "disagrees": "bold red", "incomplete": "yellow"}
 
 
-_LEAST_NAME = 12  # characters of a folder's name that are shown
 _OPTIONAL = ("predicted", "z", "± (95 %)")  # left out in this order where the terminal is too narrow
 
 
 def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Console) -> None:
-    """Print the runs as a table, one line each; ``total``: how many there are in the folder."""
+    """Print the runs as a table, one line each; ``total``: how many there are in the folder.
+
+    Names, which other commands take, are never cut; a narrow terminal leaves out numbers instead.
+    """
     if not runs:
         console.print(Text(f"{folder}: no run" if not total else f"{folder}: none of {counted(total, 'run')}"))
         return
@@ -305,42 +344,20 @@ def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Cons
     columns: dict[str, Sequence[str]] = dict(zip(heads, zip(*rows, strict=True), strict=True))
     if all(Path(run.folder).name.startswith(f"{run.name}_{run.date:%Y%m%d_%H%M}") for run in runs):
         del columns["experiment"], columns["date"]  # the names of the folders have them
-    columns = {head: cells for head, cells in columns.items() if set(cells) != {"-"}}
-    for head in _OPTIONAL:
-        if _width(columns) > console.width:
-            columns.pop(head, None)
-    room = console.width - _width(columns) + _widest(columns["run"])
-    columns["run"] = [_cut(name, max(room, _LEAST_NAME)) for name in columns["run"]]
+    columns = that_fit(console, columns, _OPTIONAL)
     table = number_table(console, f"Runs in {folder}", *columns)
     for run, cells in zip(runs, zip(*columns.values(), strict=True), strict=True):
         style = _STYLES.get(run.verdict or "", "dim" if run.verdict is None else "")
         table.add_row(
             *(Text(cell, style if head == "verdict" else "") for head, cell in zip(columns, cells, strict=True))
         )
-    width = console.width
-    console.width = max(width, _width(columns))  # a line of its own for each run
-    console.print(table)
-    console.width = width
+    print_wide(console, table, table_width(columns))
     counts = Counter(run.verdict or run.status for run in runs)
-    listed = ", ".join(f"{number} {word}" for word, number in counts.most_common())
-    console.print(Text(f"{counted(len(runs), 'run')}{f' of {total}' if len(runs) < total else ''}: {listed}"))
+    number = f"{counted(len(runs), 'run')}{f' of {total}' if len(runs) < total else ''}"
+    console.print(Text(f"{number}: {', '.join(f'{count} {word}' for word, count in counts.most_common())}"))
     for run in runs:
         if run.status == "damaged" and run.problem:
             console.print(Text(f"damaged: {run.problem}", style="yellow"))
-
-
-def _width(columns: Mapping[str, Sequence[str]]) -> int:
-    return 1 + sum(MARGIN + _widest((head, *cells)) for head, cells in columns.items())
-
-
-def _widest(cells: Sequence[str]) -> int:
-    return max(map(cell_len, cells))
-
-
-def _cut(name: str, width: int) -> str:
-    """The name without its middle where it is longer: folders differ at their ends."""
-    left = width // 2 - 1
-    return name if cell_len(name) <= width else f"{name[:left]}…{name[left + 1 - width :]}"
 
 
 def describe_sweep(sweep: Sweep, done: Conducted, judgement: Judgement, rows: Sequence[SweepRow]) -> dict[str, Any]:

@@ -12,15 +12,21 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from msg_analysis.common.text import agent_name, agent_text, duration_text, listed, number_text, p_text, percent, z_text
+from msg_analysis.common.text import (
+    agent_name,
+    agent_text,
+    counted,
+    duration_text,
+    listed,
+    number_text,
+    p_text,
+    percent,
+    z_text,
+)
 from msg_analysis.report.tables import fact_table, first_rows, interval_text, number_table, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 
-_METHODS = {
-    "exhaustive": "exhaustive search",
-    "greedy": "greedy selection",
-    "swap": "greedy selection with exchanges",
-}
+_METHODS = {"exhaustive": "exhaustive search", "greedy": "greedy selection", "swap": "greedy selection with exchanges"}
 
 
 def print_prediction(document: dict[str, Any], console: Console) -> None:
@@ -44,7 +50,7 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
     console.print(modes)
     for key, title in LAW_NAMES.items():
         if key in document and document[key] is None:
-            console.print(f"{title}: not finite, or not defined with this noise", style="dim")
+            console.print(f"{title.capitalize()}: infinite, or not defined with this noise", style="dim")
     for line in tails_words(document):
         console.print(Text(line, style="yellow"))
 
@@ -188,9 +194,10 @@ def _print_form(law: str, form: dict[str, Any], names: Sequence[str] | None, con
 def print_plan(document: dict[str, Any], console: Console) -> None:
     """Print a document of ``RunPlan.to_json()``: the run of the file, lengths for the precision, power for faults."""
     rate, sought = document["rate"], percent(document["precision"])
+    console.print(Text(_answer(document), style="bold"))
     facts = fact_table(console, f"Plan of {document['experiment']}")
     facts.add_row("predicted system error", number_text(document["system_error"]))
-    facts.add_row("run of the file", _run_text(document["file"]))
+    facts.add_row("as configured", _run_text(document["file"]))
     if document["budget"]:
         budget = document["budget"]
         facts.add_row(f"best run in {duration_text(budget['time'])}", _run_text(budget))
@@ -203,10 +210,10 @@ def print_plan(document: dict[str, Any], console: Console) -> None:
     console.print(facts)
     table = number_table(
         console,
-        f"Length for a 95 % interval of ± {sought} of the system error, at one time and at all times",
+        f"Run length for ± {sought} (95 %): evaluated once at the end, or monitored throughout",
         "replicas",
         *("steps", "duration", "wall time"),
-        *("steps, all times", "wall time, all times"),
+        *("steps, monitored", "wall time, monitored"),
     )
     table.columns[0].justify = "right"
     for row in document["lengths"]:
@@ -220,8 +227,8 @@ def print_plan(document: dict[str, Any], console: Console) -> None:
         )
     print_table(console, table)
     steps = document["file"]["steps"]
-    title = f"Faults, and the power of the tests in {steps} steps, level {percent(document['level'])}"
-    table = number_table(console, title, "fault", "power", "steps for 99 %", "steps, any time")
+    title = f"Detectable faults: power of the tests in {steps} steps, false-alarm rate {percent(document['level'])}"
+    table = number_table(console, title, "fault", "power", "steps for 99 %", "steps, monitored")
     for row in document["faults"]:
         table.add_row(Text(row["fault"]), percent(row["power"]), _count(row["steps"]), _count(row["any_time_steps"]))
     if document["faults"]:
@@ -236,9 +243,21 @@ def _run_text(run: dict[str, Any]) -> str:
         text += f", {duration_text(run['wall_time'])}"
     if not math.isfinite(run["half_width"]):
         return f"{text}: ends before the effect of the start does"
-    text += f": ± {percent(run['half_width'])} (95 %)"
+    text += f": ± {percent(run['half_width'])} (95 %) at the end"
     uniform = run["any_time_half_width"]
-    return text if uniform is None else f"{text}, ± {percent(uniform)} at all times"
+    return text if uniform is None else f"{text}, ± {percent(uniform)} if monitored throughout"
+
+
+def _answer(document: dict[str, Any]) -> str:
+    """How long to run for the precision, with the replicas of the file, and how precise its own length is."""
+    own = document["file"]
+    row = next(row for row in document["lengths"] if row["replicas"] == own["replicas"])
+    time = f" ({duration_text(row['wall_time'])})" if row["wall_time"] is not None else ""
+    reached = f"gives ± {percent(own['half_width'])}" if math.isfinite(own["half_width"]) else "ends in the warm-up"
+    return (
+        f"For ± {percent(document['precision'])} of the system error (95 %), run {_count(row['steps'])} steps{time} "
+        f"with {counted(own['replicas'], 'replica')}; the length of the file, {own['steps']} steps, {reached}."
+    )
 
 
 def _time(seconds: float | None) -> str:
@@ -263,7 +282,7 @@ def print_spectrum(document: dict[str, Any], console: Console) -> None:
     console.print(density)
     log = document["log"]
     if log:
-        heads = ("predicted", "measured", "corrected for the path", "95 % interval", "z")
+        heads = ("predicted", "measured", "corrected for graphs", "95 % interval", "z")
         table = number_table(console, f"The log, {log['steps']} steps", "lag", *heads)
         keys = ("lags", "predicted", "measured", "corrected", "intervals", "z")
         for lag, *numbers, interval, z in zip(*(log[key] for key in keys), strict=True):

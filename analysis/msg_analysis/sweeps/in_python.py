@@ -89,7 +89,7 @@ class Sweep:
         import matplotlib as mpl
 
         from msg_analysis.report.figures import STYLE
-        from msg_analysis.report.sweep_figure import draw
+        from msg_analysis.report.sweep_plots import draw
         from msg_analysis.sweeps.figure_series import picture
 
         with mpl.rc_context(STYLE):

@@ -1,12 +1,13 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Commands to begin with: ``demo``, ``examples``, ``new``, ``schema``."""
+"""Commands to begin with: ``demo``, ``examples``, ``new``, ``doctor``, ``schema``."""
 
 from __future__ import annotations
 
 import shlex
 import sys
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -16,7 +17,7 @@ import click
 from msg_analysis.cli.console import examples as example_lines
 from msg_analysis.cli.console import print_json, print_text, result_console
 from msg_analysis.cli.options import PATH, PositiveFloat, json_option
-from msg_analysis.errors import InputError
+from msg_analysis.errors import ExitCode, InputError
 from msg_analysis.experiment.examples import (
     FOLDER,
     KINDS,
@@ -33,6 +34,10 @@ from msg_analysis.experiment.examples import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from rich.console import Console
+
+    from msg_agents.doctor.checks import Check
+
 
 DEMO = "line_ring"
 DEFAULT = Choices()
@@ -48,8 +53,8 @@ def demo_of(run: click.Command) -> click.Command:
         "demo",
         params=[parameter for parameter in run.params if not isinstance(parameter, click.Argument)],
         callback=demo,
-        help=f"Run {DEMO}, an example that is installed with the software, as `run` does.\n\n"
-        "Five agents, a switcher and a recorder; the verdict comes after some seconds.",
+        help=f"Run the example {DEMO}: a verdict in some seconds.\n\n"
+        f"Five agents, a switcher and a recorder. The same as `msg-agents run {DEMO}` with the installed file.",
         epilog=example_lines("msg-agents demo", "msg-agents demo --web", "msg-agents demo --duration 100 --json"),
     )
 
@@ -58,7 +63,7 @@ def demo_of(run: click.Command) -> click.Command:
 @click.argument("name", required=False)
 @json_option
 def examples(name: str | None, *, as_json: bool) -> None:
-    """List the examples and what they show; with NAME, print the file of one.
+    """List the examples, or print the file of one.
 
     Every command that takes an experiment takes these names.
     """
@@ -134,9 +139,9 @@ def examples(name: str | None, *, as_json: bool) -> None:
 )
 @json_option
 def new(file: Path, *, as_json: bool, **given: Any) -> None:
-    """Write a new experiment with comments to FILE, which must not exist.
+    """Write a new experiment, with comments, to FILE.
 
-    Without options, a terminal asks for the values; otherwise what is not given has its default.
+    FILE must not exist. Without options, a terminal asks for the values; otherwise what is not given has its default.
     """
     if file.exists():
         raise InputError(f"{file}: exists already: remove it, or choose another name")
@@ -230,3 +235,52 @@ def schema() -> None:
     from msg_agents.channel.channel_file import json_schema
 
     print_json(json_schema(), indent=2)
+
+
+STYLES = {"ok": "green", "warning": "bold yellow", "error": "bold red"}
+
+
+@click.command(epilog=example_lines("msg-agents doctor"))
+@json_option
+def doctor(*, as_json: bool) -> None:
+    """Check whether this machine can run networks.
+
+    It also shows how to fix problems. The last check runs two processes for a second. Exit code 2: a run cannot work;
+    warnings do not change it.
+    """
+    from msg_agents.doctor.network_checks import examine
+
+    console, found = result_console(), []
+    for check in examine():
+        found.append(check)
+        if not as_json:
+            _print_check(console, check)
+    counts = Counter(check.status for check in found)
+    can_run = not counts["error"]
+    if as_json:
+        counted = {"errors": counts["error"], "warnings": counts["warning"]}
+        print_json({"can_run": can_run, **counted, "checks": [check.to_json() for check in found]})
+    else:
+        console.print(_summary(counts["error"], counts["warning"]), soft_wrap=True)
+    if not can_run:
+        sys.exit(ExitCode.BAD_INPUT)
+
+
+def _print_check(console: Console, check: Check) -> None:
+    """One line; terminals get the text folded in a column of its own."""
+    from rich.table import Table
+    from rich.text import Text
+
+    status, name = Text(f"{check.status:<8}", STYLES[check.status]), Text(f"{check.name.replace('_', ' '):<20}", "bold")
+    if console.is_terminal:
+        row = Table.grid(padding=(0, 1))
+        row.add_row(status, name, Text(check.text, overflow="fold"))
+        row.columns[0].no_wrap = row.columns[1].no_wrap = True
+        console.print(row)
+    else:
+        console.print(Text(" ").join([status, name, Text(check.text)]))
+
+
+def _summary(errors: int, warnings: int) -> str:
+    noted = f" ({warnings} warning{'s' * (warnings > 1)})" if warnings else ""
+    return f"A run cannot work here{noted}." if errors else f"A run can work here{noted}."

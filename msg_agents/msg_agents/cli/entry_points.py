@@ -12,6 +12,7 @@ import atexit
 import gc
 import os
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -108,41 +109,6 @@ def enter(domain: int | None) -> None:
     exit_on_signals()
 
 
-def msg_agents() -> None:
-    """The command line."""
-    _run()
-
-
-def agent() -> None:
-    """``msg-agents agent``."""
-    _run("agent")
-
-
-def switcher() -> None:
-    """``msg-agents switcher``."""
-    _run("switcher")
-
-
-def recorder() -> None:
-    """``msg-agents recorder``."""
-    _run("recorder")
-
-
-def player() -> None:
-    """``msg-agents play``."""
-    _run("play")
-
-
-def live() -> None:
-    """``msg-agents live``."""
-    _run("live")
-
-
-def markers() -> None:
-    """``msg-agents markers``."""
-    _run("markers")
-
-
 def _run(*command: str) -> None:
     atexit.register(_leave_garbage)
     try:
@@ -161,6 +127,13 @@ def _leave_garbage() -> None:
     """What is left at the end goes with the process; but nodes of ROS say that they go, when they are collected."""
     if "rclpy" not in sys.modules:
         gc.freeze()
+
+
+msg_agents = partial(_run)
+agent, switcher, recorder, live, markers = (
+    partial(_run, command) for command in ("agent", "switcher", "recorder", "live", "markers")
+)
+player = partial(_run, "play")
 
 
 class Verb:

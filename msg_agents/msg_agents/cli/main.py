@@ -16,7 +16,6 @@ import click
 
 import msg_agents
 from msg_agents.cli import begin, nodes, replay, watching
-from msg_agents.cli.doctor import doctor
 from msg_agents.cli.run_result import finish
 from msg_agents.cli.watching import WebCommand, announce, page, web_options
 from msg_agents.environment import LAST_DOMAIN, RESTARTS, USER_TIMEOUT
@@ -31,9 +30,13 @@ from msg_analysis.cli.options import (
     experiment_argument,
     json_option,
     seed_option,
+    set_option,
+    source_of,
     storage,
     storage_options,
     suggest,
+    verbose_option,
+    with_changes,
 )
 from msg_analysis.cli.runs import runs
 
@@ -43,7 +46,7 @@ if TYPE_CHECKING:
 
 
 class _Commands(CommandGroup):
-    """With that of the process of a channel, which only a run can start: it is in no list."""
+    """Includes the command of the process of a channel, which only a run starts: no list shows it."""
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
         """The command of this name."""
@@ -60,7 +63,7 @@ _no_analyse = click.option(
     "--no-analyse", is_flag=True, help="Do not compare the bag with the prediction: no verdict, no report."
 )
 _no_fork = click.option(
-    "--no-fork", is_flag=True, help="Start every process on its own, not forked from one that has imported everything."
+    "--no-fork", is_flag=True, help="Start every process as a new Python, not forked from one with all imports."
 )
 _write_report = click.option(
     "--write-report",
@@ -72,13 +75,13 @@ _write_report = click.option(
 
 
 def _interruption() -> Interruption:
-    """That of a run, from the start of its processes to the end of this command: its comparison comes after its end."""
+    """Of a run, from the start of its processes to the end of this command, so including its comparison."""
     interruption = Interruption()
     click.get_current_context().call_on_close(interruption.end)
     return interruption
 
 
-@main.command(
+@click.command(
     cls=WebCommand,
     epilog=examples(
         "msg-agents run line_ring",
@@ -99,12 +102,13 @@ def _interruption() -> Interruption:
 @_write_report
 @seed_option
 @duration_option
+@set_option
 @click.option(
     "--until",
     "until_text",
     metavar="PRECISION|decided",
-    help="End earlier, in order: when the system error is known to a PRECISION such as 1%, or when the evidence "
-    "disagrees or that precision is 5% (decided).",
+    help="End earlier, in order: when the 95 % interval of the system error that is valid at all times has a "
+    "half-width of PRECISION, such as 1%; decided: at 5%, or when the evidence exceeds its threshold.",
 )
 @click.option(
     "--pace",
@@ -113,10 +117,7 @@ def _interruption() -> Interruption:
     help="Overrides run.pace: lockstep or realtime.",
 )
 @click.option(
-    "--speed",
-    type=float,
-    metavar="SPEED",
-    help="Overrides run.speed: units of simulated time per second (realtime).",
+    "--speed", type=float, metavar="SPEED", help="Overrides run.speed: units of simulated time per second (realtime)."
 )
 @click.option(
     "--delivery",
@@ -138,11 +139,7 @@ def _interruption() -> Interruption:
     help="How often, in total, killed agents or the switcher are restarted.",
 )
 @click.option(
-    "--domain",
-    type=click.IntRange(0, LAST_DOMAIN),
-    metavar="D",
-    show_default="a free one",
-    help="ROS_DOMAIN_ID.",
+    "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", show_default="a free one", help="ROS_DOMAIN_ID."
 )
 @click.option(
     "--await",
@@ -168,6 +165,7 @@ def _interruption() -> Interruption:
 @storage_options
 @web_options
 @click.option("--executor", type=click.Choice(["events", "single"]), help="For comparison only.", hidden=True)
+@verbose_option
 @json_option
 def run(
     experiment: Path,
@@ -176,30 +174,24 @@ def run(
     no_record: bool,
     no_analyse: bool,
     write_report: ReportWhen,
-    seed: int | None,
-    duration: float | None,
+    changes: tuple[str, ...],
     until_text: str | None,
-    pace: str | None,
-    speed: float | None,
-    delivery: str | None,
-    processes: str | None,
-    restarts: int,
-    domain: int | None,
     readers: tuple[str, ...],
     use_sim_time: bool,
     channel_file: Path | None,
-    pin: bool,
     no_fork: bool,
     compression: Compression,
     split_size: float | None,
     web: int | None,
     web_host: str,
     executor: str | None,
+    verbose: bool,
     as_json: bool,
+    **given: Any,
 ) -> None:
-    """Run EXPERIMENT as a network of processes, record it, and compare the record with the theory.
+    """Run EXPERIMENT as processes and compare it with theory.
 
-    On a terminal, a panel shows the progress; with --web, a page for browsers does, too.
+    The run is recorded to a bag. On a terminal, a panel shows the progress; with --web, a page for browsers does, too.
     """
     from msg_agents.run.folder import load_with_overrides
     from msg_agents.run.runner import run_network
@@ -207,10 +199,14 @@ def run(
     from msg_analysis.model.run_record import Until
 
     interruption = _interruption()
-    changes: dict[str, Any] = {"seed": seed, "duration": duration, "pace": pace, "speed": speed}
-    changes |= {"delivery": delivery, "processes": processes}
     until = Until.parse(until_text) if until_text is not None else None
-    what = load_with_overrides(experiment, changes)
+    values = {key: given.pop(key) for key in ("seed", "duration", "pace", "speed", "delivery", "processes")}
+    what = load_with_overrides(
+        experiment,
+        values,
+        change=lambda document: with_changes(document, changes),
+        source=source_of(experiment, changes),
+    )
     channel = None
     if channel_file is not None:
         if use_sim_time or readers:
@@ -226,24 +222,29 @@ def run(
             result = run_network(
                 what,
                 None if no_record else out,
-                domain=domain,
-                restarts=restarts,
                 readers=readers,
                 use_sim_time=use_sim_time,
                 storage=storage(compression, split_size),
-                pin=pin,
                 fork=not no_fork,
                 view=view,
                 environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
                 channel=channel,
                 interruption=interruption,
                 until=until,
+                **given,
             )
-        say, analyse = view.display.end, not no_analyse
-        finish(result, as_json, say, interruption=interruption, analyse=analyse, report=write_report)
+        finish(
+            result,
+            as_json,
+            view.display.end,
+            interruption=interruption,
+            analyse=not no_analyse,
+            report=write_report,
+            verbose=verbose,
+        )
 
 
-@main.command(
+@click.command(
     epilog=examples(
         "msg-agents prepare line_ring > run.json   # once; copy it to all hosts",
         "msg-agents host run.json hosts.yaml            # on every host",
@@ -287,6 +288,7 @@ def run(
     "--profile", "only_profile", is_flag=True, help="Only print the discovery profile, for other ROS 2 tools."
 )
 @storage_options
+@verbose_option
 @json_option
 def host(
     run_record: Path,
@@ -303,12 +305,14 @@ def host(
     only_profile: bool,
     compression: Compression,
     split_size: float | None,
+    verbose: bool,
     as_json: bool,
 ) -> None:
-    """Run this host's part of a network on several hosts, as described in the file HOSTS.
+    """Run one host's part of a network on several hosts.
 
-    Give all hosts the same RUN_RECORD (from `msg-agents prepare`) and HOSTS; start them in any order. The recorder's
-    host compares the record with the theory, as `msg-agents run` does; the others end with the run.
+    The file HOSTS says which agents run where. Give all hosts the same RUN_RECORD (from `msg-agents prepare`) and
+    HOSTS; start them in any order. The recorder's host compares the record with the theory, as `msg-agents run`
+    does; the others end with the run.
     """
     from msg_agents.process_layout import Hosts, this_host
     from msg_agents.run.folder import workshop
@@ -342,25 +346,12 @@ def host(
             share=share,
             interruption=interruption,
         )
-    finish(result, as_json, interruption=interruption, analyse=not no_analyse, report=write_report)
+    finish(result, as_json, interruption=interruption, analyse=not no_analyse, report=write_report, verbose=verbose)
     if not share.home and not as_json:
         click.echo(f"the run has ended: its verdict is on {places.recorder}")
 
 
-for _command in (
-    begin.demo_of(run),
-    begin.examples,
-    begin.new,
-    begin.schema,
-    runs,
-    doctor,
-    replay.check,
-    nodes.prepare,
-    nodes.agent,
-    nodes.switcher,
-    nodes.recorder,
-    replay.play,
-    watching.live,
-    watching.markers,
-):
-    main.add_command(_command)
+main.add_section("Start here", begin.demo_of(run), begin.examples, begin.new, begin.doctor)
+main.add_section("Runs", run, host, runs, watching.live, watching.markers, begin.schema)
+main.add_section("Bags", replay.check, replay.play)
+main.add_section("Single nodes", nodes.prepare, nodes.agent, nodes.switcher, nodes.recorder)

@@ -69,7 +69,7 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
             "--account",
             type=PATH,
             metavar="FILE",
-            help="File, written once a second, with what the nodes refused and wait for: for health checks.",
+            help="Status file, written every second: rejected messages, what the nodes wait for (health checks).",
         ),
     ):
         command = option(command)
@@ -115,7 +115,10 @@ def _agents_of_record(context: click.Context, _option: click.Parameter, incomple
 @click.command(epilog=examples("msg-agents prepare line_ring > run.json"))
 @experiment_argument
 def prepare(experiment: Path) -> None:
-    """Print the run record of a new run of EXPERIMENT: the file with which single nodes are started."""
+    """Print the run record of a new run of EXPERIMENT.
+
+    Single nodes are started with this file.
+    """
     from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.twin.simulate import new_record
 
@@ -142,7 +145,7 @@ def prepare(experiment: Path) -> None:
 def agent(
     run_record: Path, *, agents: tuple[int, ...], readers: tuple[str, ...], checkpoint: Path | None, **options: Any
 ) -> None:
-    """Run one or more agents of the run in RUN_RECORD in one process."""
+    """Run one or more agents in one process."""
     from msg_analysis.errors import InputError
 
     record = load_record(run_record)
@@ -189,7 +192,10 @@ def switcher(
     patience: float | None,
     **options: Any,
 ) -> None:
-    """Run the switcher of the run in RUN_RECORD: it publishes the experiment and the active graph."""
+    """Run the switcher.
+
+    It publishes the experiment and the active graph.
+    """
     record = load_record(run_record)
 
     def report(reached: Sequence[int]) -> None:

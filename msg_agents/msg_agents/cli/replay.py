@@ -17,7 +17,6 @@ from click.shell_completion import CompletionItem
 from msg_agents.cli.entry_points import RosCommand, domain_option, enter
 from msg_analysis.cli.console import examples, print_json, print_text
 from msg_analysis.cli.options import BAG, PositiveFloat, json_option
-from msg_analysis.common.text import print_note
 from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -79,12 +78,7 @@ class _Rate(click.types.FloatParamType):
 @click.option("--duration", type=PositiveFloat(), metavar="SECONDS", help="Seconds of the bag to play.")
 @click.option("-l", "--loop", is_flag=True, help="Start again at the end.")
 @click.option("--paused", is_flag=True, help="Start paused; the space bar continues.")
-@click.option(
-    "--clock",
-    type=PositiveFloat(),
-    metavar="HZ",
-    help="Publish the time of the bag on /clock at this rate.",
-)
+@click.option("--clock", type=PositiveFloat(), metavar="HZ", help="Publish the time of the bag on /clock at this rate.")
 @click.option(
     "--topics",
     multiple=True,
@@ -110,33 +104,12 @@ class _Rate(click.types.FloatParamType):
 )
 @click.option("--await", "readers", multiple=True, metavar="NODE", help="Start when NODE reads the topics. Repeatable.")
 @click.option(
-    "--wait-timeout",
-    type=PositiveFloat(),
-    metavar="SECONDS",
-    default=30.0,
-    help="How long to wait for readers [s].",
+    "--wait-timeout", type=PositiveFloat(), metavar="SECONDS", default=30.0, help="How long to wait for readers [s]."
 )
 @domain_option
 @json_option
-def play(
-    bag: Path,
-    *,
-    rate: float,
-    start_offset: float,
-    duration: float | None,
-    loop: bool,
-    paused: bool,
-    clock: float | None,
-    topics: tuple[str, ...],
-    exclude: tuple[str, ...],
-    remaps: tuple[str, ...],
-    subscribers: int | None,
-    readers: tuple[str, ...],
-    wait_timeout: float,
-    domain: int | None,
-    as_json: bool,
-) -> None:
-    """Play BAG, a bag of ROS 2: publish its messages in the recorded order.
+def play(bag: Path, *, subscribers: int | None, domain: int | None, as_json: bool, **options: Any) -> None:
+    """Play BAG: publish its messages in the recorded order.
 
     No message is lost: the player waits for slow readers.
 
@@ -147,24 +120,11 @@ def play(
     from msg_agents.nodes.player import play as play_bag
 
     enter(domain)
-    options = PlayOptions(
-        rate=rate,
-        start_offset=start_offset,
-        duration=duration,
-        loop=loop,
-        paused=paused,
-        clock=clock,
-        topics=topics,
-        exclude=exclude,
-        remaps=remaps,
-        subscribers=subscribers or 0,
-        readers=readers,
-        wait_timeout=wait_timeout,
-    )
+    chosen = PlayOptions(subscribers=subscribers or 0, **options)
     with PlayBar(bag.name) as bar:
         try:
             played = play_bag(
-                bag, options, on_progress=bar.update, on_note=bar.note, on_stop=bar.hide, on_continue=bar.show
+                bag, chosen, on_progress=bar.update, on_note=bar.note, on_stop=bar.hide, on_continue=bar.show
             )
         except (KeyboardInterrupt, SystemExit):
             if bar.played.begun:
@@ -239,6 +199,8 @@ class PlayBar:
 
     def note(self, line: str) -> None:
         """Print a note, above the bar."""
+        from msg_analysis.common.text import print_note
+
         print_note(line, self._console)
 
 
@@ -246,9 +208,9 @@ class PlayBar:
 @click.argument("bag", type=BAG, required=False)
 @json_option
 def check(bag: Path | None, *, as_json: bool) -> None:
-    """Recompute the run in BAG with the offline twin; report the first agent and step that differ.
+    """Recompute a run with the twin, bit for bit.
 
-    Without BAG, the newest bag below ./runs is checked.
+    The first step and agent that differ are reported. Without BAG, the newest bag below ./runs is checked.
     """
     from msg_analysis.bags.reading import read_bag
     from msg_analysis.cli.console import WorkProgress

@@ -30,8 +30,9 @@ def finish(
     interruption: Interruption,
     analyse: bool = True,
     report: ReportWhen = "always",
+    verbose: bool = False,
 ) -> None:
-    """Print the failures, judge what was recorded, show the result, and exit with its code.
+    """Print the failures, compare what was recorded, show the result, and exit with its code.
 
     ``interruption``: of the run; a signal ends the comparison, too, and nothing else.
     """
@@ -50,7 +51,7 @@ def finish(
             result.interrupt(signal.SIGINT, "while the run was compared with the prediction")
             complain(result.failures[0], "failed:")
     say(_ending(result), result.report)
-    _show(result, as_json)
+    _show(result, as_json, verbose)
     if result.incomplete or (analyse and result.bag is not None and result.comparison is None):
         sys.exit(ExitCode.INCOMPLETE)
     if result.comparison is not None:
@@ -69,7 +70,7 @@ def _ending(result: RunResult) -> dict[str, Any]:
     return {"text": f"The run has ended; {outcome}.", "verdict": verdict}
 
 
-def _show(result: RunResult, as_json: bool) -> None:
+def _show(result: RunResult, as_json: bool, verbose: bool) -> None:
     """Print the result on stdout; of an interrupted run, also write result.json."""
     document = result.to_json()
     if result.interrupted:
@@ -80,7 +81,7 @@ def _show(result: RunResult, as_json: bool) -> None:
     if result.comparison is not None:
         from msg_analysis.report.comparison_text import print_comparison
 
-        print_comparison(document, result_console())
+        print_comparison(document, result_console(), verbose=verbose)
     for line in (result.channel or {}).get("findings", []):
         click.echo(f"Channel: {line}")
     if result.comparison is not None:

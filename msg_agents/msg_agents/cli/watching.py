@@ -16,9 +16,8 @@ import click
 
 from msg_agents.cli import nodes
 from msg_agents.cli.entry_points import RosCommand, domain_option, enter
-from msg_analysis.cli.console import examples, print_json, print_text, result_console
+from msg_analysis.cli.console import examples, print_json, print_note, print_text, result_console
 from msg_analysis.cli.options import BAG, RUN_RECORD, PositiveFloat, json_option
-from msg_analysis.common.text import print_note
 from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -144,10 +143,10 @@ def live(
     web_host: str,
     domain: int | None,
 ) -> None:
-    """Watch a network, running or played: its errors so far next to their prediction.
+    """Watch the errors of a network next to their prediction.
 
-    It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The numbers are those of `msg-analysis
-    compare`, also published on the topic `estimate`; they are not a verdict.
+    The network runs, or is played. It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The
+    numbers are those of `msg-analysis compare`, also published on the topic `estimate`; they are not a verdict.
     """
     from msg_agents.nodes.live import watch
     from msg_agents.watch.panel import Display
@@ -226,22 +225,18 @@ class LiveView:
     epilog=examples("msg-agents markers --domain 42", "msg-agents markers --rate 30 --replica 2 --frame map"),
 )
 @click.option(
-    "--rate",
-    type=click.FloatRange(0, 1000, min_open=True),
-    metavar="HZ",
-    default=10.0,
-    help="Updates per second.",
+    "--rate", type=click.FloatRange(0, 1000, min_open=True), metavar="HZ", default=10.0, help="Updates per second."
 )
 @click.option("--replica", type=click.IntRange(1), metavar="R", default=1, help="Replica to draw.")
 @click.option("--frame", metavar="FRAME", default="network", help="Frame of reference: the fixed frame of RViz.")
 @_timeout
 @domain_option
 def markers(*, rate: float, replica: int, frame: str, timeout: float | None, domain: int | None) -> None:
-    """Draw a network, running or played, for RViz and Foxglove: markers on the topic `markers`.
+    """Draw a network for RViz and Foxglove.
 
-    Agents on a circle, coloured by how far their states are from the mean (or the reference), and the links of the
-    active graph. It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The network never waits
-    for it.
+    It publishes markers on the topic `markers`: agents on a circle, coloured by how far their states are from the
+    mean (or the reference), and the links of the active graph. It ends with the run, or with Ctrl-C (exit code 3:
+    the end was not reached). The network never waits for it.
     """
     from msg_agents.nodes.markers import show_markers
 

@@ -81,23 +81,29 @@ def make_bag_directory(experiment: Experiment, out: Path, *, option: str = "--ou
 
 
 def load_with_overrides(
-    path: Path, run: Mapping[str, Any], *, name: Callable[[str], str] = "--{}".format
+    path: Path,
+    run: Mapping[str, Any],
+    *,
+    name: Callable[[str], str] = "--{}".format,
+    change: Callable[[Any], Any] = lambda document: document,
+    source: str = "",
 ) -> Experiment:
     """The experiment, checked once, after values of ``run`` were replaced; None replaces nothing.
 
-    ``processes`` may be a number as text. ``name``: how errors call the new value of a key.
+    ``processes`` may be a number as text. ``name``: how errors call the new value of a key. ``change``: of other keys
+    of the file, made first; ``source``: how errors call the file then.
     """
     changes = {key: value for key, value in run.items() if value is not None}
     if str(changes.get("processes", "")).isdigit():
         changes["processes"] = int(changes["processes"])
-    document = read_yaml(path)
+    document, source = change(read_yaml(path)), source or str(path)
     if not changes or not isinstance(document, dict) or not isinstance(section := document.get("run", {}), dict):
-        return Experiment.parse(document, source=str(path), directory=path.parent)
+        return Experiment.parse(document, source=source, directory=path.parent)
     changed = document | {"run": section | changes}
     try:
-        return Experiment.parse(changed, source=str(path), directory=path.parent)
+        return Experiment.parse(changed, source=source, directory=path.parent)
     except InputError as error:
-        Experiment.parse(document, source=str(path), directory=path.parent)  # the fault may be the file's
+        Experiment.parse(document, source=source, directory=path.parent)  # the fault may be the file's
         problems = error.problems if isinstance(error, ExperimentError) else []
         wrong = [key for key in changes if any(line.startswith(f"run.{key}:") for line in problems)]
         given = ", ".join(name(key) for key in wrong or changes)

@@ -1,6 +1,7 @@
 """``msg-analysis compare`` of several bags, and ``tabulate``, as a user calls them."""
 
 import csv
+import io
 import json
 import re
 from pathlib import Path
@@ -8,9 +9,12 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
+from rich.console import Console
 
 from experiments import changed, claimed, golden, simulate, write_trajectory
 from msg_analysis.cli.main import main
+from msg_analysis.report.saved_results import print_results
+from msg_analysis.runs import read_result
 
 EXPERIMENT = Path(__file__).parents[3] / "analysis/msg_analysis/experiment/bundled/leader_smallest.yaml"
 
@@ -86,9 +90,8 @@ def test_the_level_is_that_of_the_verdict(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("width", [60, 80, 40])
-def test_tabulate_in_narrow_windows(results: list[Path], width: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rows can be told apart by the ends of their names, and no number is cut."""
-    monkeypatch.setenv("COLUMNS", str(width))
+def test_tabulate_in_narrow_windows(results: list[Path], width: int) -> None:
+    """No name of a run and no number is cut."""
     places = [
         results[0].parent / name / "result.json"
         for name in ("leaders_of_the_first_kind_1", "leaders_of_the_first_kind_2")
@@ -96,13 +99,22 @@ def test_tabulate_in_narrow_windows(results: list[Path], width: int, monkeypatch
     for place, result in zip(places, results, strict=False):
         place.parent.mkdir(exist_ok=True)
         place.write_text(result.read_text())
-    lines = call("tabulate", *places).stdout.splitlines()
+    console = Console(file=io.StringIO(), width=width, force_terminal=True, color_system=None)
+    print_results([read_result(place) for place in places], 0.01, console)
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
     rows = [line.split() for line in lines if re.match(r"  \S*kind_[12] ", line)]
-    assert [row[0][-6:] for row in rows] == ["kind_1", "kind_2"], lines
+    assert [row[0] for row in rows] == [place.parent.name for place in places], lines
     for row, place in zip(rows, places, strict=True):
         error = json.loads(place.read_text())["system_error"]
         assert {f"{error['measured']:.6g}", f"{error['predicted']:.6g}", f"{error['z']:+.2f}"} <= set(row)
     assert width < 80 or max(map(len, lines[:6])) <= width
+
+
+def test_tabulate_in_a_pipe(results: list[Path]) -> None:
+    """Whole paths, for other commands, and all columns, in a line for each result."""
+    lines = call("tabulate", *results).stdout.splitlines()
+    assert {"experiment", "leaders", "verdict", "seed", "time", "predicted", "smallest"} <= set(lines[2].split())
+    assert [line.split()[0] for line in lines[4:7]] == [str(path) for path in results]
 
 
 def test_tabulate(results: list[Path], bags: list[Path]) -> None:

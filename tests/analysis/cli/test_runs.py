@@ -1,16 +1,20 @@
 """The commands ``runs`` and ``diff``: what they print, and their exit codes."""
 
+import io
 import json
 from pathlib import Path
 
 import pytest
 import yaml
 from click.testing import CliRunner, Result
+from rich.console import Console
 
 from msg_agents.cli.main import main as agents
 from msg_analysis import Experiment
 from msg_analysis.cli.main import main
 from msg_analysis.common.text import json_text
+from msg_analysis.report.tables import print_runs
+from msg_analysis.runs import list_runs
 
 DOCUMENT = {
     "name": "pair",
@@ -58,16 +62,25 @@ def test_runs() -> None:
     text = invoke("runs", "--name", "pair").stdout
     assert "2 runs of 3" in text
     assert "2026-11-27 12:00" not in text  # the names of the folders have it
-    wide, narrow = (invoke("runs", columns=columns).stdout.splitlines() for columns in (140, 40))
-    assert len(wide) == len(narrow)  # a line for each run, with what there is room for
-    assert {"predicted", "z"} < set(wide[2].split())
-    assert not {"predicted", "z"} & set(narrow[2].split())
-    for name, lines in (("pair_20261128_120000", wide), ("pair_…120000", narrow)):
-        assert any(name in line and "2026-11-28 12:00" in line and "agrees" in line for line in lines)
+    piped = invoke("runs", columns=40).stdout.splitlines()  # nothing is cut or left out where no terminal is
+    assert {"predicted", "z"} < set(piped[2].split())
+    (line,) = (line for line in piped if "pair_20261128_120000" in line)
+    assert "2026-11-28 12:00" in line
+    assert "agrees" in line
     assert "none of 3 runs" in invoke("runs", "--seed", "9").stdout
     document = json.loads(invoke("runs", "--verdict", "agrees", "--json").stdout)
     assert (document["folder"], document["total"]) == ("runs", 3)
     assert [run["seed"] for run in document["runs"]] == [8]
+
+
+def test_runs_on_a_narrow_terminal() -> None:
+    """A line for each run, whose name is whole; numbers are left out."""
+    console = Console(file=io.StringIO(), width=40, force_terminal=True, color_system=None)
+    found = list_runs(Path("runs"))
+    print_runs(found, Path("runs"), len(found), console)
+    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert not {"predicted", "z"} & set(lines[2].split())
+    assert sum(" pair_20261128_120000 " in line for line in lines) == 1
 
 
 def test_page(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -163,7 +163,8 @@ def test_plan(tmp_path):
     assert document["precision"] == 0.02
     assert document["budget"]["steps"] == 480_000
     text = call("plan", LINE_RING, "--precision", "2%", "--budget", "1h", "--speed", "800").stdout
-    assert "Length for a 95 % interval of ± 2 % of the system error" in text
+    assert text.startswith("For ± 2 % of the system error (95 %), run 56581 steps (1 min 11 s) with 16 replicas;")
+    assert "Run length for ± 2 % (95 %): evaluated once at the end, or monitored throughout" in text
     assert "best run in 1 h 0 min" in text
     assert "noise variance of agent 1 x 1.05" in text
     assert "speed: gives" not in text

@@ -27,7 +27,7 @@ from experiments import (
 )
 from msg_analysis.inference.online_errors import LiveEstimate
 from msg_analysis.inference.pool import compare_pooled
-from msg_analysis.report.wording import trust_words
+from msg_analysis.report.comparison_text import trust_words
 
 SEEDS = range(100, 140)
 

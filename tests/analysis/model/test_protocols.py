@@ -313,7 +313,7 @@ def test_verdicts_without_a_prediction() -> None:
     comparison = compare(trajectory)
     assert comparison.verdict == "unpredicted"
     text = render(comparison, trajectory)
-    assert "No verdict: there is no prediction." in text
+    assert "No verdict, because there is no prediction." in text
     assert "protocol saturated (msg_agents_example_protocols 0.1.0) is not linear" in text
     found = comparison.to_json()
     assert json.loads(json.dumps(found, allow_nan=False))["verdict"] == "unpredicted"

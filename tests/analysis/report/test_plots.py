@@ -13,7 +13,7 @@ from msg_analysis.report import plot_style
 from msg_analysis.report.drawings import chain_drawing, graph_drawings, interval_bars, plus_minus
 from msg_analysis.report.error_plots import covariances
 from msg_analysis.report.page import render
-from msg_analysis.report.plot_style import Accused, envelope, thin, thin_together
+from msg_analysis.report.plot_style import Candidates, envelope, thin, thin_together
 from msg_analysis.report.run_plots import run_events, trajectory_plots
 
 DOCUMENT = document(name="marked", run={"duration": 60, "replicas": 8, "seed": 1, "start": "zero"})
@@ -25,7 +25,7 @@ def cause(**changes: object) -> dict[str, object]:
 
 
 def test_who_is_named() -> None:
-    found = Accused.of(
+    found = Candidates.of(
         [
             cause(kind="gain", link=[2, 3], graph="ring"),
             cause(agent=3),
@@ -48,19 +48,19 @@ def test_who_is_named() -> None:
 
 def test_drawings() -> None:
     experiment = Experiment.parse(DOCUMENT)
-    marked = Accused(agents=(2,), links=((1, 3, None),), jumps=(("line", "ring"),))
+    marked = Candidates(agents=(2,), links=((1, 3, None),), jumps=(("line", "ring"),))
     line, ring = graph_drawings(experiment, marked)
-    assert line.count('class="accused"') == 1  # the agent; it has no link 1-3
-    assert ring.count('class="accused"') == 2
+    assert line.count('class="candidate"') == 1  # the agent; it has no link 1-3
+    assert ring.count('class="candidate"') == 2
     assert "named by the verdict: 1-3" in ring
     chain = chain_drawing(experiment, marked)
-    assert chain.count('class="accused"') == 1
-    assert 'class="accused"' not in "".join(graph_drawings(experiment))
+    assert chain.count('class="candidate"') == 1
+    assert 'class="candidate"' not in "".join(graph_drawings(experiment))
 
 
 def test_frames_in_the_covariance() -> None:
-    plots = covariances(np.eye(3), None, None, Accused(agents=(2,), links=((1, 3, "ring"),)))
-    frames = plots["covariance_measured"].select({"name": "accused"})
+    plots = covariances(np.eye(3), None, None, Candidates(agents=(2,), links=((1, 3, "ring"),)))
+    frames = plots["covariance_measured"].select({"name": "candidates"})
     assert {(one.left, one.right, one.bottom, one.top) for one in frames} == {
         (0.5, 3.5, 1.5, 2.5),
         (1.5, 2.5, 0.5, 3.5),
@@ -90,7 +90,7 @@ def test_the_cause_is_the_headline(louder: Comparison) -> None:
     assert headline
     assert headline[1].startswith("✗ Agent 2&#39;s noise variance is")
     assert "The run disagrees with the prediction." in text
-    assert 'data-accused="[2]"' in text
+    assert 'data-candidates="[2]"' in text
     assert text.count('<b class="named"') == 1
 
 

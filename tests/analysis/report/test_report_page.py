@@ -166,7 +166,7 @@ def test_incomplete(tmp_path: Path, first_gap: int) -> None:
     assert "No verdict: the data are incomplete." in page.text
     assert "Missing: 1 of 1203 states" in page.text
     assert ("too early to compute" in page.text) == (first_gap == 5)
-    assert "refused: torn file" in page.text
+    assert "rejected: torn file" in page.text
 
 
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -223,7 +223,7 @@ def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         "Real time",
         "lateness [ms]",
         "600 of 600 (100 %)",
-        "Laws",
+        "Models",
         "logged pattern",
         "predicted, logged pattern",
     ):

@@ -91,7 +91,7 @@ def test_small_and_large(tab: Tab, reports: Callable[..., tuple[Path, Run]], age
     figures, drawn = page.locator(".figure").count(), page.locator(".figure:not(:empty)").count()
     assert 4 <= drawn < figures - 4
     page.locator("#innovations").scroll_into_view_if_needed()
-    page.locator("[aria-label^='Variance of the innovations'] .figure:not(:empty)").wait_for()
+    page.locator("[aria-label^='Variance of the residuals'] .figure:not(:empty)").wait_for()
     assert page.locator(".figure:empty").count() > 0
 
     rows = page.locator("#node-table tbody tr:visible")

@@ -1,6 +1,8 @@
 """Tables for a terminal: they show the numbers of the document, also where some are missing."""
 
 import io
+import re
+from functools import partial
 from typing import Any
 
 import pytest
@@ -10,7 +12,7 @@ from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.protocols import ProtocolInfo
 from msg_analysis.report import comparison_text, tables, theory_text
 from msg_analysis.report.documents import describe_experiment
-from msg_analysis.report.wording import explain
+from msg_analysis.report.drawings import explain
 from msg_analysis.theory.graph_indices import algebraic_connectivity
 
 
@@ -55,10 +57,35 @@ def test_comparison() -> None:
     assert output.count("1.5 .. 2.5") == 4
     assert "+3.14" in output
     assert "agent 3" in output
-    lines = [line for line in output.splitlines() if "0.0001" in line]
-    assert "rejected" in lines[0]
-    assert "covariance [m > 20]" in output
-    assert "not tested" in output
+    lines = output.splitlines()
+    place = lines.index("1 of 1 tests rejected (smallest adjusted p 0.001; family-wise false-alarm rate 1 %)")
+    (rejected,) = (line for line in lines if "0.0001" in line)
+    assert rejected.split() == ["switching", "0.0001", "0.001", "rejected"]
+    assert place < lines.index(rejected) < lines.index(next(line for line in lines if line.startswith("system")))
+    assert "covariance [m > 20]" not in output
+    everything = shown(partial(comparison_text.print_comparison, verbose=True), comparison("disagrees", 3, 2.0))
+    (untested,) = (line for line in everything.splitlines() if "covariance [m > 20]" in line)
+    assert untested.endswith("not tested  ")
+
+
+def test_a_run_that_agrees_takes_ten_lines() -> None:
+    """Counts that are 0 and tests that are ok are not listed; all is there with ``verbose``."""
+    tests = [{"name": f"test {i}", "p": 0.8, "p_adjusted": 0.77, "rejected": False} for i in range(21)]
+    whole = {"expected": 12, "received": 12, "missing": 0, "duplicates": 0, "out_of_order": 0}
+    document = comparison("agrees", 5, 2.0) | {"tests": tests, "completeness": whole}
+    lines = shown(comparison_text.print_comparison, document).splitlines()
+    assert len(lines) <= 10
+    assert "12 of 12 states in 3 steps (0.75 units of time)" in lines
+    assert "21 of 21 tests ok (smallest adjusted p 0.77)" in lines
+    everything = shown(partial(comparison_text.print_comparison, verbose=True), document)
+    assert sum(f"test {i}  " in everything for i in range(21)) == 21
+    assert "Model-free estimate of the system error (batch means): 2 ± 1 (95 %)" in everything
+
+
+def test_all_rejected_tests_are_shown() -> None:
+    tests = [{"name": f"test {i}", "p": 0.0, "p_adjusted": 0.0, "rejected": i % 2 == 0} for i in range(100)]
+    output = shown(comparison_text.print_comparison, comparison("disagrees", 2, 2.0) | {"tests": tests})
+    assert [f"test {i}  " in output for i in range(100)] == [i % 2 == 0 for i in range(100)]
 
 
 def test_strangers() -> None:
@@ -66,7 +93,7 @@ def test_strangers() -> None:
     output = shown(comparison_text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": [entry]})
     (line,) = (line for line in output.splitlines() if "1234" in line)
     assert line.split() == ["agent_1", "[red]graph", "other", "run", "1234"]
-    assert "refused" not in shown(comparison_text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": []})
+    assert "Rejected" not in shown(comparison_text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": []})
 
 
 def test_blame_and_bags() -> None:
@@ -93,11 +120,16 @@ def test_comparison_without_numbers() -> None:
     assert "nan" not in output.lower()
 
 
-def test_many_agents_are_cut_and_it_says_so() -> None:
-    output = shown(comparison_text.print_comparison, comparison("agrees", 100, 2.0))
-    assert "agent 30" in output
-    assert "agent 31" not in output
-    assert "70 more agents: use --json" in output
+def test_of_many_agents_the_five_furthest_from_the_prediction_are_shown() -> None:
+    document = comparison("agrees", 100, 2.0)
+    for agent, error in enumerate(document["node_errors"], start=1):
+        error["z"] = {10: -4.0, 20: 3.5, 30: 3.0, 40: 2.5, 50: 2.2}.get(agent, 1.0)
+    output = shown(comparison_text.print_comparison, document)
+    assert re.findall(r"^agent (\d+)", output, re.MULTILINE) == ["10", "20", "30", "40", "50"]
+    words = " ".join(output.split())
+    assert "95 of 100 agent errors have the prediction in their 95 % intervals; shown are the 5 that are" in words
+    everything = shown(partial(comparison_text.print_comparison, verbose=True), document)
+    assert len(re.findall(r"^agent ", everything, re.MULTILINE)) == 100
 
 
 def test_prediction() -> None:
@@ -113,7 +145,7 @@ def test_prediction() -> None:
     }
     output = shown(theory_text.print_prediction, document)
     assert "[red]" in output
-    for part in ("continuous time", "steps of the run", "3.5", "0.285714", "0.25", "graphs held fixed: not"):
+    for part in ("continuous time", "steps of the run", "3.5", "0.285714", "0.25", "Graphs held fixed: infinite"):
         assert part in output
 
 
@@ -246,15 +278,20 @@ def test_real_time() -> None:
     }
     laws = {"pattern": law | {"supported": True}, "sequential": law, "continuous": law | {"supported": False}}
     document = comparison("agrees", 3, 2.0) | {"timing": timing, "laws": laws | {"why": "the reasons"}}
-    output = shown(comparison_text.print_comparison, document)
-    assert output.startswith("The run agrees with the prediction; 7.3 % of the deadlines were missed.")
-    for part in ("lateness [ms]", "73 of 1000 (7.3 %)", "300 of 400 (75 %)", "1 of 1000 (less than 0.01 %)"):
+    short = shown(comparison_text.print_comparison, document)
+    assert short.startswith("The run agrees with the prediction; 7.3 % of the deadlines were missed.")
+    assert "the reasons" in short
+    assert "lateness [ms]" not in short
+    output = shown(partial(comparison_text.print_comparison, verbose=True), document)
+    for part in ("lateness [ms]", "period jitter [ms]", "73 of 1000 (7.3 %)", "1 of 1000 (less than 0.01 %)"):
         assert part in output
+    assert re.search(r"neighbour values as recent as with ideal timers +75 %", output)
     assert "neighbours before their first message" in output
     assert output.count("supported") == 2
     assert "not decided" in output
     assert "the reasons" in output
-    assert "Timing" not in shown(comparison_text.print_comparison, comparison("agrees", 3, 2.0))
+    lockstep = shown(partial(comparison_text.print_comparison, verbose=True), comparison("agrees", 3, 2.0))
+    assert "Timing" not in lockstep
 
 
 def test_losses_by_link() -> None:
@@ -271,7 +308,7 @@ def test_losses_by_link() -> None:
         ({"loss": 0.3, "burst": 4}, "; 30 % of the messages are lost, on average 4 of a link in a row."),
         (
             {"loss": {"default": 0.1, "edges": [[1, 2, 0.5]]}, "on_loss": "hold"},
-            "; 10 % of the messages are lost, and 50 % of those of 1 link, and the last value that was heard takes the "
+            "; 10 % of the messages are lost, and 50 % of those of 1 link, and the last received value takes the "
             "place of a lost one.",
         ),
         (

@@ -14,8 +14,8 @@ from msg_analysis.cli.main import main
 from msg_analysis.common.text import agent_name, agent_text, with_names
 from msg_analysis.errors import InputError
 from msg_analysis.inference.pool import compare_pooled
+from msg_analysis.report.comparison_text import furthest, order_statements, sentence
 from msg_analysis.report.page import page_title, run_facts
-from msg_analysis.report.wording import furthest, order_statements, sentence
 from msg_analysis.sweeps.grid import axis_name, column_words, load_sweep
 
 AGENTS = ["agent 1", "agent 2", "agent 3"]
@@ -39,20 +39,20 @@ def order(distinctions, contradictions=()):
 
 def test_order_in_sentences():
     pairs = [pair(3, 2, 0.99999, True), pair(1, 2, 0.9951, None)]
-    assert order_statements(order(pairs, [pairs[1]]), AGENTS, "is more certain than") == [
-        "Order, smallest measured error first: agent 3, agent 1, agent 2. 2 of 3 pairs differ significantly (level "
-        "0.01 for all pairs together).",
-        "Agent 3 is more certain than agent 2 (confidence > 99.99 %).",
-        "Agent 1 is more certain than agent 2 (confidence 99.51 %).",
+    assert order_statements(order(pairs, [pairs[1]]), AGENTS, "has a smaller error than") == [
+        "Order, smallest measured error first: agent 3, agent 1, agent 2. 2 of 3 pairs differ significantly "
+        "(family-wise level 0.01).",
+        "Agent 3 has a smaller error than agent 2 (confidence > 99.99 %).",
+        "Agent 1 has a smaller error than agent 2 (confidence 99.51 %).",
         "Not significantly different: agent 3 and agent 1.",
-        "Measured, but predicted equal: agent 1 is more certain than agent 2 (confidence 99.51 %).",
+        "Unexpected: agent 1 has a smaller error than agent 2 (confidence 99.51 %); the theory predicts equal errors.",
     ]
     files = order_statements(order([pair(3, 2, 0.999, False)]), ["a.json", "b.json", "c.json"], "beats")
     assert files[1] == "c.json beats b.json (confidence 99.90 %)."
 
 
 def test_order_without_differences_and_the_largest_z_first() -> None:
-    (line,) = order_statements(order([]), AGENTS, "is more certain than")
+    (line,) = order_statements(order([]), AGENTS, "has a smaller error than")
     assert "0 of 3 pairs differ significantly" in line
     assert sentence("agent 3 does not move") == "Agent 3 does not move."
     assert furthest([0.5, None, -3.0, 2.0], 3) == [2, 3, 0]
@@ -176,7 +176,7 @@ def test_notebooks_and_report(named_run: Run, tmp_path: Path) -> None:
         assert "Bonn" in text
     html = write_report(comparison, tmp_path / "report.html").read_text(encoding="utf-8")
     assert "the leader, agent Bonn, is pulled" in html
-    assert "leader, agent Bonn hears Ulm, Kiel" in html
+    assert "leader, agent Bonn receives from Ulm, Kiel" in html
     assert "<td>Kiel</td>" in html
     assert "agent 2" not in html
 

@@ -2,7 +2,7 @@
 // Choosing agents: by numbers in the field, or in the figure; the table and the lines follow.
 (() => {
   const COLOURS = JSON.parse(document.body.dataset.colours);
-  const ACCUSED = new Set(JSON.parse(document.body.dataset.accused));
+  const CANDIDATES = new Set(JSON.parse(document.body.dataset.candidates));
   const DASHES = ["solid", "dashed", "dotted", "dotdash"];
   const MOST = Number(document.body.dataset.most), MOST_BANDS = 3;
   const field = document.getElementById("agents");
@@ -43,7 +43,7 @@
       ys: known.map((agent) => Array.from(parts.slice((agent - 1) * points, agent * points))),
       agent: known.map((agent) => `agent ${window.called(agent)}`),
       colour: known.map(colour),
-      width: known.map((agent) => (ACCUSED.has(agent) ? 4 : 2)),
+      width: known.map((agent) => (CANDIDATES.has(agent) ? 4 : 2)),
       dash: known.map((agent) => DASHES[Math.floor((agent - 1) / COLOURS.length) % DASHES.length]),
     };
     const banded = known.filter((agent) => known.length <= MOST_BANDS && Number.isFinite(widths[agent - 1]));

@@ -4,7 +4,7 @@
   const box = document.getElementById("trajectories");
   if (!box) return;
   const COLOURS = JSON.parse(document.body.dataset.colours);
-  const FIRST = JSON.parse(document.body.dataset.shown), ACCUSED = new Set(JSON.parse(document.body.dataset.accused));
+  const FIRST = JSON.parse(document.body.dataset.shown), CANDIDATES = new Set(JSON.parse(document.body.dataset.candidates));
   const DASHES = ["solid", "dashed", "dotted", "dotdash"];
   const MOST_STRIPS = 1500, MOST_BUTTONS = 120, OVERVIEW = 400, UNKNOWN = 65535;
   const from = document.getElementById("from"), to = document.getElementById("to");
@@ -70,13 +70,13 @@
   function drawStates(first, last, pixels) {
     const deviation = document.getElementById("deviation").checked, part = deviation ? "deviation_" : "";
     const low = run[`${part}low`], high = run[`${part}high`] || low;
-    const chosen = [...on].sort((a, b) => ACCUSED.has(a) - ACCUSED.has(b) || a - b);  // the accused on top
+    const chosen = [...on].sort((a, b) => CANDIDATES.has(a) - CANDIDATES.has(b) || a - b);  // the candidates on top
     const lines = chosen.map((agent) => line(low, high, (agent - 1) * bins, first, last, pixels));
     model("states").data = {
       xs: lines.map(([xs]) => xs), ys: lines.map(([, ys]) => ys),
       agent: chosen.map((agent) => `agent ${window.called(agent)}`),
       colour: chosen.map(colour), dash: chosen.map(dash),
-      width: chosen.map((agent) => (ACCUSED.has(agent) ? 2.4 : 1.3)),
+      width: chosen.map((agent) => (CANDIDATES.has(agent) ? 2.4 : 1.3)),
     };
     const found = [Infinity, -Infinity];
     for (const [, ys] of lines) extremes(ys, found);
@@ -109,9 +109,9 @@
     range(model("error_range"), extremes(predicted ? predicted.data_source.data.y : [], extremes(y, [0, 0])), 0);
   }
 
-  // Sojourns closer together than a pixel are drawn as one; the background is that which is longest in its pixels.
+  // Intervals closer together than a pixel are drawn as one; the background is that which is longest in its pixels.
   function drawGraphs(pixels) {
-    const starts = column("sojourns", "start"), graphs = column("sojourns", "graph");
+    const starts = column("intervals", "start"), graphs = column("intervals", "graph");
     const names = column("graphs", "name"), colours = column("graphs", "colour");
     const gap = (time.end - time.start) / pixels, open = new Map(), lanes = [], strips = [];
     let place = Math.max(0, firstAfter(starts, time.start) - 1);
@@ -204,10 +204,10 @@
       const button = document.createElement("button"), mark = document.createElement("i");
       button.type = "button";
       button.dataset.agent = agent;
-      button.setAttribute("aria-label", `agent ${window.called(agent)}${ACCUSED.has(agent) ? ", accused" : ""}`);
+      button.setAttribute("aria-label", `agent ${window.called(agent)}${CANDIDATES.has(agent) ? ", candidates" : ""}`);
       mark.style.borderTopColor = `var(--line-${(agent - 1) % COLOURS.length})`;
       mark.style.borderTopStyle = { dotdash: "dashed" }[dash(agent)] || dash(agent);
-      button.append(mark, ACCUSED.has(agent) ? `${window.called(agent)} ✗` : window.called(agent));
+      button.append(mark, CANDIDATES.has(agent) ? `${window.called(agent)} ✗` : window.called(agent));
       button.addEventListener("click", () => {
         if (on.has(agent)) on.delete(agent);
         else on.add(agent);

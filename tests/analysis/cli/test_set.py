@@ -1,0 +1,86 @@
+"""``--set KEY=VALUE`` of the commands that take an experiment; and names that are almost those of an example."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner, Result
+
+from msg_agents.cli.main import main as agents
+from msg_analysis.cli.main import main as analysis
+from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.experiment.problems import ExperimentError
+
+
+def call(group: click.Group, *words: str) -> Result:
+    return CliRunner().invoke(group, words)
+
+
+def system_error(*changes: str) -> float:
+    words = [word for change in changes for word in ("--set", change)]
+    result = call(analysis, "predict", "line_ring", "--json", *words)
+    assert result.exit_code == 0, result.stderr
+    return float(json.loads(result.stdout)["emulated"]["system_error"])
+
+
+def test_values_of_the_experiment_are_replaced() -> None:
+    """The error is proportional to the square of the gain of the noise; the last of several values counts."""
+    assert system_error("noise.process=2") == pytest.approx(4 * system_error())
+    assert system_error("noise.process=5", "noise.process=2") == system_error("noise.process=2")
+    assert system_error("noise.process=[1, 1, 1, 1, 1]", "noise.process[3]=2") > system_error()
+    assert system_error("switching.scale=100") != system_error()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["plan", "--json"],
+        ["leaders", "--count", "1", "--json"],
+        ["spectrum", "--json"],
+        ["simulate", "--json", "--out", "twin"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_every_such_command_takes_it(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    command, *options = words
+    given = call(analysis, command, "line_ring", "--set", "name=other", "--set", "run.duration=10", *options)
+    assert given.exit_code == 0, given.stderr
+    assert json.loads(given.stdout)["experiment"] == "other"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("noise.proces=2", "line_ring.yaml --set noise.proces=2: noise.proces: unknown key"),
+        ("noise.process", "--set noise.process: expected KEY=VALUE, for example noise.process=2"),
+        ("=2", "--set =2: expected KEY=VALUE"),
+        ("noise.process=", "--set noise.process=: expected KEY=VALUE"),
+        ("noise.process[9]=2", "--set noise.process[9]: noise.process has 1.0: expected a list"),
+        ("run.dt=[1", "--set run.dt=[1: line 2, column 1"),
+    ],
+)
+@pytest.mark.parametrize(("group", "command"), [(analysis, "predict"), (agents, "run")])
+def test_refused(group: click.Group, command: str, change: str, words: str) -> None:
+    result = call(group, command, "line_ring", "--set", change)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert words in result.stderr
+
+
+def test_not_with_a_bag(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").touch()
+    result = call(analysis, "spectrum", str(tmp_path), "--set", "noise.process=2")
+    assert result.exit_code == 2
+    assert "--set: not with the bag" in result.stderr
+
+
+def test_names_of_examples_and_protocols_that_are_meant() -> None:
+    assert call(analysis, "predict", "line_rign").stderr.rstrip().endswith(": did you mean line_ring?")
+    assert call(agents, "examples", "discret").stderr.rstrip().endswith(": did you mean discrete?")
+    document = {"name": "a", "graphs": {"g": {"path": [1, 2]}}, "protocol": {"name": "metropoli"}}
+    with pytest.raises(ExperimentError) as error:
+        Experiment.parse(document)
+    assert "did you mean metropolis?" in str(error.value)
