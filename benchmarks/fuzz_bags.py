@@ -19,10 +19,10 @@ from fuzz_documents import mutate_document, mutate_text
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from msg_analysis.bags import writing
-from msg_analysis.bags.mcap_chunks import COMPRESSIONS, Storage
+from msg_analysis.bags import mcap_writing
 from msg_analysis.bags.mcap_reading import MAGIC
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.stored_file import COMPRESSIONS, Storage
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.messages import decode_string, encode_string
 from msg_analysis.twin.simulate import simulate
@@ -39,7 +39,7 @@ Record = tuple[int, bytes]  # opcode, content
 
 def make_bags(directory: Path) -> list[Path]:
     """A bag of every kind that there is, each with several chunks."""
-    writing.CHUNK_SIZE = 3000
+    mcap_writing.CHUNK_SIZE = 3000
     graphs = {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}}
     plain = {"name": "fuzz", "graphs": graphs, "switching": {"generator": [[-1, 1], [1, -1]]}}
     run = {"dt": 0.05, "duration": 6.0, "replicas": 2, "start": "zero"}

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         read_bag,
         write_report,
     )
-    from msg_analysis.common.version import __version__ as __version__
+    from msg_analysis.common.resources import __version__ as __version__
 
 __all__ = [
     "BagError",
@@ -51,9 +51,9 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        from msg_analysis.common import version
+        from msg_analysis.common.resources import __version__
 
-        return version.__version__
+        return __version__
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from msg_analysis import api

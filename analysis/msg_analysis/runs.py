@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from msg_analysis.bags.files import METADATA_FILE, first_file, starting_time
-from msg_analysis.bags.mcap_chunks import BAG_SUFFIXES
+from msg_analysis.bags.stored_file import BAG_SUFFIXES
 from msg_analysis.common.files import REPORT_FILE, RESULT_FILE, read_text
 from msg_analysis.common.text import HALF_WIDTH_95, agent_name, with_names
 from msg_analysis.errors import BagError, InputError

@@ -28,12 +28,10 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, ChunkIndex
 from mcap.summary import Summary
 
-from msg_analysis.bags.mcap_chunks import BAG_SUFFIXES, CHUNK_CRC, RECORD_LIMIT, SQLITE_SUFFIX, chunk_head
-from msg_analysis.bags.mcap_reading import McapFile
-from msg_analysis.bags.sqlite import SqliteFile
-from msg_analysis.bags.stored_file import Batch, StoredFile
+from msg_analysis.bags.mcap_reading import CHUNK_CRC, McapFile, chunk_head
+from msg_analysis.bags.stored_file import BAG_SUFFIXES, RECORD_LIMIT, SQLITE_SUFFIX, Batch, SqliteFile, StoredFile
 from msg_analysis.common.files import load_yaml, read_text
-from msg_analysis.common.version import ros_distribution
+from msg_analysis.common.resources import ros_distribution
 from msg_analysis.errors import BagError
 from msg_analysis.experiment.loading import no_bag_but
 

@@ -21,9 +21,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from msg_analysis.bags.files import bag_files, offered_profiles, stored_file
-from msg_analysis.bags.mcap_chunks import CHUNK_TIMES, INDEX_HEAD, RECORD, DamageError
-from msg_analysis.bags.mcap_reading import MAGIC, McapFile
-from msg_analysis.bags.stored_file import StoredFile
+from msg_analysis.bags.mcap_reading import CHUNK_TIMES, INDEX_HEAD, MAGIC, RECORD, McapFile
+from msg_analysis.bags.stored_file import DamageError, StoredFile
 from msg_analysis.errors import BagError
 
 # Bytes of messages held to be put in order. A bag that needs more is played out of order rather than held in memory.

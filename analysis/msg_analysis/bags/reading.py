@@ -25,18 +25,25 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from msg_analysis.bags.files import Inventory, bag_files, first_file, stored_file
-from msg_analysis.bags.mcap_chunks import RECORD, RECORD_LIMIT
-from msg_analysis.bags.mcap_reading import MAGIC
-from msg_analysis.bags.run_builder import Collector
-from msg_analysis.bags.stored_file import Batch, StoredFile
-from msg_analysis.bags.writing import RECORD_NAME, recording_pid
+from msg_analysis.bags.mcap_reading import MAGIC, RECORD
+from msg_analysis.bags.mcap_writing import RECORD_NAME
+from msg_analysis.bags.states import Collector
+from msg_analysis.bags.stored_file import RECORD_LIMIT, Batch, StoredFile
+from msg_analysis.bags.writing import recording_pid
 from msg_analysis.common.arrays import AnyArray, IntArray
 from msg_analysis.common.resources import tell
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import CdrError
-from msg_analysis.messages.messages import ActiveGraph, Progress, decode_string
-from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, PROGRESS, STRING
+from msg_analysis.messages.messages import (
+    ACTIVE_GRAPH,
+    AGENT_STATE,
+    PROGRESS,
+    STRING,
+    ActiveGraph,
+    Progress,
+    decode_string,
+)
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 

@@ -32,17 +32,9 @@ from msg_analysis.bags.files import (
     stored_file,
     write_metadata,
 )
-from msg_analysis.bags.mcap_chunks import SQLITE_SUFFIX, ZSTD_SUFFIX
-from msg_analysis.bags.mcap_writing import McapWriter
-from msg_analysis.bags.stored_file import Batch, StoredFile
-from msg_analysis.bags.writing import (
-    CHUNK_SIZE,
-    RECORD_NAME,
-    RECORDING_MARKER,
-    ROSBAG2_RECORD,
-    exists_already,
-    recording_pid,
-)
+from msg_analysis.bags.mcap_writing import CHUNK_SIZE, RECORD_NAME, ROSBAG2_RECORD, McapWriter
+from msg_analysis.bags.stored_file import SQLITE_SUFFIX, ZSTD_SUFFIX, Batch, StoredFile
+from msg_analysis.bags.writing import RECORDING_MARKER, exists_already, recording_pid
 from msg_analysis.errors import BagError
 
 LONGEST_LIST = 500  # characters of what is said of torn files

@@ -29,12 +29,12 @@ from msg_analysis.cli.options import (
     storage,
     storage_options,
 )
-from msg_analysis.common.version import __version__
+from msg_analysis.common.resources import __version__
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
-    from msg_analysis.bags.mcap_chunks import Compression
-    from msg_analysis.sweep.results import OtherSoftware
+    from msg_analysis.bags.stored_file import Compression
+    from msg_analysis.sweep.workers import OtherSoftware
 
 
 @click.group(cls=CommandGroup)
@@ -325,7 +325,7 @@ main.add_command(sweep.sweep)
 def schema(what: str) -> None:
     """Print the JSON Schema of experiment files, or of sweep files, for editors."""
     if what == "sweep":
-        from msg_analysis.sweep.sweep_file import json_schema
+        from msg_analysis.sweep.grid import json_schema
     else:
         from msg_analysis.experiment.experiment import json_schema
 

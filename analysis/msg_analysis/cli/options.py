@@ -15,7 +15,7 @@ from typing import Any
 import click
 from click.shell_completion import CompletionItem
 
-from msg_analysis.bags.mcap_chunks import (
+from msg_analysis.bags.stored_file import (
     BAG_SUFFIXES,
     COMPRESSIONS,
     DEFAULT_STORAGE,

@@ -22,7 +22,7 @@ from dataclasses import fields, replace
 from functools import cached_property
 from typing import TypeVar
 
-from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.arithmetic.update_law import all_finite
 from msg_analysis.messages.cdr import CdrError
 from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, StateFrame, decode_string, encode_string

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.common.arrays import AnyArray, IntArray
 
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"

@@ -19,8 +19,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.files import write_whole
 from msg_analysis.experiment.problems import show
 from msg_analysis.report.figures import BLACK, DARK_GREY, MODE_COLOURS, STYLE, plain, rendered, shifted
-from msg_analysis.sweep.figure_series import Picture, Place, Series
-from msg_analysis.sweep.grid import axis_name, column_words
+from msg_analysis.sweep.results import Picture, Place, Series, axis_name, column_words
 from msg_analysis.theory.prediction import LAW_NAMES
 
 FORMATS = ("svg", "png")

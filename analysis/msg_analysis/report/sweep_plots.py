@@ -30,8 +30,7 @@ from msg_analysis.common.text import measured_text, number_text
 from msg_analysis.experiment.problems import show
 from msg_analysis.report.figures import shifted, shorten
 from msg_analysis.report.plot_style import BLACK, DARK_SCALE, GREY, INK, LINES, SANS, SCALE, new_figure
-from msg_analysis.sweep.figure_series import Picture, Place, Series, value_text
-from msg_analysis.sweep.grid import axis_name, column_words, key_words
+from msg_analysis.sweep.results import Picture, Place, Series, axis_name, column_words, key_words, value_text
 from msg_analysis.theory.prediction import LAW_NAMES
 
 MOST_LINES = 8  # series of one figure; of more values, some

@@ -21,10 +21,9 @@ from msg_analysis.common.text import agent_name, counted, half_width_text, liste
 from msg_analysis.experiment.loading import amount
 from msg_analysis.report.wording import gaps
 from msg_analysis.runs import RunEntry
-from msg_analysis.sweep.figure_series import Picture, value_text
 from msg_analysis.sweep.grid import Sweep
-from msg_analysis.sweep.points import FAILED
-from msg_analysis.sweep.results import Conducted, Judgement
+from msg_analysis.sweep.points import FAILED, JobResults
+from msg_analysis.sweep.results import Picture, SweepVerdict, value_text
 from msg_analysis.sweep.results import Row as SweepRow
 
 Row = TypeVar("Row")
@@ -343,7 +342,7 @@ def _cut(name: str, width: int) -> str:
     return name if cell_len(name) <= width else f"{name[:left]}…{name[left + 1 - width :]}"
 
 
-def describe_sweep(sweep: Sweep, done: Conducted, judgement: Judgement, rows: Sequence[SweepRow]) -> dict[str, Any]:
+def describe_sweep(sweep: Sweep, done: JobResults, judgement: SweepVerdict, rows: Sequence[SweepRow]) -> dict[str, Any]:
     """The document of ``msg-analysis sweep --json``, without the names of the files; ``rows`` of ``rows_of``."""
     failed = sum(outcome.status == FAILED for outcome in done.outcomes)
     return {
@@ -355,7 +354,7 @@ def describe_sweep(sweep: Sweep, done: Conducted, judgement: Judgement, rows: Se
         "verdict": judgement.verdict,
         "done": len(rows) - failed,
         "failed": failed,
-        "kept": done.kept,
+        "kept": done.reused,
         "points": list(rows),
     }
 

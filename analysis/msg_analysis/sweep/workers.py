@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Worker pool: processes of this machine, or a Dask cluster; a worker that dies is replaced.
+"""The jobs of a sweep on workers: processes of this machine, or a Dask cluster; a worker that dies is replaced.
 
 Items are sent in batches of about half a second of work. What kills workers is tried again alone, then given up.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import dataclasses
 import logging
 import math
 import multiprocessing
@@ -20,16 +21,25 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from contextlib import closing, contextmanager, suppress
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 from msg_analysis.common.resources import SINGLE_THREAD, count_cores, one_blas_thread
 from msg_analysis.errors import InputError
-from msg_analysis.sweep.points import installed_software
+from msg_analysis.sweep.points import (
+    FAILED,
+    Job,
+    JobResults,
+    NetworkOptions,
+    Outcome,
+    evaluate,
+    installed_software,
+)
 
 if TYPE_CHECKING:
     from distributed import Client, Future
+
+    from msg_analysis.sweep.results import ResultStore
 
 
 T = TypeVar("T")
@@ -42,6 +52,7 @@ NOTICE = 0.5  # s between two checks of a worker whether the work is being ended
 # Signals that end a sweep as Ctrl-C does: that of a cluster's queue, and that of a terminal that is closed.
 ENDING = (signal.SIGTERM, signal.SIGHUP)
 _CONNECT = 10.0  # s
+NETWORK_TIMEOUT = 60.0  # s that running networks have to end in order
 # Less of what Dask does besides the work, which costs time on two cores.
 _QUIET = {
     "distributed.worker.profile.enabled": False,
@@ -52,6 +63,8 @@ _NEEDED = ("msg_analysis.theory.prediction", "msg_analysis.inference.verdict", "
 
 # What is done with an item; the second argument says whether the work is being ended.
 Function = Callable[[T, Callable[[], bool]], R]
+OtherSoftware = Literal["refuse", "redo", "keep"]
+SweepProgress = Callable[[int, int, int], None]  # outcomes available, total, how many of them failed
 
 
 class WorkersLostError(Exception):
@@ -132,9 +145,7 @@ class Workers:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._close()
 
     def _close(self) -> None:
@@ -152,28 +163,28 @@ class Workers:
         return sum(self._client.nthreads().values()) if self._scheduler else self._count
 
     def outcomes(
-        self, function: Function[T, R], items: Sequence[T], *, patience: float = 2 * NOTICE
+        self, function: Function[T, R], items: Sequence[T], *, timeout: float = 2 * NOTICE
     ) -> Generator[list[tuple[T, R | Lost]], None, None]:
         """Results of ``function`` (at the top of a module) for all items, in batches, as they are ready.
 
-        An item that kills its workers again when tried alone is ``Lost``. If interrupted, running work has ``patience``
+        An item that kills its workers again when tried alone is ``Lost``. If interrupted, running work has ``timeout``
         [s] to end. WorkersLostError: the scheduler is gone; InputError: other software on a worker.
         """
         from distributed import as_completed
 
         assert self._client is not None
         pending = deque(items)
-        suspects: deque[T] = deque()
+        suspected: deque[T] = deque()
         running: dict[Future, list[T]] = {}
         seconds = math.inf
         done = as_completed()
         try:
-            while pending or suspects or running:
+            while pending or suspected or running:
                 while pending and len(running) < QUEUED * max(self.threads, 1):
                     self._submit(function, _take(pending, seconds, self.threads), running, done)
                 alone = not running
                 if alone:
-                    self._submit(function, [suspects.popleft()], running, done)
+                    self._submit(function, [suspected.popleft()], running, done)
                 future = next(done)
                 batch = running.pop(future)
                 found = self._result(future)
@@ -185,9 +196,9 @@ class Workers:
                 elif alone:
                     yield [(batch[0], Lost("killed every worker that tried it, or used up its memory"))]
                 else:
-                    suspects += batch
+                    suspected += batch
         except BaseException as error:
-            self._stop(list(running), patience)
+            self._stop(list(running), timeout)
             if isinstance(error, OSError | asyncio.CancelledError | concurrent.futures.CancelledError):
                 raise WorkersLostError("the scheduler has gone") from error
             raise
@@ -221,14 +232,14 @@ class Workers:
             raise WorkersLostError("the scheduler has gone")
         return None  # the only worker that had the result died
 
-    def _stop(self, running: Sequence[Future], patience: float) -> None:
-        """Tell the workers to stop, and wait up to ``patience`` seconds for the running batches."""
+    def _stop(self, running: Sequence[Future], timeout: float) -> None:
+        """Tell the workers to stop, and wait up to ``timeout`` seconds for the running batches."""
         from distributed import Event, wait
 
         with _ignoring(signal.SIGINT, signal.SIGTERM), suppress(Exception):
             assert self._client is not None
             Event(self._stop_name, client=self._client).set()
-            wait(running, timeout=patience)
+            wait(running, timeout=timeout)
 
     def _compare_software(self) -> None:
         """Refuse workers with other software; those that join later refuse themselves in ``_do``."""
@@ -338,3 +349,65 @@ def _environment(changes: dict[str, str]) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+def run_jobs(
+    jobs: Sequence[Job],  # equal ones are done once
+    store: ResultStore,
+    *,
+    workers: int | None = None,  # processes here; None: one per CPU, or a single one where networks run
+    scheduler: str | None = None,  # of a Dask cluster, whose workers are used instead
+    network: NetworkOptions | None = None,  # needed where jobs run networks
+    other_software: OtherSoftware = "refuse",  # what to do with outcomes that other software made
+    retry: bool = False,  # whether failed jobs are done again
+    watch: SweepProgress = lambda _done, _total, _failed: None,
+) -> JobResults:
+    """Do all jobs that have not been done; outcomes are written to ``store`` as soon as they come.
+
+    InputError: outcomes of other software ("refuse"), or no workers. WorkersLostError: the cluster went away.
+    """
+    todo = _todo(jobs, store, other_software, retry)
+    reused = len(jobs) - sum(job.id in todo for job in jobs)
+    total = len({job.id for job in jobs})
+    failed = sum(store.outcomes[job.id].status == FAILED for job in jobs if job.id not in todo)
+    done = total - len(todo)
+    watch(done, total, failed)
+    if todo:
+        runs_networks = any(job.kind == "network" for job in todo.values())
+        if runs_networks and not scheduler:
+            workers = workers or 1
+        items = [dataclasses.replace(job, network=network) for job in todo.values()]
+        timeout = {"timeout": NETWORK_TIMEOUT} if runs_networks else {}
+        with Workers(workers, scheduler) as pool, closing(pool.outcomes(evaluate, items, **timeout)) as batches:
+            for batch in batches:
+                found = [_lost(job, result) if isinstance(result, Lost) else result for job, result in batch]
+                with deferring_interrupts():  # the outcomes that are counted are on the disk
+                    store.add(found)
+                done += len(found)
+                failed += sum(outcome.status == FAILED for outcome in found)
+                watch(done, total, failed)
+    outcomes = tuple(store.outcomes[job.id] for job in jobs)
+    return JobResults(outcomes, reused, len(store.outcomes.keys() - {job.id for job in jobs}))
+
+
+def _todo(jobs: Sequence[Job], store: ResultStore, other_software: OtherSoftware, retry: bool) -> dict[str, Job]:
+    """The jobs that have to be done, by id."""
+    todo, others = {}, {}
+    for job in jobs:
+        known = store.outcomes.get(job.id)
+        if known is None or (retry and known.status == FAILED):
+            todo[job.id] = job
+        elif known.software != installed_software() and other_software != "keep":
+            others[job.id] = known.software
+            todo[job.id] = job
+    if others and other_software == "refuse":
+        was = " and ".join(sorted(set(others.values())))
+        raise InputError(
+            f"{store.directory}: {len(others)} results were made with other software ({was}), not "
+            f"{installed_software()}: choose another --out, or use --other-software redo or keep"
+        )
+    return todo
+
+
+def _lost(job: Job, lost: Lost) -> Outcome:
+    return Outcome(job.id, FAILED, lost.reason, {}, 0.0, "", installed_software())

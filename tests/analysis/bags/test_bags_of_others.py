@@ -15,10 +15,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 
-from msg_analysis.bags.mcap_chunks import Storage
 from msg_analysis.bags.reading import read_bag, read_record
-from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.bags.salvage import salvage
+from msg_analysis.bags.stored_file import Storage
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.errors import BagError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
@@ -254,7 +254,7 @@ def test_split_without_metadata_and_with_a_lost_file(run: Run, record: Record, t
 
 def test_torn_file_that_is_compressed_as_a_whole(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Cut or flipped: what could be unpacked up to there counts."""
-    monkeypatch.setattr("msg_analysis.bags.writing.CHUNK_SIZE", 3000)
+    monkeypatch.setattr("msg_analysis.bags.mcap_writing.CHUNK_SIZE", 3000)
     write_trajectory(run, tmp_path / "bag", Storage("none"))
     whole = (tmp_path / "bag" / "bag_0.mcap").read_bytes()
     frames = [whole[start : start + 10_000] for start in range(0, len(whole), 10_000)]

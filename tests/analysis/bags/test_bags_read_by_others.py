@@ -14,9 +14,9 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
-from msg_analysis.bags.mcap_chunks import COMPRESSIONS, Compression, Storage
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.stored_file import COMPRESSIONS, Compression, Storage
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run import Run
@@ -50,7 +50,7 @@ def test_every_peer_reads_every_bag(
     run: Run, compression: Compression, split: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every message, in the order of time, with the right counts and values, in one file or in several."""
-    monkeypatch.setattr("msg_analysis.bags.writing.CHUNK_SIZE", 3000)
+    monkeypatch.setattr("msg_analysis.bags.mcap_writing.CHUNK_SIZE", 3000)
     bag = tmp_path / "bag"
     if split is not None:  # so many files
         write_trajectory(run, tmp_path / "one", Storage(compression))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from msg_analysis.bags import run_writer
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags import writing
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import simulate
 
@@ -37,7 +37,7 @@ def test_the_order_of_messages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
             values[70, 1] = np.nan
         run = dataclasses.replace(run, made=made)
     write_trajectory(run, tmp_path / "whole" / "bag")
-    monkeypatch.setattr(run_writer, "BLOCK_NUMBERS", 20)
+    monkeypatch.setattr(writing, "BLOCK_NUMBERS", 20)
     write_trajectory(run, tmp_path / "parts" / "bag")
     files = [tmp_path / name / "bag" / "bag_0.mcap" for name in ("whole", "parts")]
     assert files[0].read_bytes() == files[1].read_bytes()

@@ -20,8 +20,7 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.inference.verdict import compare
-from msg_analysis.messages.messages import ActiveGraph, AgentState, encode_string
-from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING
+from msg_analysis.messages.messages import ACTIVE_GRAPH, AGENT_STATE, STRING, ActiveGraph, AgentState, encode_string
 from msg_analysis.model.run import Run
 from msg_analysis.model.step_model import build_model
 from msg_analysis.twin.check import check

@@ -11,11 +11,18 @@ import pytest
 from mcap.writer import Writer
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.bags.salvage import salvage
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.messages.messages import ActiveGraph, AgentState, encode_string
-from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, STRING, MessageType
+from msg_analysis.messages.messages import (
+    ACTIVE_GRAPH,
+    AGENT_STATE,
+    STRING,
+    ActiveGraph,
+    AgentState,
+    MessageType,
+    encode_string,
+)
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.simulate import simulate

@@ -11,10 +11,18 @@ import pytest
 from mcap.writer import Writer
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.messages.acceptance import Refusal
-from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, encode_string
-from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, PROGRESS, STRING
+from msg_analysis.messages.messages import (
+    ACTIVE_GRAPH,
+    AGENT_STATE,
+    PROGRESS,
+    STRING,
+    ActiveGraph,
+    AgentState,
+    Progress,
+    encode_string,
+)
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import Until
 

@@ -25,14 +25,14 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from msg_analysis.bags import mcap_chunks
-from msg_analysis.bags.mcap_chunks import DamageError, locate, unpack
+from msg_analysis.bags import mcap_reading
+from msg_analysis.bags.mcap_reading import locate, unpack
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.stored_file import DamageError
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.cdr import CdrError
-from msg_analysis.messages.messages import ActiveGraph, AgentState, encode_string
-from msg_analysis.messages.schemas import AGENT_STATE, STRING
+from msg_analysis.messages.messages import AGENT_STATE, STRING, ActiveGraph, AgentState, encode_string
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 
@@ -264,7 +264,7 @@ def test_unpack() -> None:
 
 
 def test_chunks_that_claim_too_much_are_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mcap_chunks, "RECORD_LIMIT", 10**6)
+    monkeypatch.setattr(mcap_reading, "RECORD_LIMIT", 10**6)
     bomb = bytes(10**7)
     with pytest.raises(DamageError):
         unpack(_chunk(bomb, b"zstd", zstandard.ZstdCompressor().compress(bomb), size=9), zstandard.ZstdDecompressor())

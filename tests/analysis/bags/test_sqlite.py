@@ -20,8 +20,8 @@ from rosbags.highlevel import AnyReader
 
 from msg_analysis.bags.playback import Playback
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.bags.salvage import salvage
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.cli.main import main
 from msg_analysis.errors import BagError
 from msg_analysis.model.run import Run

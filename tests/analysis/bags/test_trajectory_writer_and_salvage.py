@@ -20,11 +20,10 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from rosbags.highlevel import AnyReader
 
 from msg_analysis.bags import salvage as salvage_module
-from msg_analysis.bags.mcap_chunks import Compression, Storage
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.bags.salvage import salvage, salvage_in_place
-from msg_analysis.bags.writing import BagWriter
+from msg_analysis.bags.stored_file import Compression, Storage
+from msg_analysis.bags.writing import BagWriter, write_trajectory
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.messages.messages import encode_string
 from msg_analysis.messages.topics import network_topics
@@ -120,7 +119,7 @@ def _boundaries(file: Path) -> list[int]:
 @pytest.fixture
 def recorded(tmp_path: Path, make_run: MakeRun, monkeypatch: pytest.MonkeyPatch) -> tuple[Run, Path]:
     """A run and its bag of many small chunks."""
-    monkeypatch.setattr("msg_analysis.bags.writing.CHUNK_SIZE", 2000)
+    monkeypatch.setattr("msg_analysis.bags.mcap_writing.CHUNK_SIZE", 2000)
     run = make_run()
     write_trajectory(run, tmp_path / "whole")
     return run, tmp_path / "whole" / "whole_0.mcap"

@@ -253,7 +253,7 @@ def test_storage_options_are_checked(options: list[str], tmp_path: Path) -> None
 
 def test_salvage_of_a_torn_bag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is dropped is counted, nothing is overwritten, and what comes out is compared as incomplete."""
-    monkeypatch.setattr("msg_analysis.bags.writing.CHUNK_SIZE", 20_000)
+    monkeypatch.setattr("msg_analysis.bags.mcap_writing.CHUNK_SIZE", 20_000)
     call("simulate", LINE_RING, "--duration", "50", "--seed", "3", "--out", tmp_path / "bag")
     (mcap,) = (tmp_path / "bag").glob("*.mcap")
     torn, out = tmp_path / "torn.mcap", tmp_path / "out"

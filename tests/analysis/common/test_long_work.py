@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.cli.console import SweepProgress, WorkProgress
 from msg_analysis.common.resources import tell, watched
 from msg_analysis.common.text import duration_text

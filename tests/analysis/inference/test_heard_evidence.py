@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from tests.support import line_and_ring
 from tests.support.watched_run import messages_of, watch, watched, whole_sums
 
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import online_errors, online_evidence
 from msg_analysis.inference.online_errors import LiveEstimate

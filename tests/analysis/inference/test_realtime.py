@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 from tests.support.p_values import kolmogorov_smirnov
 
-from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
+from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK, Stream, normals
 from msg_analysis.common.text import percent
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment

@@ -13,7 +13,7 @@ import pytest
 import scipy.linalg
 from processors import another_processor
 
-from msg_analysis.arithmetic.matrix_exponential import exponential, reproducible_product
+from msg_analysis.arithmetic.reproducible import exponential, reproducible_product
 
 
 def laplacian(agents: int, scale: float, seed: int) -> np.ndarray:
@@ -52,7 +52,7 @@ CODE = """
 import hashlib, sys
 sys.path.insert(0, {here!r})
 from test_matrix_exponential import laplacian
-from msg_analysis.arithmetic.matrix_exponential import exponential
+from msg_analysis.arithmetic.reproducible import exponential
 print(hashlib.sha256(b"".join(exponential(-laplacian(m, 1.0, m)).tobytes() for m in (3, 9, 64))).hexdigest())
 """
 

@@ -13,7 +13,7 @@ from euler import Euler, EulerSteps, experiment
 from pydantic import Field
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.errors import InputError
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.run_record import RunRecord

@@ -16,7 +16,7 @@ import yaml
 from euler import DIRECTED, Euler, EulerSteps, experiment
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from msg_analysis.arithmetic.random_streams import Stream, generator, link_number, normals
+from msg_analysis.arithmetic.reproducible import Stream, generator, link_number, normals
 
 
 def defined(seed: int, stream: int, agent: int, block: int) -> np.random.Generator:

@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.arithmetic.reproducible import StepClock
 
 # Lengths with few decimals, as people write them, and with as many as a float has.
 lengths = st.one_of(st.sampled_from([0.05, 0.1, 1.0, 1e-7, 0.3, 0.007, 1 / 3]), st.floats(1e-6, 100.0))

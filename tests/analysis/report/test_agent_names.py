@@ -11,7 +11,8 @@ from click.testing import CliRunner
 from msg_analysis.api import Experiment, Run, write_report
 from msg_analysis.cli.main import main
 from msg_analysis.common.text import agent_name, agent_text, with_names
-from msg_analysis.sweep.grid import axis_name, column_words, load_sweep
+from msg_analysis.sweep.grid import load_sweep
+from msg_analysis.sweep.results import axis_name, column_words
 
 NAMES = ["Ulm", "Bonn", "Kiel"]
 

@@ -12,7 +12,8 @@ from browser import CUT, FAINT, Tab
 
 from msg_analysis.report.figures import shifted
 from msg_analysis.report.list_pages import write_sweep_page
-from msg_analysis.sweep.grid import axis_name, column_words, load_sweep
+from msg_analysis.sweep.grid import load_sweep
+from msg_analysis.sweep.results import axis_name, column_words
 
 EXPERIMENT = {
     "name": "made_up",

@@ -13,7 +13,7 @@ from msg_analysis.sweep.points import source_digest, source_files
 PACKAGE = Path(msg_analysis.__file__).parent
 JOBS = """
 import sys
-from msg_analysis.sweep.jobs import evaluate, network_run
+from msg_analysis.sweep.points import evaluate
 from msg_analysis.theory import prediction
 from msg_analysis.inference.verdict import compare
 from msg_analysis.twin import simulate

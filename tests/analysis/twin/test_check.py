@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import FloatArray, IntArray, in_file
 from msg_analysis.experiment.experiment import Experiment

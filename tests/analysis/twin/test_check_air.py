@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run import Run
 from msg_analysis.twin.check import check

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK
+from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK
 from msg_analysis.arithmetic.update_law import from_payload, to_payload
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.agent_law import agent_law

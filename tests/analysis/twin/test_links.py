@@ -11,7 +11,7 @@ from links_by_hand import assert_by_hand
 
 from msg_analysis.arithmetic import update_law
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.agent_law import agent_law
 from msg_analysis.model.reception import LOST

@@ -15,7 +15,7 @@ import yaml
 from processors import another_processor
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run_record import RunRecord
@@ -53,7 +53,7 @@ CASES: dict[str, dict[str, Any]] = {
 WRITE = """
 import sys
 from pathlib import Path
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import simulate
 for file in map(Path, sys.argv[1:]):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, generator
+from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK, Stream, generator
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.agent_law import agent_law
 from msg_analysis.model.graph_path import mode_path

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import msg_analysis.messages
-from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, ESTIMATE, PROGRESS, STRING, MessageType
+from msg_analysis.messages.messages import ACTIVE_GRAPH, AGENT_STATE, ESTIMATE, PROGRESS, STRING, MessageType
 
 DEFINITIONS = Path(msg_analysis.messages.__file__).parent / "definitions"
 INTERFACES = Path(__file__).parents[3] / "ros_ws" / "src" / "msg_agents_interfaces"

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from msg_analysis.messages.cdr import CdrError, decode_batch, encode_batch
-from msg_analysis.messages.schemas import STATE_BATCH
+from msg_analysis.messages.messages import STATE_BATCH
 
 RUN = bytes(range(16))
 
