@@ -4,8 +4,8 @@
 """Numbers that are the same to the last bit on every machine: times of steps, random numbers, the matrix exponential.
 
 Random streams need no communication: the key of a counter-based Philox generator comes from the seed, its counter from
-the stream, the agent and the block of steps. So any process can compute any agent's noise at any step, a restarted agent
-draws the same numbers again, and one more agent does not change the streams of the others.
+stream, agent and block of steps. So any process can compute any agent's noise at any step, a restarted agent draws the
+same numbers again, and one more agent does not change the streams of the others.
 """
 
 from __future__ import annotations

@@ -22,23 +22,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
+from mcap.records import Attachment, AttachmentIndex, Channel, McapRecord, Metadata, MetadataIndex, Schema
 
 from msg_analysis.bags.files import ChannelCount, FileCount, bag_information, dump
 from msg_analysis.bags.mcap_reading import MAGIC
@@ -89,7 +76,7 @@ class McapWriter:
         self._chunk: list[bytes] = []  # records of the chunk in progress, in parts
         self._size = 0  # of the chunk in progress
         self._index: dict[int, bytearray] = defaultdict(bytearray)  # by channel: an ENTRY for each message
-        stream.write(MAGIC + _encoded(Header(profile=profile, library=library)))
+        stream.write(MAGIC + _encoded(records.Header(profile=profile, library=library)))
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
         """Append a metadata record, outside the chunks."""
@@ -100,17 +87,9 @@ class McapWriter:
     def add_attachment(self, attachment: Attachment) -> None:
         """Append an attachment, outside the chunks."""
         record = _encoded(attachment)
-        self._attachment_indexes.append(
-            AttachmentIndex(
-                offset=self._stream.tell(),
-                length=len(record),
-                log_time=attachment.log_time,
-                create_time=attachment.create_time,
-                data_size=len(attachment.data),
-                name=attachment.name,
-                media_type=attachment.media_type,
-            )
-        )
+        a, place = attachment, self._stream.tell()
+        index = (place, len(record), a.log_time, a.create_time, len(a.data), a.name, a.media_type)
+        self._attachment_indexes.append(AttachmentIndex(*index))
         self._stream.write(record)
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
@@ -120,20 +99,16 @@ class McapWriter:
 
     def register_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
         """Register a channel; its number."""
-        self._channels.append(
-            Channel(
-                id=len(self._channels) + 1, topic=topic, message_encoding=encoding, schema_id=schema, metadata=metadata
-            )
-        )
+        self._channels.append(Channel(len(self._channels) + 1, topic, encoding, metadata, schema))
         return self._register(self._channels)
 
-    def _register(self, records: Sequence[McapRecord]) -> int:
-        record = _encoded(records[-1])
+    def _register(self, so_far: Sequence[McapRecord]) -> int:
+        record = _encoded(so_far[-1])
         self._chunk.append(record)
         self._size += len(record)
         if self._size > self._chunk_size:
             self._finish_chunk()
-        return len(records)
+        return len(so_far)
 
     def add_message(
         self, channel: int, time_ns: int, data: bytes, sequence: int, published_ns: int | None = None
@@ -168,15 +143,15 @@ class McapWriter:
         """Append messages to one chunk, and finish that when it is full."""
         place = np.cumsum(size + MESSAGE.size) - size  # of their bytes among the records
         total = int(place[-1] + size[-1])
-        records = np.empty(total, dtype=np.uint8)
+        written = np.empty(total, dtype=np.uint8)
         heads = np.empty(len(head), _MESSAGE_RECORD)
         heads["opcode"], heads["length"], heads["head"] = Opcode.MESSAGE, size + MESSAGE_HEAD.itemsize, head
-        scatter(records, place - MESSAGE.size, heads.view(f"V{MESSAGE.size}"))
+        scatter(written, place - MESSAGE.size, heads.view(f"V{MESSAGE.size}"))
         for length in np.unique(size).tolist():
             of_it = np.flatnonzero(size == length)
             if length:
-                scatter(records, place[of_it], gather(data, start[of_it], length))
-        self._chunk.append(records.tobytes())
+                scatter(written, place[of_it], gather(data, start[of_it], length))
+        self._chunk.append(written.tobytes())
         order = np.argsort(head["channel"], kind="stable")
         entries = np.column_stack((head["log_time"], (place - MESSAGE.size + self._size).astype(np.uint64)))
         flat = memoryview(entries[order].astype("<u8").tobytes())
@@ -192,17 +167,17 @@ class McapWriter:
         """Write the chunk in progress; one without messages stays in progress."""
         if not self._index:
             return
-        records, entries = b"".join(self._chunk), dict(self._index)
+        content, entries = b"".join(self._chunk), dict(self._index)
         self._chunk.clear()
         self._index.clear()
         self._size = 0
-        compressed = _compressed(records, self._compression)
+        compressed = _compressed(content, self._compression)
         name = COMPRESSION_NAMES[self._compression].encode()
         times = np.frombuffer(b"".join(entries.values()), "<u8")[::2]
         start, end = int(times.min()), int(times.max())
         tail = struct.pack(f"<I{len(name)}sQ", len(name), name, len(compressed))
         length = CHUNK.size - 9 + len(tail) + len(compressed)
-        head = CHUNK.pack(Opcode.CHUNK, length, start, end, len(records), zlib.crc32(records)) + tail
+        head = CHUNK.pack(Opcode.CHUNK, length, start, end, len(content), zlib.crc32(content)) + tail
         place = self._stream.tell()
         after = place + len(head) + len(compressed)
         indexes, offsets = bytearray(), {}
@@ -213,18 +188,10 @@ class McapWriter:
             indexes += index
         for part in (head, compressed, indexes):
             self._stream.write(part)
-        chunk_index = ChunkIndex(
-            message_start_time=start,
-            message_end_time=end,
-            chunk_start_offset=place,
-            chunk_length=after - place,
-            message_index_offsets=offsets,
-            message_index_length=len(indexes),
-            compression=name.decode(),
-            compressed_size=len(compressed),
-            uncompressed_size=len(records),
-        )
-        self._chunk_indexes.write(_encoded(chunk_index))
+        sizes = {"compressed_size": len(compressed), "uncompressed_size": len(content), "chunk_length": after - place}
+        places = {"chunk_start_offset": place, "message_index_offsets": offsets, "message_index_length": len(indexes)}
+        times_and_name = {"message_start_time": start, "message_end_time": end, "compression": name.decode()}
+        self._chunk_indexes.write(_encoded(records.ChunkIndex(**sizes, **places, **times_and_name)))
         self._chunks += 1
         self._first = start if self._first is None else min(self._first, start)
         self._last = max(self._last, end)
@@ -237,7 +204,7 @@ class McapWriter:
     def finish(self) -> None:
         """Write the summary; the stream stays open."""
         self._finish_chunk()
-        self._stream.write(_encoded(DataEnd(0)))
+        self._stream.write(_encoded(records.DataEnd(0)))
         start, checksum = self._stream.tell(), 0
         offsets = b""
         for opcode, parts in self._groups():
@@ -246,11 +213,11 @@ class McapWriter:
                 checksum = zlib.crc32(part, checksum)
                 self._stream.write(part)
             length = self._stream.tell() - begin
-            offsets += _encoded(SummaryOffset(group_opcode=opcode, group_start=begin, group_length=length))
+            offsets += _encoded(records.SummaryOffset(group_opcode=opcode, group_start=begin, group_length=length))
         self._chunk_indexes.close()
         offset_start = self._stream.tell()
         checksum = zlib.crc32(FOOTER.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(offsets, checksum))
-        footer = Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=checksum)
+        footer = records.Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=checksum)
         self._stream.write(offsets + _encoded(footer) + MAGIC)
 
     def _groups(self) -> Iterator[tuple[Opcode, Iterable[bytes]]]:
@@ -260,24 +227,30 @@ class McapWriter:
             (Opcode.CHANNEL, self._channels),
             (Opcode.STATISTICS, [self._statistics()]),
         ]
-        for opcode, records in groups:
-            yield opcode, map(_encoded, records)
+        for opcode, group in groups:
+            yield opcode, map(_encoded, group)
         self._chunk_indexes.seek(0)
         yield Opcode.CHUNK_INDEX, iter(lambda: self._chunk_indexes.read(2**20), b"")
         yield Opcode.ATTACHMENT_INDEX, map(_encoded, self._attachment_indexes)
         yield Opcode.METADATA_INDEX, map(_encoded, self._metadata_indexes)
 
-    def _statistics(self) -> Statistics:
-        return Statistics(
-            attachment_count=len(self._attachment_indexes),
-            channel_count=len(self._channels),
-            channel_message_counts=self._counts,
+    def _statistics(self) -> records.Statistics:
+        counts = {
+            name: len(of)
+            for name, of in (
+                ("attachment_count", self._attachment_indexes),
+                ("channel_count", self._channels),
+                ("metadata_count", self._metadata_indexes),
+                ("schema_count", self._schemas),
+            )
+        }
+        messages = {"channel_message_counts": self._counts, "message_count": sum(self._counts.values())}
+        return records.Statistics(
+            **counts,
+            **messages,
             chunk_count=self._chunks,
-            message_count=sum(self._counts.values()),
-            metadata_count=len(self._metadata_indexes),
             message_start_time=self._first or 0,
             message_end_time=self._last,
-            schema_count=len(self._schemas),
         )
 
 

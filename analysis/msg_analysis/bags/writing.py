@@ -18,7 +18,6 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import numpy as np
@@ -260,9 +259,7 @@ class BagWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
         self.close(complete=error is None)
 
 
@@ -296,9 +293,8 @@ def write_trajectory(trajectory: Run, directory: str | Path, storage: Storage = 
     record = trajectory.record.to_json()
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{directory.name}.", dir=directory.parent) as workshop:
-            # It has its final name already: the name of its file derives from it.
-            unfinished = Path(workshop) / directory.name
+        with tempfile.TemporaryDirectory(prefix=f".{directory.name}.", dir=directory.parent) as parent:
+            unfinished = Path(parent) / directory.name  # its final name: that of its file derives from it
             noisy = trajectory.published is not None
             topics = network_topics(trajectory.record.experiment.agents, truth=noisy)
             with BagWriter(unfinished, topics, record=record, storage=storage) as bag:

@@ -26,15 +26,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 from msg_analysis.common.resources import SINGLE_THREAD, count_cores, one_blas_thread
 from msg_analysis.errors import InputError
-from msg_analysis.sweep.points import (
-    FAILED,
-    Job,
-    JobResults,
-    NetworkOptions,
-    Outcome,
-    evaluate,
-    installed_software,
-)
+from msg_analysis.sweep.points import FAILED, Job, JobResults, NetworkOptions, Outcome, evaluate, installed_software
 
 if TYPE_CHECKING:
     from distributed import Client, Future
