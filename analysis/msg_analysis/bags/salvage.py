@@ -58,7 +58,7 @@ class SalvageReport:
     def __add__(self, other: SalvageReport) -> SalvageReport:
         """Of two files together."""
         sums: list[Any] = [mine + its for mine, its in zip(astuple(self)[:-1], astuple(other)[:-1], strict=True)]
-        return SalvageReport(*sums, _joined(self.torn, other.torn))
+        return SalvageReport(*[*sums, _joined(self.torn, other.torn)])
 
 
 def _joined(first: str | None, second: str | None) -> str | None:
