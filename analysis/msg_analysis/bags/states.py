@@ -53,9 +53,20 @@ class States:
         found = self.head["run"]
         return np.asarray((found[:, 0] == run[0]) & (found[:, 1] == run[1]))
 
-    def column(self, name: str) -> IntArray:
-        """(messages,) ``agent`` (from 1), ``mode`` (from 1; 0 at step 0) or ``heard_count``, as sent."""
-        return np.asarray(self.head[name].astype(np.int64))
+    @property
+    def agent(self) -> IntArray:
+        """(messages,) as sent, from 1."""
+        return np.asarray(self.head["agent"].astype(np.int64))
+
+    @property
+    def mode(self) -> IntArray:
+        """(messages,) as sent, from 1; 0 at step 0."""
+        return np.asarray(self.head["mode"].astype(np.int64))
+
+    @property
+    def heard_count(self) -> IntArray:
+        """(messages,) length of ``heard``."""
+        return np.asarray(self.head["heard_count"].astype(np.int64))
 
     @property
     def step(self) -> IntArray:
@@ -70,7 +81,7 @@ class States:
     def heard(self, most: int) -> AnyArray:
         """(messages, most) the first entries of ``heard``, uint64; 0 beyond its end."""
         out = np.zeros((len(self), most), np.uint64)
-        length = np.minimum(self.column("heard_count"), most)
+        length = np.minimum(self.heard_count, most)
         for size in np.unique(length[length > 0]).tolist():
             alike = length == size
             values = gather(self.data, self.start[alike] + STATE_HEAD.itemsize, 8 * size).view("<u8")
@@ -81,12 +92,12 @@ class States:
         """(messages, width) of states that all have this length."""
         if not width:
             return np.empty((len(self), 0))
-        values = gather(self.data, self.start + STATE_SIZE + 8 * self.column("heard_count"), 8 * width).view("<f8")
+        values = gather(self.data, self.start + STATE_SIZE + 8 * self.heard_count, 8 * width).view("<f8")
         return np.asarray(values.reshape(len(self), width), dtype=np.float64)
 
     def alone(self) -> States:
         """The same with bytes of their own, so that those of the batch can be freed."""
-        size = STATE_SIZE + 8 * (self.column("heard_count") + self.replicas)
+        size = STATE_SIZE + 8 * (self.heard_count + self.replicas)
         ranges = zip(self.start.tolist(), (self.start + size).tolist(), strict=True)
         data = b"".join([self.data[first:end] for first, end in ranges])
         return States(data, np.cumsum(size) - size, self.head, self.replicas, self.position)
@@ -291,7 +302,7 @@ class Collected:
 
     def _add(self, states: States) -> None:
         states, values = self._good(states)
-        cell = states.step * self._shape[1] + states.column("agent") - 1
+        cell = states.step * self._shape[1] + states.agent - 1
         place = states.position + 1
         before = self._position[cell]
         if not before.any():
@@ -325,9 +336,9 @@ class Collected:
         finite = np.isfinite(values)
         good = np.ones(len(states), dtype=np.bool_)
         for reason, bad in (
-            (Refusal.UNKNOWN_AGENT, (states.column("agent") < 1) | (states.column("agent") > self._shape[1])),
+            (Refusal.UNKNOWN_AGENT, (states.agent < 1) | (states.agent > self._shape[1])),
             (Refusal.OUT_OF_RANGE, states.step >= self._shape[0]),
-            (Refusal.UNKNOWN_MODE, states.column("mode") > self._graphs),
+            (Refusal.UNKNOWN_MODE, states.mode > self._graphs),
             (Refusal.NOT_FINITE, _NEVER if finite.all() else ~finite.all(axis=1)),
             (Refusal.BEFORE_START, states.stamp < 0 if self._realtime else _NEVER),
         ):
@@ -336,22 +347,22 @@ class Collected:
                 good &= ~bad
         if not good.all():
             states, values = states[good], values[good]
-        if self._lossy or states.column("heard_count").any():
-            heard, count = states.heard(self._links.most), states.column("heard_count")
-            fits = self._links.fit(states.step, states.column("mode"), states.column("agent") - 1, heard, count)
+        if self._lossy or states.heard_count.any():
+            heard, count = states.heard(self._links.most), states.heard_count
+            fits = self._links.fit(states.step, states.mode, states.agent - 1, heard, count)
             self.refused[Refusal.BAD_HEARD] += int((~fits).sum())
             states, values = states[fits], values[fits]
         return states, values
 
     def _write(self, cell: IntArray, states: States, values: FloatArray) -> None:
         self._states[cell] = values
-        self._modes[cell] = states.column("mode")
+        self._modes[cell] = states.mode
         if not self._lossy:
             return
         heard = states.heard(self._links.most)
-        self._listed[cell] = states.column("heard_count") > 0
+        self._listed[cell] = states.heard_count > 0
         if self._steps_used:
-            listed = np.arange(self._links.most) < states.column("heard_count")[:, None]
+            listed = np.arange(self._links.most) < states.heard_count[:, None]
             self._used[cell] = np.where(listed & (heard != LOST), heard.astype(np.int64) + 1, 0)
         if self._realtime:
             self._made[cell] = states.stamp + 1
@@ -360,7 +371,7 @@ class Collected:
 
     def _differ(self, cell: IntArray, states: States, values: FloatArray) -> BoolArray:
         """(copies,) whether these copies differ from the first ones, which are in their places."""
-        differs = (values != self._states[cell]).any(axis=1) | (states.column("mode") != self._modes[cell])
+        differs = (values != self._states[cell]).any(axis=1) | (states.mode != self._modes[cell])
         if self._lossy:
             differs |= (states.heard(self._links.most) != self._heard(cell)).any(axis=1)
         if self._realtime:

@@ -29,11 +29,8 @@ class Qos:
 
     def __str__(self) -> str:
         depth = "keep-all" if self.depth is None else f"keep-last {self.depth}"
-        reliability, durability = (
-            "reliable" if self.reliable else "best-effort",
-            "latched" if self.latched else "volatile",
-        )
-        return f"{reliability}, {depth}, {durability}"
+        durability = "latched" if self.latched else "volatile"
+        return f"{'reliable' if self.reliable else 'best-effort'}, {depth}, {durability}"
 
     def offered(self) -> list[dict[str, Any]]:
         """The one profile that the publishers offer, as rosbag2 writes it."""
@@ -109,22 +106,8 @@ MARKERS = Topic("markers", MessageType("visualization_msgs", "MarkerArray"), NEW
 DIAGNOSTICS = Topic("/diagnostics", MessageType("diagnostic_msgs", "DiagnosticArray"), RECENT, "every process", "")
 CLOCK = Topic("/clock", MessageType("rosgraph_msgs", "Clock"), RECENT, "player", "nodes with use_sim_time")
 TOPICS = (
-    EXPERIMENT,
-    GRAPH,
-    STATE,
-    TRUTH,
-    STATES,
-    TRUTHS,
-    PROGRESS,
-    RESEND,
-    EPOCH,
-    END,
-    STOP,
-    LEAVE,
-    ESTIMATE,
-    MARKERS,
-    DIAGNOSTICS,
-    CLOCK,
+    *(EXPERIMENT, GRAPH, STATE, TRUTH, STATES, TRUTHS, PROGRESS, RESEND, EPOCH, END, STOP, LEAVE),
+    *(ESTIMATE, MARKERS, DIAGNOSTICS, CLOCK),
 )
 
 

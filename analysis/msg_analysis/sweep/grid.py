@@ -107,7 +107,7 @@ def _precision(value: str) -> str:
         until = Until.parse(value)
     except InputError as error:
         raise expected("a precision such as 5%") from error
-    if until.decided:  # the tests of a sweep are judged together
+    if until.decided:  # the runs of a sweep are tested together
         raise expected("a precision such as 5%")
     return str(until)
 
@@ -293,18 +293,16 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
         raise ExperimentError(str(path), found) from error
     directory = path.parent
     base: Any = spec.experiment
+    lines = []
     if isinstance(base, str):
         file = find(base, directory)
         directory = file.parent
         base = read_yaml(file)
         if not isinstance(base, Mapping):
-            raise ExperimentError(
-                str(path), [problem("experiment", show(base), "expected a file of keys", "correct it")]
-            )
-    lines = _spec_problems(spec)
-    if lines:
+            lines = [problem("experiment", show(base), "expected a file of keys", "correct it")]
+    if lines := lines or _spec_problems(spec):
         raise ExperimentError(str(path), lines)
-    return _plan(path, spec, base, directory, checked)
+    return _grid(path, spec, base, directory, checked)
 
 
 def _spec_problems(spec: SweepSpec) -> list[str]:
@@ -330,14 +328,10 @@ def _spec_problems(spec: SweepSpec) -> list[str]:
     return found
 
 
-def _combinations(spec: SweepSpec) -> Iterator[dict[str, Any]]:
-    joined = itertools.product(*spec.over.values()) if spec.combine == "grid" else zip(*spec.over.values(), strict=True)
-    for values in joined:
-        yield dict(zip(spec.over, values, strict=True))
-
-
-def _plan(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
-    combinations = list(_combinations(spec))
+def _grid(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
+    axes = spec.over.values()
+    joined = itertools.product(*axes) if spec.combine == "grid" else zip(*axes, strict=True)
+    combinations = [dict(zip(spec.over, values, strict=True)) for values in joined]
     wrong: dict[str, list[int]] = {}  # line: indices of the combinations that have it
     points: list[Point] = []
     name, named = "", set()
@@ -384,19 +378,15 @@ def own_seed(seed: int, values: Mapping[str, Any], repetition: int) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big")
 
 
-def label(values: Mapping[str, Any]) -> str:
-    """A point in words: the swept keys and their values."""
-    return ", ".join(f"{key} = {show(value)}" for key, value in values.items())
-
-
 def _grouped(wrong: Mapping[str, Sequence[int]], combinations: Sequence[Mapping[str, Any]]) -> list[str]:
     """Each problem once, with the points that have it."""
     lines = []
     for line, numbers in wrong.items():
-        if len(numbers) == len(combinations) > 1:
-            lines.append(f"every point: {line}")
-            continue
-        named = "; ".join(f"point {number + 1} ({label(combinations[number])})" for number in numbers[:_NAMED])
+        named = []
+        for number in numbers[:_NAMED]:
+            values = ", ".join(f"{key} = {show(value)}" for key, value in combinations[number].items())
+            named.append(f"point {number + 1} ({values})")
         more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
-        lines.append(f"{named}{more}: {line}")
+        every = len(numbers) == len(combinations) > 1
+        lines.append(f"every point: {line}" if every else f"{'; '.join(named)}{more}: {line}")
     return lines

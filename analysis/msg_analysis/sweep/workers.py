@@ -20,8 +20,8 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 from msg_analysis.common.resources import SINGLE_THREAD, count_cores, one_blas_thread
@@ -79,9 +79,15 @@ def warm_up() -> None:
         return
     from multiprocessing import forkserver
 
-    with _environment(SINGLE_THREAD), _ignoring(signal.SIGINT):
+    previous = {name: os.environ.get(name) for name in SINGLE_THREAD}
+    os.environ.update(SINGLE_THREAD)
+    with _ignoring(signal.SIGINT):
         multiprocessing.get_context("forkserver").set_forkserver_preload(["distributed", *_NEEDED])
         forkserver.ensure_running()
+    for name, value in previous.items():
+        del os.environ[name]
+        if value is not None:
+            os.environ[name] = value
 
 
 class Workers:
@@ -236,17 +242,15 @@ class Workers:
     def _compare_software(self) -> None:
         """Refuse workers with other software; those that join later refuse themselves in ``_do``."""
         assert self._client is not None
+        where, own = f"--scheduler {self._scheduler}", installed_software()
         try:
             found = self._client.run(installed_software)
         except ModuleNotFoundError as error:
-            raise InputError(
-                f"--scheduler {self._scheduler}: {error}: install the same software on its workers"
-            ) from error
-        for worker, software in found.items():
-            if software != installed_software():
+            raise InputError(f"{where}: {error}: install the same software on its workers") from error
+        for worker, other in found.items():
+            if other != own:
                 raise InputError(
-                    f"--scheduler {self._scheduler}: worker {worker} has {software}: expected "
-                    f"{installed_software()}: install the same software there"
+                    f"{where}: worker {worker} has {other}: expected {own}: install the same software there"
                 )
 
 
@@ -297,50 +301,33 @@ class _Stopping:
 
 
 @contextmanager
-def _ignoring(*numbers: signal.Signals) -> Iterator[None]:
-    """Ignore signals for a while, if this is the main thread; processes started meanwhile ignore them for good."""
+def _handling(handler: Any, numbers: Iterable[signal.Signals]) -> Iterator[None]:
+    """Another handler of signals for a while, if this is the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
+    previous = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        for number, former in previous.items():
+            signal.signal(number, former)
+
+
+def _ignoring(*numbers: signal.Signals) -> AbstractContextManager[None]:
+    """Ignore signals for a while; processes started meanwhile ignore them for good."""
+    return _handling(signal.SIG_IGN, numbers)
 
 
 @contextmanager
 def deferring_interrupts() -> Iterator[None]:
     """Postpone signals that end the program until the block is done; then the first one is raised."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     received: list[int] = []
     numbers = [signal.SIGINT, *(number for number in ENDING if callable(signal.getsignal(number)))]
-    previous = {number: signal.signal(number, lambda number, _: received.append(number)) for number in numbers}
-    try:
+    with _handling(lambda number, _: received.append(number), numbers):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
     if received:
         signal.raise_signal(received[0])
-
-
-@contextmanager
-def _environment(changes: dict[str, str]) -> Iterator[None]:
-    """Other values of environment variables for a while."""
-    previous = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, value in previous.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def run_jobs(
