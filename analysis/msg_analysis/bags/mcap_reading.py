@@ -184,7 +184,7 @@ class McapFile(StoredFile):
             yield opcode, content, (np.array([0]), np.array([length]))
 
     def note(self, opcode: int, content: bytes) -> None:
-        """Keep the content of a record that is not a message; DamageError where it does not fit its type.
+        """Take the content of a record that is not a message; DamageError where it does not fit its type.
 
         BagError where there are too many channels.
         """

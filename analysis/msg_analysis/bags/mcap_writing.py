@@ -44,7 +44,7 @@ ENTRY = struct.Struct("<QQ")  # of an index: log time, place among the records o
 MESSAGE_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of the entries; then the entries
 CHUNK = struct.Struct("<BQQQQI")  # opcode, length, first and last time, size and checksum of the records
 FOOTER = struct.Struct("<BQQQ")  # what of it the checksum of the summary covers
-INDEXES_IN_MEMORY = 2**24  # bytes of the indexes of chunks; what is beyond is kept in a temporary file
+INDEXES_IN_MEMORY = 2**24  # bytes of the indexes of chunks; what is beyond is in a temporary file
 ZSTD_LEVEL = -1  # noisy states: 3 % larger than with zstd's own level, 3, in a third of the time
 COMPRESSION_NAMES: dict[Compression, str] = {"none": "", "zstd": "zstd", "lz4": "lz4"}
 

@@ -47,7 +47,7 @@ _Message = tuple[str, bytes, int, int | None]
 class BagWriter:
     """A bag being written: its directory, new or empty, has ``.recording`` (locked) and no metadata.yaml.
 
-    The run record (JSON) is kept in every file. A full file is closed, and on the disk, when all topics have passed its
+    The run record (JSON) is in every file. A full file is closed, and on the disk, when all topics have passed its
     end. BagError, here and in the methods: cannot be written; what was written before stays readable.
     """
 
@@ -97,7 +97,7 @@ class BagWriter:
         """Append a message (CDR with encapsulation header) to a topic, by absolute name, at a simulated time [ns].
 
         Files that begin later repeat it if the topic is latched, up to the time ``until`` [ns] (None: always). A split
-        bag keeps a latched message that is ahead of its time until then.
+        bag holds a latched message that is ahead of its time until then.
         """
         if topic not in self._sequences or self._closed:
             raise self._refused("is closed" if self._closed else f"has no topic {topic}")

@@ -23,9 +23,9 @@ _NUMBER = "<i>"
 class Qos:
     """Quality of service of a publisher or a subscription."""
 
-    depth: int | None = None  # messages kept for slow or late readers; None: all
+    depth: int | None = None  # messages stored for slow or late readers; None: all
     reliable: bool = True
-    latched: bool = False  # transient-local: late readers get the kept messages
+    latched: bool = False  # transient-local: late readers get the stored messages
 
     def __str__(self) -> str:
         depth = "keep-all" if self.depth is None else f"keep-last {self.depth}"
@@ -59,7 +59,7 @@ NEWEST = Qos(1, latched=True)
 RECENT = Qos(10)
 PASSIVE, PASSIVE_NEWEST = Qos(5000, reliable=False), Qos(1, reliable=False)
 """Of readers that no writer waits for: they miss messages if they are too slow. PASSIVE_NEWEST: what such a reader has
-not read yet is replaced, and nothing is kept for it."""
+not read yet is replaced, and nothing is stored for it."""
 
 
 @dataclass(frozen=True, slots=True)

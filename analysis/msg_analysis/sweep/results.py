@@ -114,7 +114,7 @@ class ResultStore:
         return cls(directory, outcomes, damaged, descriptor)
 
     def add(self, outcomes: Iterable[Outcome]) -> None:
-        """Keep outcomes: when this returns, they are on the disk."""
+        """Add outcomes: when this returns, they are on the disk."""
         lines = b""
         for outcome in outcomes:
             self.outcomes[outcome.id] = outcome
