@@ -82,18 +82,14 @@ class Network:
     def curves(self, rates: tuple[FloatArray, FloatArray, FloatArray], *quantities: str) -> list[Curve]:
         """All curves of some quantities along a path of (epsilon, r12, r21), each (points,)."""
         points = list(zip(*rates, strict=True))
-        agents = range(self.base.agents)
-        found: list[Curve] = []
+        found: dict[tuple[str, int | None], FloatArray] = {}
         if {SYSTEM, NODE} & set(quantities):
             values = np.array([self.certainties(*point) for point in points])
-            if SYSTEM in quantities:
-                found.append(Curve(self.name, SYSTEM, None, *rates, values[:, 0]))
-            if NODE in quantities:
-                found += [Curve(self.name, NODE, a, *rates, values[:, a + 1]) for a in agents]
+            found |= {(SYSTEM, None): values[:, 0]} | {(NODE, a): values[:, a + 1] for a in range(self.base.agents)}
         if CENTRALITY in quantities:
             values = np.array([self.centralities(*point) for point in points])
-            found += [Curve(self.name, CENTRALITY, a, *rates, values[:, a]) for a in agents]
-        return found
+            found |= {(CENTRALITY, a): values[:, a] for a in range(self.base.agents)}
+        return [Curve(self.name, *key, *rates, value) for key, value in found.items() if key[0] in quantities]
 
 
 def _edges(pairs: str) -> dict[str, Any]:
@@ -145,11 +141,6 @@ class Example:
     def networks(self) -> dict[str, tuple[Graph, ...]]:
         """Graphs by name of the network."""
         return {name: NETWORKS[name].base.graph_list for name in dict.fromkeys(curve.network for curve in self.curves)}
-
-    @property
-    def reconstructed(self) -> bool:
-        """Whether its graphs are reconstructions."""
-        return any("reconstruct" in line for line in self.remarks)
 
     def select(self, network: str, quantity: str) -> list[Curve]:
         """The curves of one network and one quantity."""

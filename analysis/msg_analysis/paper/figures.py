@@ -25,19 +25,8 @@ from msg_analysis.experiment.graphs import Graph
 from msg_analysis.inference.statistics import holm
 from msg_analysis.paper import examples
 from msg_analysis.paper.examples import CENTRALITY, NODE, SYSTEM, Curve, Example
-from msg_analysis.report.figures import (
-    BLACK,
-    BLUE,
-    DARK_GREY,
-    GREEN,
-    INK,
-    ORANGE,
-    PURPLE,
-    STYLE,
-    VERMILLION,
-    draw_graph,
-    rendered,
-)
+from msg_analysis.report import figures as look
+from msg_analysis.report.figures import BLACK, DARK_GREY, draw_graph, rendered
 from msg_analysis.sweep.grid import own_seed
 from msg_analysis.sweep.points import DONE, Job, Outcome
 
@@ -179,7 +168,7 @@ FORMATS = ("png", "svg", "pdf")
 WIDTH = 7.16  # inches: two columns of a journal
 _DPI = 300
 _STYLE = (
-    STYLE
+    look.STYLE
     | dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), 8)
     | dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize", "legend.title_fontsize"), 7.5)
     | dict.fromkeys(("axes.linewidth", "xtick.major.width", "ytick.major.width"), 0.6)
@@ -190,11 +179,11 @@ _STYLE = (
 )
 # Colour, dashes and marker of the first, second ... curve of a panel; each of the three alone is distinctive.
 _LINES = (
-    (BLUE, "-", "o"),
-    (VERMILLION, (0, (5, 1.5)), "s"),
-    (GREEN, (0, (5, 1.5, 1, 1.5)), "^"),
-    (ORANGE, (0, (1, 1)), "D"),
-    (PURPLE, (0, (8, 2)), "v"),
+    (look.BLUE, "-", "o"),
+    (look.VERMILLION, (0, (5, 1.5)), "s"),
+    (look.GREEN, (0, (5, 1.5, 1, 1.5)), "^"),
+    (look.ORANGE, (0, (1, 1)), "D"),
+    (look.PURPLE, (0, (8, 2)), "v"),
 )
 _SIDE = 0.05  # inches between points at the same rate
 _NOTE = (
@@ -234,7 +223,12 @@ def draw(example: Example, measured: Sequence[Measured] = ()) -> Figure:
     figure = {1: _draw_1, 2: _draw_2, 3: _draw_3}[example.number](example, measured)
     if measured:
         figure.supxlabel(_NOTE, size=7.5, color=DARK_GREY)
-    _settle(figure)
+    layout = figure.get_layout_engine()
+    assert layout
+    layout.execute(figure)
+    figure.set_layout_engine("none")
+    for axes in figure.axes:  # rounded: the last digits depend on the iteration order of a set
+        axes.set_position(np.round(axes.get_position(original=True).bounds, 5).tolist())
     return figure
 
 
@@ -312,7 +306,14 @@ def _draw_3(example: Example, measured: Sequence[Measured]) -> Figure:
             high = max([c.value.max() for c in curves] + [point.high for point in found])
             axes.set_ylim(low - 0.06 * (high - low), high + 0.36 * (high - low))
             _plot(axes, "epsilon", [(_agent(c), c) for c in curves], "agent", measured)
-            axes.text(0.03, 0.985, _orders(curves), transform=axes.transAxes, va="top", size=7, color=DARK_GREY)
+            orders = [
+                "-".join(
+                    str(agent + 1) for agent in examples.order(curves, int(np.abs(curves[0].epsilon - at).argmin()))
+                )
+                + rf" at $\epsilon$ = {at:g}"
+                for at in (0.1, 1.0, 10.0)
+            ]
+            axes.text(0.03, 0.985, "\n".join(orders), transform=axes.transAxes, va="top", size=7, color=DARK_GREY)
         lead.set(ylabel="agent 1 above agent 3 [%]", ylim=(-2, 2))
         lead.set_yscale("symlog", linthresh=0.01, linscale=0.6)
         lead.set_yticks([-1, -0.1, -0.01, 0, 0.01, 0.1, 1], ["−1", "−0.1", "−0.01", "0", "0.01", "0.1", "1"])
@@ -324,16 +325,6 @@ def _draw_3(example: Example, measured: Sequence[Measured]) -> Figure:
         ]
         _plot(lead, "epsilon", ahead, "in")
     return figure
-
-
-def _orders(curves: Sequence[Curve]) -> str:
-    """Order of the agents at epsilon = 0.1, 1 and 10."""
-    lines = []
-    for epsilon in (0.1, 1.0, 10.0):
-        point = int(np.abs(curves[0].epsilon - epsilon).argmin())
-        order = "-".join(str(agent + 1) for agent in examples.order(curves, point))
-        lines.append(rf"{order} at $\epsilon$ = {epsilon:g}")
-    return "\n".join(lines)
 
 
 def _plot(
@@ -386,20 +377,10 @@ def _plot_points(axes: Axes, swept: str, points: Sequence[Measured], colour: str
         axes.plot(x, point.predicted, "_", color=BLACK, ms=4.5, mew=0.8, zorder=5, transform=place)
 
 
-def _settle(figure: Figure) -> None:
-    """Make the layout, and round it: its last digits depend on the iteration order of a set."""
-    layout = figure.get_layout_engine()
-    assert layout
-    layout.execute(figure)
-    figure.set_layout_engine("none")
-    for axes in figure.axes:
-        axes.set_position(np.round(axes.get_position(original=True).bounds, 5).tolist())
-
-
 def _draw_network(axes: Axes, graph: Graph, title: str, *, reconstructed: bool = True) -> None:
     angles = np.pi / 2 - 2 * np.pi * np.arange(graph.agents) / graph.agents
     places = {agent: np.array([np.cos(angle), np.sin(angle)]) for agent, angle in enumerate(angles)}
-    draw_graph(axes, graph, places, INK, size=110)
+    draw_graph(axes, graph, places, look.INK, size=110)
     for artist in axes.collections:
         artist.set_clip_on(False)
     axes.set_title("")
@@ -412,21 +393,19 @@ def _draw_network(axes: Axes, graph: Graph, title: str, *, reconstructed: bool =
 
 def _coinciding(curves: Sequence[Curve]) -> list[tuple[str, Curve]]:
     """Curves that are equal by symmetry, once, under the numbers of all their agents."""
-    groups: list[tuple[list[str], Curve]] = []
+    groups: list[list[Curve]] = []
     for curve in curves:
-        for agents, other in groups:
-            if np.allclose(curve.value, other.value, rtol=1e-9):
-                agents.append(_agent(curve))
-                break
-        else:
-            groups.append(([_agent(curve)], curve))
-    return [(", ".join(agents), curve) for agents, curve in groups]
+        alike = (group for group in groups if np.allclose(curve.value, group[0].value, rtol=1e-9))
+        group = next(alike, None)
+        if group is None:
+            groups.append(group := [])
+        group.append(curve)
+    return [(", ".join(map(_agent, group)), group[0]) for group in groups]
 
 
 def _agent(curve: Curve) -> str:
     """Number of a curve's agent, from 1."""
-    assert curve.agent is not None
-    return str(curve.agent + 1)
+    return "" if curve.agent is None else str(curve.agent + 1)
 
 
 def _rate(name: str) -> str:

@@ -25,7 +25,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -52,7 +52,7 @@ def require_libraries() -> None:
 @functools.cache
 def installed_software() -> str:
     """Versions of msg_analysis, numpy and scipy in one line, with a digest of the code that results depend on."""
-    libraries = " ".join(f"{name} {_version(name)}" for name in ("numpy", "scipy"))
+    libraries = " ".join(f"{name} {version(name)}" for name in ("numpy", "scipy"))
     return f"msg_analysis {__version__} ({source_digest(Path(__file__).parents[1])}), {libraries}"
 
 
@@ -68,13 +68,6 @@ def source_files(package: Path) -> list[Path]:
     """These files: Python and C, in order."""
     found = [file for name in _SOURCES for file in [package / name, *(package / name).rglob("*")]]
     return sorted(file for file in found if file.suffix in (".py", ".c") and file.is_file())
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "unknown"
 
 
 JobKind = Literal["predict", "simulate", "network"]

@@ -40,7 +40,6 @@ _KEYS = {
     "agents": "number of agents",
     "leaders.agents": "leaders",
     "leaders.gain": "gain of the leaders",
-    "leaders.reference": "reference",
     "noise.broadcast": "noise of published values",
     "noise.burst": "messages lost in a row",
     "noise.delay": "delay of messages, in steps",
@@ -49,22 +48,16 @@ _KEYS = {
     "noise.loss.default": "loss of messages",
     "noise.on_loss": "in place of a lost value",
     "noise.process": "process noise",
-    "problem": "problem",
     "run.dt": "step length dt",
     "run.duration": "simulated time",
-    "run.pace": "pace",
-    "run.delivery": "delivery",
     "run.processes": "number of processes",
     "run.replicas": "number of replicas",
-    "run.seed": "seed",
     "run.speed": "speed of real time",
-    "run.start": "start",
-    "switching.generator": "generator",
     "switching.initial": "first graph",
     "switching.scale": "factor of the switching rates",
     "switching.transition": "transition matrix",
-    "time": "time",
 }
+_LAST_PART = {"leaders.reference", "run.pace", "run.delivery", "run.seed", "run.start", "switching.generator"}
 _COLUMNS = {
     "node_errors": "error of {}",
     "rate": "decay rate",
@@ -415,8 +408,8 @@ def value_text(value: Any) -> str:
 
 def key_words(key: str, names: Sequence[str] | None = None) -> str:
     """A key in words, such as "step length dt"; the key itself if it has none. ``names``: of the agents."""
-    if key in _KEYS:
-        return _KEYS[key]
+    if key in _KEYS or key in _LAST_PART:
+        return _KEYS.get(key, key.rpartition(".")[2])
     if found := re.fullmatch(r"noise\.process\[(\d+)\]", key):
         return f"process noise of {agent_text(int(found[1]), names)}"
     if found := re.fullmatch(r"switching\.rates\.([^.]+)\.([^.]+)", key):

@@ -22,6 +22,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 from msg_analysis.common.resources import SINGLE_THREAD, count_cores, one_blas_thread
@@ -63,11 +64,11 @@ class WorkersLostError(Exception):
     """The cluster went away in the middle of the work."""
 
 
+@dataclass(frozen=True, slots=True)
 class Lost:
-    """In place of a result: the item killed every worker that tried it; ``reason`` is a text for the user."""
+    """In place of a result: the item killed every worker that tried it."""
 
-    def __init__(self, reason: str) -> None:
-        self.reason = reason
+    reason: str  # for the user
 
 
 def warm_up() -> None:
