@@ -190,10 +190,10 @@ def _split(key: str) -> list[str | int]:
     for piece in key.split("."):
         found = list(_PART.finditer(piece))
         if not found or "".join(match[0] for match in found) != piece or found[0][1] is None:
-            raise KeyProblemError(_problem(key, "not a key", "names joined by dots, places in lists in brackets"))
+            raise _problem(key, "not a key", "names joined by dots, places in lists in brackets")
         for match in found:
             if match[2] == "0":
-                raise KeyProblemError(_problem(key, f"place {match[0]}", "places from 1"))
+                raise _problem(key, f"place {match[0]}", "places from 1")
             parts.append(match[1] if match[1] is not None else int(match[2]) - 1)
     return parts
 
@@ -205,11 +205,11 @@ def _put(here: Any, parts: list[str | int], value: Any, key: str, path: str) -> 
     if isinstance(name, int):
         if not isinstance(here, list) or not name < len(here):
             size = f"{len(here)} entries" if isinstance(here, list) else show(here)
-            raise KeyProblemError(_problem(key, f"{path} has {size}", f"a list with at least {name + 1} entries"))
+            raise _problem(key, f"{path} has {size}", f"a list with at least {name + 1} entries")
         shown = f"{path}[{name + 1}]"
     else:
         if not isinstance(here, dict):
-            raise KeyProblemError(_problem(key, f"{path} is {show(here)}", "keys with values there"))
+            raise _problem(key, f"{path} is {show(here)}", "keys with values there")
         shown = f"{path}.{name}" if path else name
     if not rest:
         here[name] = value
@@ -233,8 +233,8 @@ def _name(here: Any, parts: list[str | int]) -> tuple[str | int, int]:
     return parts[0], 1
 
 
-def _problem(key: str, found: str, wanted: str) -> str:
-    return problem(f"over.{key}", found, f"expected {wanted}", "correct the key")
+def _problem(key: str, found: str, wanted: str) -> KeyProblemError:
+    return KeyProblemError(problem(f"over.{key}", found, f"expected {wanted}", "correct the key"))
 
 
 SEED = "run.seed"
@@ -320,9 +320,7 @@ def _spec_problems(spec: SweepSpec) -> list[str]:
         found.append(problem("until", spec.until, wanted, "remove it, or use kind: network"))
     if SEED in spec.over and spec.repetitions > 1:
         found.append(problem("repetitions", spec.repetitions, f"expected 1, since {SEED} is swept", "use one of both"))
-    total = spec.repetitions
-    for length in lengths.values() if spec.combine == "grid" else [max(lengths.values())]:
-        total *= length
+    total = spec.repetitions * (math.prod(lengths.values()) if spec.combine == "grid" else max(lengths.values()))
     if total > MOST_POINTS:
         found.append(problem("over", f"{total} points", f"expected at most {MOST_POINTS}", "sweep fewer values"))
     return found

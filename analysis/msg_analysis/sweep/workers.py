@@ -30,7 +30,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.sweep.points import FAILED, Job, JobResults, NetworkOptions, Outcome, evaluate, installed_software
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Future
 
     from msg_analysis.sweep.results import ResultStore
 
@@ -62,6 +62,10 @@ SweepProgress = Callable[[int, int, int], None]  # outcomes available, total, ho
 
 class WorkersLostError(Exception):
     """The cluster went away in the middle of the work."""
+
+
+class EndedError(Exception):
+    """The work was ended before it was done."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +104,7 @@ class Workers:
     def __init__(self, count: int | None = None, scheduler: str | None = None) -> None:
         self._count = count or count_cores()
         self._scheduler = scheduler
-        self._client: Client | None = None
+        self._client: Any = None  # of Dask, from ``__enter__`` on
         self._cluster: Any = None
         self._stop_name = f"msg-sweep-stop-{uuid.uuid4().hex}"
 
@@ -129,15 +133,10 @@ class Workers:
         dask.config.set({"distributed.worker.multiprocessing-method": method, **_QUIET})
         try:
             with deferring_interrupts():
-                self._cluster = distributed.LocalCluster(
-                    n_workers=self._count,
-                    threads_per_worker=1,
-                    processes=True,
-                    host="127.0.0.1",
-                    dashboard_address="127.0.0.1:0",
-                    scheduler_kwargs={"dashboard": False},
-                    silence_logs=logging.CRITICAL + 1,
-                )
+                quiet = {"scheduler_kwargs": {"dashboard": False}, "silence_logs": logging.CRITICAL + 1}
+                place = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+                size = {"n_workers": self._count, "threads_per_worker": 1, "processes": True}
+                self._cluster = distributed.LocalCluster(**size, **place, **quiet)
                 self._client = distributed.Client(self._cluster)
         except KeyboardInterrupt:
             self._close()
@@ -158,7 +157,6 @@ class Workers:
     @property
     def threads(self) -> int:
         """Items that can be worked on at a time now; 0 where a cluster has no worker yet."""
-        assert self._client is not None
         return sum(self._client.nthreads().values()) if self._scheduler else self._count
 
     def outcomes(
@@ -171,7 +169,6 @@ class Workers:
         """
         from distributed import as_completed
 
-        assert self._client is not None
         pending = deque(items)
         suspected: deque[T] = deque()
         running: dict[Future, list[T]] = {}
@@ -203,7 +200,6 @@ class Workers:
             raise
 
     def _submit(self, function: Function[T, R], batch: list[T], running: dict[Future, list[T]], done: Any) -> None:
-        assert self._client is not None
         future = self._client.submit(_do, function, batch, self._stop_name, installed_software(), pure=False)
         running[future] = batch
         done.add(future)
@@ -215,7 +211,6 @@ class Workers:
         """
         from distributed import KilledWorker
 
-        assert self._client is not None
         if future.status == "finished":
             found: tuple[list[Any], float] = future.result()
             return found
@@ -236,13 +231,11 @@ class Workers:
         from distributed import Event, wait
 
         with _ignoring(signal.SIGINT, signal.SIGTERM), suppress(Exception):
-            assert self._client is not None
             Event(self._stop_name, client=self._client).set()
             wait(running, timeout=timeout)
 
     def _compare_software(self) -> None:
         """Refuse workers with other software; those that join later refuse themselves in ``_do``."""
-        assert self._client is not None
         where, own = f"--scheduler {self._scheduler}", installed_software()
         try:
             found = self._client.run(installed_software)
@@ -275,10 +268,6 @@ def _do(function: Function[T, R], batch: Sequence[T], stop_name: str, software: 
                 raise EndedError
             results.append(function(item, stopping))
     return results, time.perf_counter() - begin
-
-
-class EndedError(Exception):
-    """The work was ended before it was done."""
 
 
 class _Stopping:
