@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK
+from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.phases import phases

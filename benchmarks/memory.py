@@ -33,7 +33,7 @@ from msg_agents.nodes.recorder import keep_freed_memory
 from msg_agents.nodes.ros import LeanNode
 from msg_agents.run.runner import run_network
 from msg_agents.stepping.state_receiver import StateReceiver
-from msg_analysis.arithmetic.step_clock import SECOND, StepClock
+from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.bags.writing import BagWriter
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.cdr import encode_batch

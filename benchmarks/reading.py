@@ -55,7 +55,7 @@ class Stopwatch:
 
 def make_bag(directory: Path, states: int, replicas: int) -> None:
     """A bag with at least so many states."""
-    from msg_analysis.bags.run_writer import write_trajectory
+    from msg_analysis.bags.writing import write_trajectory
     from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.twin.simulate import simulate
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from msg_agents.nodes.agent_group import BATCH_SIZE
 from msg_agents.nodes.recorder import write_size
 from msg_agents.stepping.state_receiver import StateReceiver
-from msg_analysis.bags.mcap_chunks import COMPRESSIONS, Storage
+from msg_analysis.bags.stored_file import COMPRESSIONS, Storage
 from msg_analysis.bags.writing import BagWriter
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.cdr import encode_batch

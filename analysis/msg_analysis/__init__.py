@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from msg_analysis.bags.reading import read_bag
-    from msg_analysis.common.version import __version__ as __version__
+    from msg_analysis.common.resources import __version__ as __version__
     from msg_analysis.errors import BagError, InputError, NotAvailableError
     from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.experiment.problems import ExperimentError
@@ -70,7 +70,7 @@ def __getattr__(name: str) -> Any:
     from importlib import import_module
 
     if name == "__version__":
-        return import_module("msg_analysis.common.version").__version__
+        return import_module("msg_analysis.common.resources").__version__
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"msg_analysis.{_PLACES[name]}"), name)

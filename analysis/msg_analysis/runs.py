@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from msg_analysis.bags.files import METADATA_FILE, first_file, starting_time
-from msg_analysis.bags.mcap_chunks import BAG_SUFFIXES
+from msg_analysis.bags.stored_file import BAG_SUFFIXES
 from msg_analysis.common.files import REPORT_FILE, RESULT_FILE, read_text
 from msg_analysis.common.text import HALF_WIDTH_95, agent_name, with_names
 from msg_analysis.errors import BagError, InputError
@@ -193,13 +193,10 @@ def list_runs(folder: Path) -> list[RunEntry]:
     try:
         with os.scandir(folder) as entries:
             inside = list(entries)
-    except NotADirectoryError as error:
-        raise InputError(f"{folder}: a file: expected a folder with the folders of runs in it") from error
     except OSError as error:
-        raise InputError(
-            f"{folder}: {error.strerror}: expected a folder with the folders of runs in it, as `msg-agents run --out` "
-            "makes it"
-        ) from error
+        problem = "a file" if isinstance(error, NotADirectoryError) else error.strerror
+        wanted = "expected a folder with the folders of runs in it, as `msg-agents run --out` makes it"
+        raise InputError(f"{folder}: {problem}: {wanted}") from error
     if any(entry.name == METADATA_FILE or entry.name.endswith(BAG_SUFFIXES) for entry in inside):
         raise InputError(f"{folder}: a bag: give the folder it is in: {folder.absolute().parent}")
     inner = (Path(entry) for entry in inside if entry.is_dir() and not entry.name.startswith("."))
@@ -247,13 +244,13 @@ def _compared(folder: Path, date: datetime, report: str | None) -> RunEntry:
     """By the saved result; InputError: it cannot be used."""
     document = read_document(folder)
     row = result_row(folder, document)
-    tested = tested_error(document, folder / RESULT_FILE)
-    given = tested is not None and row.standard_error is None
-    measured = tested["measured"] if tested else row.measured
-    error = tested["standard_error"] if tested else None
-    predicted = tested["predicted"] if tested else row.predicted
-    known = measured is not None and error is not None
-    half = HALF_WIDTH_95 * error if error is not None else 0.0
+    untested = {"measured": row.measured, "standard_error": None, "predicted": row.predicted}
+    tested = tested_error(document, folder / RESULT_FILE) or untested
+    measured, error, predicted = tested["measured"], tested["standard_error"], tested["predicted"]
+    low = high = z = None
+    if measured is not None and error is not None:
+        low, high = measured - HALF_WIDTH_95 * error, measured + HALF_WIDTH_95 * error
+        z = (measured - predicted) / error if predicted is not None and error else None
     return RunEntry(
         str(folder),
         "compared",
@@ -265,11 +262,11 @@ def _compared(folder: Path, date: datetime, report: str | None) -> RunEntry:
         simulated_time=row.simulated_time,
         measured=measured,
         standard_error=error,
-        low=measured - half if known and measured is not None else None,
-        high=measured + half if known and measured is not None else None,
+        low=low,
+        high=high,
         predicted=predicted,
-        z=(measured - predicted) / error if measured is not None and predicted is not None and error else None,
-        given_path=given,
+        z=z,
+        given_path=error is not None and row.standard_error is None,
         report=report,
     )
 

@@ -39,7 +39,7 @@ def test_executable(tmp_path: Path) -> None:
 
 
 def test_data_files() -> None:
-    assert (resources.files(msg_analysis) / "wire/definitions/std_msgs/msg/Header.msg").is_file()
+    assert (resources.files(msg_analysis) / "messages/definitions/std_msgs/msg/Header.msg").is_file()
     assert (resources.files(msg_analysis) / "report/templates").is_dir()
 
 

@@ -21,7 +21,7 @@ from cyclone_messages import AgentState, Header, Node, Progress, StateBatch, Tim
 from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState, WaitSet
 from cyclonedds.util import duration
 
-from msg_analysis.arithmetic.step_clock import SECOND, StepClock
+from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.messages import messages, topics
 from msg_analysis.messages.acceptance import genuine, sign
 from msg_analysis.messages.messages import StateCodec

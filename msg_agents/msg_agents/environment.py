@@ -28,8 +28,7 @@ from msg_agents.discovery.profiles import (
 )
 from msg_agents.discovery.relay import Introducer
 from msg_agents.discovery.rtps import free_domain, require_loopback
-from msg_analysis.common.resources import SINGLE_THREAD
-from msg_analysis.common.version import ros_distribution
+from msg_analysis.common.resources import SINGLE_THREAD, ros_distribution
 from msg_analysis.errors import InputError
 
 MEMORY = Path("/dev/shm")

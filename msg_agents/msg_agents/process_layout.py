@@ -26,7 +26,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from msg_agents.discovery.profiles import MOST_PARTICIPANTS, profile_for_hosts
 from msg_agents.discovery.rtps import PEERS_VARIABLE
 from msg_agents.environment import DISCOVERY_TIMEOUT, LAST_DOMAIN, USER_TIMEOUT, node_environment
-from msg_analysis.bags.mcap_chunks import DEFAULT_STORAGE, MEGABYTE, Storage
+from msg_analysis.bags.stored_file import DEFAULT_STORAGE, MEGABYTE, Storage
 from msg_analysis.common.arrays import BoolArray
 from msg_analysis.common.resources import count_cores
 from msg_analysis.errors import InputError

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from fnmatch import fnmatchcase
 
-from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.errors import InputError
 
 

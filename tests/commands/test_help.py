@@ -17,7 +17,7 @@ import pytest
 from click.testing import CliRunner
 from programs import COMMANDS, PROGRAMS, command_of, context_of
 
-import msg_analysis.bags.mcap_chunks as storage_module
+import msg_analysis.bags.stored_file as storage_module
 from msg_analysis.cli import options as cli_options
 from msg_analysis.cli.console import SHORT_HELP, CommandGroup
 from msg_analysis.common.files import RESULT_FILE

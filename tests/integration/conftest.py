@@ -35,7 +35,7 @@ from msg_agents.run.result import RunResult, read_steps
 from msg_agents.run.runner import run_network
 from msg_agents.run.supervisor import STEPS
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from msg_agents.discovery.rtps import free_domain
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.twin.simulate import simulate
 
 LISTENER = """

@@ -167,7 +167,7 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
         "from functools import partial",
         "from pathlib import Path",
         "from msg_analysis.cli.main import main",
-        "from msg_analysis.paper import emulation, examples",
+        "from msg_analysis.paper import examples, figures as emulation",
         "from msg_analysis.paper.figures import Run",
         f"emulation.runs_of = lambda number: [run for run in {runs} if run.example == number]",
         "examples.EXAMPLES |= {k: partial(example, 3) for k, example in examples.EXAMPLES.items()}  # coarse curves",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.observation import Observation

@@ -2,7 +2,7 @@
 
 import random
 
-from msg_analysis.bags import run_writer
+from msg_analysis.bags import writing
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.online_errors import LiveEstimate, LiveReport
 from msg_analysis.inference.sequential_sums import EvidenceSums
@@ -14,7 +14,7 @@ from msg_analysis.theory.prediction import Prediction
 
 def messages_of(trajectory: Run) -> list[tuple[str, bytes]]:
     """(topic, message) in the order of time, as a bag has them (``test_messages_are_those_of_the_bag``)."""
-    return [(topic, content) for topic, content, _, _ in run_writer._messages(trajectory)]
+    return [(topic, content) for topic, content, _, _ in writing._messages(trajectory)]
 
 
 def watch(

@@ -1,17 +1,11 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The update law, and many steps of it: equal to the last bit on every machine.
+"""The update law, implemented once for agents, twin and checks, on arrays and on the bytes of messages.
 
-The update law, implemented once: agents, twin and checks all call these functions.
-
-Two rules make a network of processes and the vectorised twin equal bit for bit. Sums run over the agents in ascending
-order, one term at a time (never through BLAS or a reduction, whose order depends on shapes and threads). Each term is
-one multiplication and one addition of doubles.
-
-States as messages carry them: bytes of little-endian doubles, and the update law on such bytes.
-
-The compiled kernel and numpy give the same bits. The kernel is used where it was built, because it is faster.
+Its results are equal to the last bit on every machine: sums run over the agents in ascending order, one term at a time
+(never through BLAS or a reduction, whose order depends on shapes and threads), and each term is one multiplication and
+one addition of doubles. The compiled kernel and numpy give the same bits; the kernel is faster.
 """
 
 from __future__ import annotations
@@ -119,7 +113,7 @@ class Reception:
     held: FloatArray | None = None
 
     def hold(self, k: int, states: FloatArray, agents: IntArray) -> None:
-        """Keep what these agents hear in step k, of all links."""
+        """Note what these agents receive in step k, over all links."""
         if self.held is not None:
             links = np.concatenate([np.arange(self.first[i], self.first[i + 1]) for i in agents])
             links = links[~self.lost[links, k + self.ahead[links]]]
@@ -178,13 +172,13 @@ class ManySteps:
         states[: len(past)] = past
         if self._compiled:
             arrays = self._order, self._offsets, self._columns, self._weights, np.ascontiguousarray(modes)
-            air: list[Any] = []
+            received: list[Any] = []
             if reception is not None:
-                air = [reception.links, reception.first, reception.senders, reception.ahead, reception.delay]
-                air += [reception.lost]
-                air += [b"" if noise is None else noise for noise in (reception.broadcast, reception.link)]
-                air += [] if reception.held is None else [reception.held]
-            _kernel.advance(*arrays, np.ascontiguousarray(drives), states, *past.shape[1:], *air)
+                received = [reception.links, reception.first, reception.senders, reception.ahead, reception.delay]
+                received += [reception.lost]
+                received += [b"" if noise is None else noise for noise in (reception.broadcast, reception.link)]
+                received += [] if reception.held is None else [reception.held]
+            _kernel.advance(*arrays, np.ascontiguousarray(drives), states, *past.shape[1:], *received)
         else:
             self._with_numpy(modes, states, drives, reception)
         return states[len(past) :]

@@ -1,12 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The files of a bag, its metadata.yaml, and what is in them.
-
-What the files of a bag hold, counted while they are read, whatever the messages are and however a file ends.
-
-Also the check of a file's summary, which the library reads without looking at its checksum.
-"""
+"""The files of a bag, its metadata.yaml, and what the files hold, counted while they are read."""
 
 from __future__ import annotations
 
@@ -28,12 +23,10 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, ChunkIndex
 from mcap.summary import Summary
 
-from msg_analysis.bags.mcap_chunks import BAG_SUFFIXES, CHUNK_CRC, RECORD_LIMIT, SQLITE_SUFFIX, chunk_head
-from msg_analysis.bags.mcap_reading import McapFile
-from msg_analysis.bags.sqlite import SqliteFile
-from msg_analysis.bags.stored_file import Batch, StoredFile
+from msg_analysis.bags.mcap_reading import CHUNK_CRC, McapFile, chunk_head
+from msg_analysis.bags.stored_file import BAG_SUFFIXES, RECORD_LIMIT, SQLITE_SUFFIX, Batch, SqliteFile, StoredFile
 from msg_analysis.common.files import load_yaml, read_text
-from msg_analysis.common.version import ros_distribution
+from msg_analysis.common.resources import ros_distribution
 from msg_analysis.errors import BagError
 from msg_analysis.experiment.loading import no_bag_but
 
@@ -44,6 +37,8 @@ _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _HEAD = 4096  # bytes in which rosbag2 has the start of a bag
 _STARTED = re.compile(rb"^  starting_time:\n +nanoseconds_since_epoch: (\d{1,19})\n", re.MULTILINE)
 _NEVER = 2**63 - 1  # what rosbag2 writes as the start of a bag without messages
+_FOOTER = struct.Struct("<9xQQI8x")  # starts of summary and summary offsets; CRC of all from the summary up to itself
+_BEHIND_CRC = 12  # bytes of the CRC and the closing magic
 
 
 @dataclass(slots=True)
@@ -172,9 +167,6 @@ def starting_time(directory: Path) -> int | None:
     return int(found[1]) if found and int(found[1]) != _NEVER else None
 
 
-_STORAGES = ("mcap", "sqlite3")
-
-
 def stored_file(path: Path) -> StoredFile:
     """A file of a bag, to be read; sqlite3 if its name says so, else MCAP."""
     return SqliteFile(path) if SQLITE_SUFFIX in path.suffixes else McapFile(path)
@@ -190,7 +182,7 @@ def bag_files(path: Path) -> list[Path]:
         raise BagError(f"{path}: not found: expected the directory of a bag, or an .mcap or .db3 file")
     information = read_metadata(path)
     if information is None:
-        files = [file for suffix in BAG_SUFFIXES for file in path.glob(f"*{suffix}")]
+        files = _named_as_files(path)
         if not files:
             if {entry.name for entry in path.iterdir()} <= {"log"}:  # a run makes its directory before anything else
                 raise BagError(f"{path}: empty: its run ended before anything was recorded: delete it")
@@ -210,13 +202,16 @@ def bag_files(path: Path) -> list[Path]:
 
 def first_file(path: Path) -> Path | None:
     """The first file of a bag by the names alone; None where there is none."""
-    files = [file for suffix in BAG_SUFFIXES for file in path.glob(f"*{suffix}")]
-    return min(files, key=_file_number, default=None)
+    return min(_named_as_files(path), key=_file_number, default=None)
+
+
+def _named_as_files(path: Path) -> list[Path]:
+    return [file for suffix in BAG_SUFFIXES for file in path.glob(f"*{suffix}")]
 
 
 def _refuse_unknown(path: Path, information: dict[str, Any]) -> None:
     storage = information.get("storage_identifier")
-    if storage not in _STORAGES:
+    if storage not in ("mcap", "sqlite3"):
         raise BagError(
             f"{path}: its storage is {storage}, expected mcap or sqlite3: record with `ros2 bag record -s mcap`, or "
             "convert it"
@@ -239,10 +234,6 @@ def _file_number(file: Path) -> tuple[int, str]:
     """Order of the files of a split bag, which rosbag2 numbers: name_0.mcap, name_1.mcap, ..., name_10.mcap."""
     number = re.search(r"_(\d+)\.(?:mcap|db3)", file.name)
     return int(number[1]) if number else 0, file.name
-
-
-_FOOTER = struct.Struct("<9xQQI8x")  # starts of summary and summary offsets; CRC of all from the summary up to itself
-_BEHIND_CRC = 12  # bytes of the CRC and the closing magic
 
 
 @dataclass(slots=True)

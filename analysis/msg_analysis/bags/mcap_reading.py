@@ -3,39 +3,47 @@
 
 """The messages of an MCAP file, whole or torn, in batches that numpy can work on.
 
-A file is read once, from front to back. Damaged chunks are counted and left out; a tear ends the reading.
+A file is read once, from front to back, and all messages of a chunk are found at once. Damaged chunks are counted and
+left out; a tear ends the reading.
 """
 
 from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator
+import struct
+import zlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Header, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema, Statistics
 
-from msg_analysis.bags.mcap_chunks import (
+from msg_analysis.bags.stored_file import (
     MESSAGE_HEAD,
-    RECORD,
     RECORD_LIMIT,
     ZSTD_SUFFIX,
+    Batch,
     DamageError,
+    StoredFile,
     gather,
-    indexed,
-    locate,
-    run_of_messages,
-    unpack,
+    no_time,
 )
-from msg_analysis.bags.stored_file import Batch, StoredFile, no_time
-from msg_analysis.common.arrays import IntArray
+from msg_analysis.common.arrays import AnyArray, IntArray
 from msg_analysis.errors import BagError
 
 MAGIC = b"\x89MCAP0\r\n"
+RECORD = struct.Struct("<BQ")  # opcode and length, before the content of every record
+CHUNK_TIMES = struct.Struct("<QQ")  # first and last log time, at the start of a chunk
+_CHUNK = struct.Struct("<QQQII")  # start and end time, size, CRC (0: none), length of the compression's name
+INDEX_HEAD = 6  # bytes before the entries of a message index record: channel, length; an entry: time, offset
+_RECORD_HEAD = np.dtype([("opcode", "u1"), ("length", "<u8")])
+_LENGTH = struct.Struct("<Q")
+CHUNK_CRC = slice(RECORD.size + 24, RECORD.size + 28)  # place of the CRC in the record of a chunk
+_ALIKE = 16  # records of equal length in a row, after which more are expected
 MOST_OTHERS = 2**18  # records of a chunk that are no messages: two for every number of a channel
 MOST_DESCRIBED = 2**26  # bytes of the schemas and channels in the chunks of a file: what they describe is kept
 _LOOSE = 2**18  # bytes of a batch of messages that are not in chunks
@@ -177,7 +185,7 @@ class McapFile(StoredFile):
             yield opcode, content, (np.array([0]), np.array([length]))
 
     def note(self, opcode: int, content: bytes) -> None:
-        """Keep the content of a record that is not a message; DamageError where it does not fit its type.
+        """Take the content of a record that is not a message; DamageError where it does not fit its type.
 
         BagError where there are too many channels.
         """
@@ -190,8 +198,7 @@ class McapFile(StoredFile):
                 schema = Schema.read(stream)
                 self.schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
-                channel = Channel.read(stream)
-                self.add_channel(channel)
+                self.add_channel(Channel.read(stream))
             elif opcode == Opcode.METADATA:
                 self.metadata.append(Metadata.read(stream))
             elif opcode == Opcode.STATISTICS:
@@ -261,3 +268,122 @@ def _loose_batch(data: bytes, start: IntArray, size: IntArray, end: int) -> Batc
     start, size = start[size >= MESSAGE_HEAD.itemsize], size[size >= MESSAGE_HEAD.itemsize]
     timed = ~no_time(gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD))
     return Batch.of_contents(data, start[timed], size[timed], end)
+
+
+def chunk_head(index: ChunkIndex) -> bytes:
+    """The first bytes of the record of a chunk, before its data, as its index describes it; with 0 as CRC."""
+    name = index.compression.encode()
+    times = (index.message_start_time, index.message_end_time)
+    content = _CHUNK.pack(*times, index.uncompressed_size, 0, len(name)) + name + _LENGTH.pack(index.compressed_size)
+    head: bytes = RECORD.pack(Opcode.CHUNK, index.chunk_length - RECORD.size) + content
+    return head
+
+
+def unpack(content: bytes, zstd: zstandard.ZstdDecompressor, limit: int = RECORD_LIMIT) -> bytes:
+    """The records in a chunk, from the content of its record; DamageError: too large, or a wrong checksum.
+
+    ``zstd`` is reused from chunk to chunk: making one takes longer than a small chunk.
+    """
+    _, _, size, crc, name_size = _CHUNK.unpack_from(content)
+    at = _CHUNK.size + name_size
+    name = content[_CHUNK.size : at]
+    (packed_size,) = _LENGTH.unpack_from(content, at)
+    at += _LENGTH.size
+    packed = memoryview(content)[at : at + packed_size]
+    if size > limit:
+        raise DamageError
+    if name == b"zstd":
+        if zstandard.frame_content_size(packed) > limit:
+            raise DamageError  # max_output_size is ignored where the frame states its size
+        data = zstd.decompress(packed, max_output_size=size)
+    elif name == b"lz4":
+        import lz4.frame
+
+        frame = lz4.frame.LZ4FrameDecompressor()
+        data = frame.decompress(packed, max_length=limit)
+        if not frame.eof:
+            raise DamageError
+    else:
+        data = bytes(packed)
+    if crc and zlib.crc32(data) != crc:  # 0: no checksum; other wrong fields do not matter, the records decide
+        raise DamageError
+    return data
+
+
+def locate(data: bytes, index: Sequence[bytes]) -> tuple[IntArray, IntArray] | None:
+    """(messages,) offsets of the contents of all message records of a chunk, ascending, and (messages,) their sizes.
+
+    ``index`` has the contents of the message index records behind the chunk. None where the messages that it names do
+    not fill the chunk from the first byte to the last: then only a walk from record to record finds what is there.
+    """
+    entries = [np.frombuffer(record, "<u8", offset=INDEX_HEAD) for record in index if _is_index(record)]
+    if not entries or len(entries) < len(index):
+        return None
+    start = np.concatenate(entries)[1::2]
+    start.sort(kind="stable")  # each channel's offsets are sorted already: a stable sort merges them, ten times as fast
+    if not len(start) or len(data) < RECORD.size or start[-1] > len(data) - RECORD.size:
+        return None
+    start = start.astype(np.int64)
+    head = gather(data, start, RECORD.size).view(_RECORD_HEAD)
+    start += RECORD.size
+    size = np.minimum(head["length"], RECORD_LIMIT + 1).astype(np.int64)
+    end = start + size
+    followed = start[0] == RECORD.size and end[-1] == len(data) and (start[1:] - end[:-1] == RECORD.size).all()
+    return (start, size) if followed and (head["opcode"] == Opcode.MESSAGE).all() else None
+
+
+def run_of_messages(data: bytes, at: int) -> tuple[IntArray, IntArray, int]:
+    """(messages,) content offsets and (messages,) sizes of the whole message records that follow ``at``, and their end.
+
+    Records are walked one by one while their lengths differ; after ``_ALIKE`` of equal length, the others of that
+    length are found at once.
+    """
+    starts: list[IntArray] = []
+    sizes: list[IntArray] = []
+    walked: list[tuple[int, int]] = []
+    before, alike, end = -1, 0, len(data) - RECORD.size
+
+    def keep_walked() -> None:
+        if walked:
+            places = np.array(walked, dtype=np.int64)
+            starts.append(places[:, 0])
+            sizes.append(places[:, 1])
+            walked.clear()
+
+    while at <= end:
+        opcode, length = RECORD.unpack_from(data, at)
+        step = RECORD.size + length
+        if opcode != Opcode.MESSAGE or at + step > len(data):
+            break
+        alike = alike + 1 if length == before else 0
+        before = length
+        if alike < _ALIKE:
+            walked.append((at + RECORD.size, length))
+            at += step
+            continue
+        heads: AnyArray = np.ndarray((len(data) - at) // step, _RECORD_HEAD, data, at, (step,))
+        others = np.flatnonzero((heads["opcode"] != Opcode.MESSAGE) | (heads["length"] != length))
+        count = int(others[0]) if len(others) else len(heads)
+        keep_walked()
+        starts.append(at + RECORD.size + step * np.arange(count))
+        sizes.append(np.full(count, length))
+        at, before = at + step * count, -1
+    keep_walked()
+    none = np.empty(0, dtype=np.int64)
+    return np.concatenate([none, *starts]), np.concatenate([none, *sizes]), at
+
+
+def indexed(start: IntArray, index: Sequence[bytes]) -> bool:
+    """Whether a non-empty index names exactly the messages whose contents begin at ``start``, (messages,) ascending."""
+    if not all(map(_is_index, index)):
+        return False
+    entries = [np.frombuffer(record, "<u8", offset=INDEX_HEAD)[1::2] for record in index]
+    return np.array_equal(np.sort(np.concatenate(entries)), (start - RECORD.size).astype(np.uint64))
+
+
+def _is_index(record: bytes) -> bool:
+    """Whether it has the length that it states, in whole entries."""
+    if len(record) < INDEX_HEAD:
+        return False
+    size = int.from_bytes(record[INDEX_HEAD - 4 : INDEX_HEAD], "little")
+    return size == len(record) - INDEX_HEAD and size % 16 == 0

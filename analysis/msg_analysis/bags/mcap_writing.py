@@ -1,50 +1,47 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Writes MCAP files with their messages in chunks: the same bytes as ``mcap.writer.Writer``, in half its time.
+"""Writes MCAP files with their messages in chunks, and one file of a bag with its run record and topics.
 
-The records other than messages and their indexes are encoded by ``mcap``.
+``McapWriter`` writes the same bytes as ``mcap.writer.Writer`` in half its time, and encodes the records other than
+messages and their indexes with that library.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import os
 import struct
 import tempfile
 import zlib
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
+from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
+from mcap.records import Attachment, AttachmentIndex, Channel, McapRecord, Metadata, MetadataIndex, Schema
 
-from msg_analysis.bags.mcap_chunks import MESSAGE_HEAD, Compression, gather, scatter
+from msg_analysis.bags.files import ChannelCount, FileCount, bag_information, dump
+from msg_analysis.bags.mcap_reading import MAGIC
+from msg_analysis.bags.stored_file import MESSAGE_HEAD, Compression, Storage, gather, scatter
 from msg_analysis.common.arrays import AnyArray, IntArray
+from msg_analysis.messages.topics import Qos, Topic
 
-MAGIC = b"\x89MCAP0\r\n"
+RECORD_NAME = "msg_agents"  # of the MCAP metadata record with the run record
+ROSBAG2_RECORD = "rosbag2"
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time; then the data
 _MESSAGE_RECORD = np.dtype([("opcode", "u1"), ("length", "<u8"), ("head", MESSAGE_HEAD)])  # the same
 ENTRY = struct.Struct("<QQ")  # of an index: log time, place among the records of the chunk
 MESSAGE_INDEX = struct.Struct("<BQHI")  # opcode, length, channel, bytes of the entries; then the entries
 CHUNK = struct.Struct("<BQQQQI")  # opcode, length, first and last time, size and checksum of the records
 FOOTER = struct.Struct("<BQQQ")  # what of it the checksum of the summary covers
-INDEXES_IN_MEMORY = 2**24  # bytes of the indexes of chunks; what is beyond is kept in a temporary file
+INDEXES_IN_MEMORY = 2**24  # bytes of the indexes of chunks; what is beyond is in a temporary file
 ZSTD_LEVEL = -1  # noisy states: 3 % larger than with zstd's own level, 3, in a third of the time
 COMPRESSION_NAMES: dict[Compression, str] = {"none": "", "zstd": "zstd", "lz4": "lz4"}
 
@@ -77,7 +74,7 @@ class McapWriter:
         self._chunk: list[bytes] = []  # records of the chunk in progress, in parts
         self._size = 0  # of the chunk in progress
         self._index: dict[int, bytearray] = defaultdict(bytearray)  # by channel: an ENTRY for each message
-        stream.write(MAGIC + _encoded(Header(profile=profile, library=library)))
+        stream.write(MAGIC + _encoded(records.Header(profile=profile, library=library)))
 
     def add_metadata(self, name: str, data: dict[str, str]) -> None:
         """Append a metadata record, outside the chunks."""
@@ -88,17 +85,9 @@ class McapWriter:
     def add_attachment(self, attachment: Attachment) -> None:
         """Append an attachment, outside the chunks."""
         record = _encoded(attachment)
-        self._attachment_indexes.append(
-            AttachmentIndex(
-                offset=self._stream.tell(),
-                length=len(record),
-                log_time=attachment.log_time,
-                create_time=attachment.create_time,
-                data_size=len(attachment.data),
-                name=attachment.name,
-                media_type=attachment.media_type,
-            )
-        )
+        a, place = attachment, self._stream.tell()
+        index = (place, len(record), a.log_time, a.create_time, len(a.data), a.name, a.media_type)
+        self._attachment_indexes.append(AttachmentIndex(*index))
         self._stream.write(record)
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
@@ -108,20 +97,16 @@ class McapWriter:
 
     def register_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
         """Register a channel; its number."""
-        self._channels.append(
-            Channel(
-                id=len(self._channels) + 1, topic=topic, message_encoding=encoding, schema_id=schema, metadata=metadata
-            )
-        )
+        self._channels.append(Channel(len(self._channels) + 1, topic, encoding, metadata, schema))
         return self._register(self._channels)
 
-    def _register(self, records: Sequence[McapRecord]) -> int:
-        record = _encoded(records[-1])
+    def _register(self, so_far: Sequence[McapRecord]) -> int:
+        record = _encoded(so_far[-1])
         self._chunk.append(record)
         self._size += len(record)
         if self._size > self._chunk_size:
             self._finish_chunk()
-        return len(records)
+        return len(so_far)
 
     def add_message(
         self, channel: int, time_ns: int, data: bytes, sequence: int, published_ns: int | None = None
@@ -156,15 +141,15 @@ class McapWriter:
         """Append messages to one chunk, and finish that when it is full."""
         place = np.cumsum(size + MESSAGE.size) - size  # of their bytes among the records
         total = int(place[-1] + size[-1])
-        records = np.empty(total, dtype=np.uint8)
+        written = np.empty(total, dtype=np.uint8)
         heads = np.empty(len(head), _MESSAGE_RECORD)
         heads["opcode"], heads["length"], heads["head"] = Opcode.MESSAGE, size + MESSAGE_HEAD.itemsize, head
-        scatter(records, place - MESSAGE.size, heads.view(f"V{MESSAGE.size}"))
+        scatter(written, place - MESSAGE.size, heads.view(f"V{MESSAGE.size}"))
         for length in np.unique(size).tolist():
             of_it = np.flatnonzero(size == length)
             if length:
-                scatter(records, place[of_it], gather(data, start[of_it], length))
-        self._chunk.append(records.tobytes())
+                scatter(written, place[of_it], gather(data, start[of_it], length))
+        self._chunk.append(written.tobytes())
         order = np.argsort(head["channel"], kind="stable")
         entries = np.column_stack((head["log_time"], (place - MESSAGE.size + self._size).astype(np.uint64)))
         flat = memoryview(entries[order].astype("<u8").tobytes())
@@ -180,17 +165,17 @@ class McapWriter:
         """Write the chunk in progress; one without messages stays in progress."""
         if not self._index:
             return
-        records, entries = b"".join(self._chunk), dict(self._index)
+        content, entries = b"".join(self._chunk), dict(self._index)
         self._chunk.clear()
         self._index.clear()
         self._size = 0
-        compressed = _compressed(records, self._compression)
+        compressed = _compressed(content, self._compression)
         name = COMPRESSION_NAMES[self._compression].encode()
         times = np.frombuffer(b"".join(entries.values()), "<u8")[::2]
         start, end = int(times.min()), int(times.max())
         tail = struct.pack(f"<I{len(name)}sQ", len(name), name, len(compressed))
         length = CHUNK.size - 9 + len(tail) + len(compressed)
-        head = CHUNK.pack(Opcode.CHUNK, length, start, end, len(records), zlib.crc32(records)) + tail
+        head = CHUNK.pack(Opcode.CHUNK, length, start, end, len(content), zlib.crc32(content)) + tail
         place = self._stream.tell()
         after = place + len(head) + len(compressed)
         indexes, offsets = bytearray(), {}
@@ -201,18 +186,10 @@ class McapWriter:
             indexes += index
         for part in (head, compressed, indexes):
             self._stream.write(part)
-        chunk_index = ChunkIndex(
-            message_start_time=start,
-            message_end_time=end,
-            chunk_start_offset=place,
-            chunk_length=after - place,
-            message_index_offsets=offsets,
-            message_index_length=len(indexes),
-            compression=name.decode(),
-            compressed_size=len(compressed),
-            uncompressed_size=len(records),
-        )
-        self._chunk_indexes.write(_encoded(chunk_index))
+        sizes = {"compressed_size": len(compressed), "uncompressed_size": len(content), "chunk_length": after - place}
+        places = {"chunk_start_offset": place, "message_index_offsets": offsets, "message_index_length": len(indexes)}
+        times_and_name = {"message_start_time": start, "message_end_time": end, "compression": name.decode()}
+        self._chunk_indexes.write(_encoded(records.ChunkIndex(**sizes, **places, **times_and_name)))
         self._chunks += 1
         self._first = start if self._first is None else min(self._first, start)
         self._last = max(self._last, end)
@@ -225,7 +202,7 @@ class McapWriter:
     def finish(self) -> None:
         """Write the summary; the stream stays open."""
         self._finish_chunk()
-        self._stream.write(_encoded(DataEnd(0)))
+        self._stream.write(_encoded(records.DataEnd(0)))
         start, checksum = self._stream.tell(), 0
         offsets = b""
         for opcode, parts in self._groups():
@@ -234,11 +211,11 @@ class McapWriter:
                 checksum = zlib.crc32(part, checksum)
                 self._stream.write(part)
             length = self._stream.tell() - begin
-            offsets += _encoded(SummaryOffset(group_opcode=opcode, group_start=begin, group_length=length))
+            offsets += _encoded(records.SummaryOffset(group_opcode=opcode, group_start=begin, group_length=length))
         self._chunk_indexes.close()
         offset_start = self._stream.tell()
         checksum = zlib.crc32(FOOTER.pack(Opcode.FOOTER, 20, start, offset_start), zlib.crc32(offsets, checksum))
-        footer = Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=checksum)
+        footer = records.Footer(summary_start=start, summary_offset_start=offset_start, summary_crc=checksum)
         self._stream.write(offsets + _encoded(footer) + MAGIC)
 
     def _groups(self) -> Iterator[tuple[Opcode, Iterable[bytes]]]:
@@ -248,24 +225,30 @@ class McapWriter:
             (Opcode.CHANNEL, self._channels),
             (Opcode.STATISTICS, [self._statistics()]),
         ]
-        for opcode, records in groups:
-            yield opcode, map(_encoded, records)
+        for opcode, group in groups:
+            yield opcode, map(_encoded, group)
         self._chunk_indexes.seek(0)
         yield Opcode.CHUNK_INDEX, iter(lambda: self._chunk_indexes.read(2**20), b"")
         yield Opcode.ATTACHMENT_INDEX, map(_encoded, self._attachment_indexes)
         yield Opcode.METADATA_INDEX, map(_encoded, self._metadata_indexes)
 
-    def _statistics(self) -> Statistics:
-        return Statistics(
-            attachment_count=len(self._attachment_indexes),
-            channel_count=len(self._channels),
-            channel_message_counts=self._counts,
+    def _statistics(self) -> records.Statistics:
+        counts = {
+            name: len(of)
+            for name, of in (
+                ("attachment_count", self._attachment_indexes),
+                ("channel_count", self._channels),
+                ("metadata_count", self._metadata_indexes),
+                ("schema_count", self._schemas),
+            )
+        }
+        messages = {"channel_message_counts": self._counts, "message_count": sum(self._counts.values())}
+        return records.Statistics(
+            **counts,
+            **messages,
             chunk_count=self._chunks,
-            message_count=sum(self._counts.values()),
-            metadata_count=len(self._metadata_indexes),
             message_start_time=self._first or 0,
             message_end_time=self._last,
-            schema_count=len(self._schemas),
         )
 
 
@@ -288,3 +271,140 @@ def _compressed(data: bytes, compression: Compression) -> bytes:
         framed: bytes = lz4.frame.compress(data)
         return framed
     return data
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class LatchedMessage:
+    """A message that later files repeat at their heads; in the order of time, then of its topic's messages."""
+
+    time: int  # [ns]
+    sequence: int  # among the messages of its topic, from 0
+    topic: str
+    data: bytes
+    until: int | None  # last time [ns] at which it is in force; None: always
+
+
+class WrittenFile:
+    """A new file; OSError, from every method: exists, or cannot be written.
+
+    A split bag knows where the file ends only when it is full: messages up to ``bound`` still belong into it then.
+    """
+
+    def __init__(self, path: Path, earlier: Sequence[FileCount], storage: Storage, *, begin: int = 0) -> None:
+        self.count = FileCount(path.name)
+        self.begin = begin  # first time that belongs into it [ns]
+        self.bound: int | None = None  # last one [ns]; None: not full
+        self.behind: set[str] = set()  # topics of which messages up to the bound may still come
+        self._earlier, self._storage, self._directory = list(earlier), storage, str(path.parent)
+        self._numbers: dict[str, int] = {}  # of the channels
+        self._stream: BinaryIO = path.open("xb")
+
+    def write_head(
+        self,
+        topics: Sequence[Topic],
+        record: str | None,
+        custom: Mapping[str, str],
+        latched: Iterable[LatchedMessage] = (),
+    ) -> None:
+        """Write the run record, the topics, and what is in force of the latched ones; the first thing to be written."""
+        storage, self._custom = self._storage, custom
+        self.mcap = McapWriter(
+            self._stream,
+            chunk_size=min(storage.chunk_size, storage.split_size or storage.chunk_size),
+            compression=storage.compression,
+            directory=self._directory,
+        )
+        self._add_information()
+        if record is not None:
+            self.mcap.add_metadata(RECORD_NAME, {"record": record})
+        schemas: dict[str, int] = {}
+        for topic in topics:
+            kind = topic.type.full_name
+            if kind not in schemas:
+                schemas[kind] = self.mcap.register_schema(kind, "ros2msg", topic.type.schema.encode())
+            self._add_channel(topic, schemas[kind])
+        for message in latched:
+            self.repeat(message)
+        self.mcap.flush()
+        # The head is not counted: it may be larger than the limit, and every file has it.
+        self._limit = None if storage.split_size is None else self._stream.tell() + storage.split_size
+
+    def _add_channel(self, topic: Topic, schema: int) -> None:
+        offered = topic.qos.offered()
+        self.count.channels[topic.name] = ChannelCount(topic.name, topic.type.full_name, topic.type.type_hash, offered)
+        metadata = {"offered_qos_profiles": _offered(topic.qos), "topic_type_hash": topic.type.type_hash}
+        self._numbers[topic.name] = self.mcap.register_channel(topic.name, "cdr", schema, metadata)
+
+    @property
+    def full(self) -> bool:
+        """Whether it has as many bytes as a file of a split bag should have."""
+        return self._limit is not None and self._stream.tell() >= self._limit
+
+    def add(self, topic: str, data: bytes, time_ns: int, sequence: int) -> None:
+        """Append a message."""
+        self.mcap.add_message(self._numbers[topic], time_ns, data, sequence)
+        self._counted(topic, 1, time_ns, time_ns)
+
+    def repeat(self, message: LatchedMessage) -> None:
+        """Append a message again that another file has: logged at the beginning of this one, published when it was."""
+        self.mcap.add_message(
+            self._numbers[message.topic], self.begin, message.data, message.sequence, published_ns=message.time
+        )
+        self._counted(message.topic, 1, self.begin, self.begin)
+
+    def add_many(
+        self,
+        topics: Sequence[str],
+        of: IntArray,
+        time_ns: IntArray,
+        data: bytes,
+        start: IntArray,
+        size: IntArray,
+        sequences: dict[str, int],
+    ) -> list[str]:
+        """Append messages (see ``BagWriter.write_many``) and count them in ``sequences``; the topics that they have."""
+        head = np.zeros(len(of), MESSAGE_HEAD)
+        head["log_time"] = head["publish_time"] = time_ns
+        order = np.argsort(of.astype(np.uint16), kind="stable")  # a radix sort; channels of MCAP have 16 bits
+        present, first, counts = np.unique(of[order], return_index=True, return_counts=True)
+        names = [topics[topic] for topic in present.tolist()]
+        earlier = [sequences[name] for name in names]
+        head["channel"][order] = np.repeat([self._numbers[name] for name in names], counts)
+        head["sequence"][order] = np.arange(len(of)) + np.repeat(np.array(earlier) - first, counts)
+        self.mcap.add_messages(head, data, start, size)
+        begin, end = int(time_ns.min()), int(time_ns.max())
+        for name, count in zip(names, counts.tolist(), strict=True):
+            sequences[name] += count
+            self._counted(name, count, begin, end)
+        return names
+
+    def _counted(self, topic: str, messages: int, begin: int, end: int) -> None:
+        count = self.count
+        count.channels[topic].messages += messages
+        if end > count.end:
+            count.end = end
+        if begin < count.start:
+            count.start = begin
+
+    def finish(self) -> None:
+        """Write the summary; then the file is whole and on the disk."""
+        self._add_information()
+        self.mcap.finish()
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
+        self._stream.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is."""
+        with contextlib.suppress(OSError):  # closing tries again to write what is left
+            self._stream.close()
+
+    def _add_information(self) -> None:
+        information = bag_information([*self._earlier, self.count], self._custom)
+        self.mcap.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": dump(information)})
+
+
+@functools.cache
+def _offered(qos: Qos) -> str:
+    """Of all agents' topics the same."""
+    return dump(qos.offered())

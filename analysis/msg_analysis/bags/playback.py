@@ -21,9 +21,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from msg_analysis.bags.files import bag_files, offered_profiles, stored_file
-from msg_analysis.bags.mcap_chunks import CHUNK_TIMES, INDEX_HEAD, RECORD, DamageError
-from msg_analysis.bags.mcap_reading import MAGIC, McapFile
-from msg_analysis.bags.stored_file import StoredFile
+from msg_analysis.bags.mcap_reading import CHUNK_TIMES, INDEX_HEAD, MAGIC, RECORD, McapFile
+from msg_analysis.bags.stored_file import DamageError
 from msg_analysis.errors import BagError
 
 # Bytes of messages held to be put in order. A bag that needs more is played out of order rather than held in memory.
@@ -92,17 +91,12 @@ class Playback:
     def _add(self, channel: Channel, schema: Schema | None, messages: int) -> None:
         if not messages:
             return
-        latched = _latched(channel)
-        topic = self.topics.setdefault(
-            channel.topic,
-            BagTopic(
-                channel.topic,
-                schema.name if schema else "",
-                channel.message_encoding,
-                channel.metadata.get("topic_type_hash", ""),
-                latched,
-            ),
+        type_name, type_hash = schema.name if schema else "", channel.metadata.get("topic_type_hash", "")
+        latched = any(
+            isinstance(each, dict) and each.get("durability") in _LATCHED for each in offered_profiles(channel)
         )
+        new = BagTopic(channel.topic, type_name, channel.message_encoding, type_hash, latched)
+        topic = self.topics.setdefault(channel.topic, new)
         topic.latched |= latched
         topic.messages += messages
         if schema is not None and schema.name != topic.type_name:
@@ -148,15 +142,12 @@ class Playback:
                 del pending[:ready]
                 if low > until:
                     return
-            self._note(outline, file)
+            if file.damaged_chunks and outline.damage is None:
+                outline.damage = f"damaged chunks that are left out: {file.damaged_chunks}"
+                self.damage.append(f"{outline.path}: {outline.damage}")
         for time, _, topic, data in pending:
             if time <= until:
                 yield Message(time, topic, data)
-
-    def _note(self, outline: _Outline, file: StoredFile) -> None:
-        if file.damaged_chunks and outline.damage is None:
-            outline.damage = f"damaged chunks that are left out: {file.damaged_chunks}"
-            self.damage.append(f"{outline.path}: {outline.damage}")
 
     def _starts_after(self) -> list[int]:
         """For each file, the earliest time [ns] in the files behind it."""
@@ -202,11 +193,6 @@ class _Lows:
         if self._next < len(self._ends) and self._ends[self._next] == offset:
             self._next += 1  # else a piece without messages
         return self._from[self._next]
-
-
-def _latched(channel: Channel) -> bool:
-    """Whether one of the offered profiles is transient-local."""
-    return any(isinstance(each, dict) and each.get("durability") in _LATCHED for each in offered_profiles(channel))
 
 
 def _quick_outline(path: Path) -> _Outline | None:

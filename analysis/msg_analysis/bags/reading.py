@@ -25,18 +25,25 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from msg_analysis.bags.files import Inventory, bag_files, first_file, stored_file
-from msg_analysis.bags.mcap_chunks import RECORD, RECORD_LIMIT
-from msg_analysis.bags.mcap_reading import MAGIC
-from msg_analysis.bags.run_builder import Collector
-from msg_analysis.bags.stored_file import Batch, StoredFile
-from msg_analysis.bags.writing import RECORD_NAME, recording_pid
+from msg_analysis.bags.mcap_reading import MAGIC, RECORD
+from msg_analysis.bags.mcap_writing import RECORD_NAME
+from msg_analysis.bags.states import Collector
+from msg_analysis.bags.stored_file import RECORD_LIMIT, Batch, StoredFile
+from msg_analysis.bags.writing import recording_pid
 from msg_analysis.common.arrays import AnyArray, IntArray
 from msg_analysis.common.resources import tell
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import CdrError
-from msg_analysis.messages.messages import ActiveGraph, Progress, decode_string
-from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, PROGRESS, STRING
+from msg_analysis.messages.messages import (
+    ACTIVE_GRAPH,
+    AGENT_STATE,
+    PROGRESS,
+    STRING,
+    ActiveGraph,
+    Progress,
+    decode_string,
+)
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 
@@ -49,6 +56,7 @@ _TOPICS = {
     STRING.full_name: re.compile(r"(?:^|/)(experiment)$"),
     PROGRESS.full_name: re.compile(r"(?:^|/)(stop)$"),
 }
+MOST_SEARCHED = 16 << 20  # bytes of messages in which the record of another recorder's bag is looked for
 MOST_RECORDS = 100  # different run records that a bag may have: reading each takes milliseconds
 
 
@@ -97,21 +105,19 @@ def read_record(path: str | Path, *, most: int | None = None) -> RunRecord:
     unreadable: list[BagError] = []
     files = bag_files(path)
     seen = 0
-    for name in files:
-        file = stored_file(name)
+    for file in map(stored_file, files):
         try:
             for batch, kind in contents.network_topics(file, file.batches()):
                 seen += len(batch.data)
                 if most is not None and seen > most:
                     return _choose(contents)
-                contents.learn(batch, np.flatnonzero(kind == _NUMBERS[_EXPERIMENT]))
-                contents.keep_metadata(file)
-                known = contents.first_record()
-                if known is not None:
+                contents.learn(batch, kind)
+                contents.learn_metadata(file)
+                if (known := contents.first_record()) is not None:
                     return known
         except BagError as error:
             unreadable.append(error)
-        contents.keep_metadata(file)
+        contents.learn_metadata(file)
     if len(unreadable) == len(files):
         raise unreadable[0]
     return _choose(contents)
@@ -136,7 +142,7 @@ class _Contents:
         """Take all of a file."""
         for batch, kind in self.network_topics(file, batches):
             self._add(batch, kind)
-        self.keep_metadata(file)
+        self.learn_metadata(file)
         self.refused[Refusal.TORN_FILE] += file.torn is not None
         self.refused[Refusal.DAMAGED_CHUNK] += file.damaged_chunks
 
@@ -155,27 +161,22 @@ class _Contents:
             known = len(file.channels)
             yield batch, kind_of[batch.channel]
 
-    def keep_metadata(self, file: StoredFile) -> None:
-        """Keep the run records in the metadata of a file."""
+    def learn_metadata(self, file: StoredFile) -> None:
+        """Take the run records in the metadata of a file."""
         for record in file.metadata:
             if record.name == RECORD_NAME and "record" in record.metadata and len(self.metadata) < MOST_RECORDS:
                 self.metadata[record.metadata["record"]] = None
 
     def _add(self, batch: Batch, kind: AnyArray) -> None:
-        # Records first: states of a known run are put in their places at once.
-        self.learn(batch, np.flatnonzero(kind == _NUMBERS[_EXPERIMENT]))
-        for index in np.flatnonzero(kind == _NUMBERS[_GRAPH]).tolist():
+        self.learn(batch, kind)  # first: states of a known run are put in their places at once
+        for index in np.flatnonzero((kind == _NUMBERS[_GRAPH]) | (kind == _NUMBERS[_STOP])).tolist():
             data = batch.message(index)
-            if data in self.graphs:
-                continue
             try:
-                self.graphs[data] = ActiveGraph.decode(data)
-            except CdrError:
-                self.refused[Refusal.UNDECODABLE] += 1
-        for index in np.flatnonzero(kind == _NUMBERS[_STOP]).tolist():
-            try:
-                stop = Progress.decode(batch.message(index))
-                self.stops.add((stop.run, stop.step))
+                if kind[index] == _NUMBERS[_STOP]:
+                    stop = Progress.decode(data)
+                    self.stops.add((stop.run, stop.step))
+                elif data not in self.graphs:
+                    self.graphs[data] = ActiveGraph.decode(data)
             except CdrError:
                 self.refused[Refusal.UNDECODABLE] += 1
         for name, collector in ((_STATE, self.states), (_TRUTH, self.truths)):
@@ -183,9 +184,9 @@ class _Contents:
             if len(chosen):
                 collector.add(batch, chosen)
 
-    def learn(self, batch: Batch, chosen: IntArray) -> None:
-        """Take the run records in a batch: the messages with the indices ``chosen``, (k,)."""
-        for index in chosen.tolist():
+    def learn(self, batch: Batch, kind: AnyArray) -> None:
+        """Take the run records in a batch with messages of these kinds, (messages,)."""
+        for index in np.flatnonzero(kind == _NUMBERS[_EXPERIMENT]).tolist():
             try:
                 self._learn(decode_string(batch.message(index)))
             except CdrError:
@@ -270,11 +271,9 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Run:
     experiment = record.experiment
     modes = _modes(contents, record.run.bytes, experiment.steps, planned, len(experiment.graph_list))
     published, widths = None, _widths(record)
+    truth = contents.states.finish(record, widths[0])
     if experiment.truth:
-        published = contents.states.finish(record, widths[0])
-        truth = contents.truths.finish(record, widths[1])
-    else:
-        truth = contents.states.finish(record, widths[0])
+        published, truth = truth, contents.truths.finish(record, widths[1])
     if experiment.run.pace == "lockstep":  # in real time agents may use older graphs
         differs = ((truth.modes[1:] != modes[:, None]) & (truth.modes[1:] >= 0)).any(axis=1) & (modes >= 0)
         contents.refused[Refusal.OTHER_GRAPH] += int(differs.sum())
@@ -293,17 +292,9 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Run:
         missing_modes=int((modes < 0).sum()),
         refused={reason: count for reason, count in sorted(contents.refused.items()) if count},
     )
-    return Run(
-        record,
-        truth.states,
-        modes,
-        completeness,
-        truth.modes,
-        published=published.states if published else None,
-        lost=truth.lost,
-        used=truth.used,
-        made=truth.made,
-    )
+    logged: dict[str, Any] = {"lost": truth.lost, "used": truth.used, "made": truth.made}
+    states = published.states if published else None
+    return Run(record, truth.states, modes, completeness, truth.modes, published=states, **logged)
 
 
 def _end(contents: _Contents, record: RunRecord) -> int | None:
@@ -339,15 +330,12 @@ def _modes(contents: _Contents, run: bytes, steps: int, planned: int, graphs: in
     return modes
 
 
-MOST = 16 << 20  # bytes of messages in which the record of another recorder's bag is looked for
-
-
 def record_document(path: Path) -> dict[str, Any]:
     """The document of the run record of a bag; only that of another recorder's bag is checked.
 
-    BagError: there is none in the first ``MOST`` bytes; InputError: it is not valid.
+    BagError: there is none in the first ``MOST_SEARCHED`` bytes; InputError: it is not valid.
     """
-    text = _head_record(first_file(path)) or read_record(path, most=MOST).to_json()
+    text = _head_record(first_file(path)) or read_record(path, most=MOST_SEARCHED).to_json()
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:

@@ -3,7 +3,7 @@
 
 """Makes a bag out of what a killed recorder, a full disk or a power cut left behind.
 
-Whole MCAP files are kept byte for byte; the others are rewritten from their whole records, as MCAP.
+Whole MCAP files are copied byte for byte; the others are rewritten from their whole records, as MCAP.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +32,9 @@ from msg_analysis.bags.files import (
     stored_file,
     write_metadata,
 )
-from msg_analysis.bags.mcap_chunks import CHUNK_SIZE, SQLITE_SUFFIX, ZSTD_SUFFIX
-from msg_analysis.bags.mcap_writing import McapWriter
-from msg_analysis.bags.stored_file import Batch, StoredFile
-from msg_analysis.bags.writing import RECORD_NAME, RECORDING_MARKER, ROSBAG2_RECORD, exists_already, recording_pid
+from msg_analysis.bags.mcap_writing import RECORD_NAME, ROSBAG2_RECORD, McapWriter
+from msg_analysis.bags.stored_file import CHUNK_SIZE, SQLITE_SUFFIX, ZSTD_SUFFIX, Batch, StoredFile
+from msg_analysis.bags.writing import RECORDING_MARKER, exists_already, recording_pid
 from msg_analysis.errors import BagError
 
 LONGEST_LIST = 500  # characters of what is said of torn files
@@ -44,47 +43,22 @@ _MORE = "; ..."
 
 @dataclass(frozen=True, slots=True)
 class SalvageReport:
-    """What was saved.
+    """What was saved; sizes in bytes, of a file that is compressed as a whole (.zstd) unpacked."""
 
-    Attributes
-    ----------
-    kept_messages
-        messages in the new bag
-    kept_bytes
-        bytes of the whole records of all readable files; of a file that is compressed as a whole (.zstd), unpacked
-    dropped_bytes
-        bytes behind the whole records of torn files, and all bytes of files of which nothing can be read; not exact for
-        a torn .zstd file, of which packed and unpacked bytes are compared
-    lost_messages
-        messages in damaged chunks of files that still state how many they had; those of a part that is cut off are not
-        known
-    damaged_chunks
-        chunks in the whole part whose content was lost
-    dropped_files
-        files of which nothing can be read
-    torn
-        what was there instead of the end of the torn files, of many only the first; None where all were whole
-    """
-
-    kept_messages: int
-    kept_bytes: int
+    kept_messages: int  # in the new bag
+    kept_bytes: int  # of the whole records of all readable files
+    # Behind the whole records of torn files, and all of unreadable ones; not exact for a torn .zstd file, of which
+    # packed and unpacked bytes are compared.
     dropped_bytes: int
-    lost_messages: int = 0
-    damaged_chunks: int = 0
-    dropped_files: int = 0
-    torn: str | None = None
+    lost_messages: int = 0  # in damaged chunks of files that still state how many they had; not those that are cut off
+    damaged_chunks: int = 0  # in the whole part; their content was lost
+    dropped_files: int = 0  # of which nothing can be read
+    torn: str | None = None  # instead of the end of the torn files, of many only the first; None: all were whole
 
     def __add__(self, other: SalvageReport) -> SalvageReport:
         """Of two files together."""
-        return SalvageReport(
-            self.kept_messages + other.kept_messages,
-            self.kept_bytes + other.kept_bytes,
-            self.dropped_bytes + other.dropped_bytes,
-            self.lost_messages + other.lost_messages,
-            self.damaged_chunks + other.damaged_chunks,
-            self.dropped_files + other.dropped_files,
-            _joined(self.torn, other.torn),
-        )
+        sums: list[Any] = [mine + its for mine, its in zip(astuple(self)[:-1], astuple(other)[:-1], strict=True)]
+        return SalvageReport(*[*sums, _joined(self.torn, other.torn)])
 
 
 def _joined(first: str | None, second: str | None) -> str | None:
@@ -119,29 +93,29 @@ def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
     out = Path(out).absolute()
     _refuse_living(Path(torn))
     files = bag_files(Path(torn))
-    workshop = out.with_name(f".{out.name}.{os.getpid()}")
+    unfinished = out.with_name(f".{out.name}.{os.getpid()}")
     try:
         if out.exists():
             raise exists_already(out)
-        entries, total = _look(files, parts=True)
+        entries, total = _read_all(files, parts=True)
         if not total.kept_messages:
             raise BagError(f"{torn}: no whole message is left in it: nothing can be salvaged")
-        workshop.mkdir(parents=True)
-        counts = []
-        for number, entry in enumerate(entry for entry in entries if not entry.problem):
-            copy = workshop / f"{out.name}_{number}.mcap"
+        unfinished.mkdir(parents=True)
+        readable = [entry for entry in entries if not entry.problem]
+        for number, entry in enumerate(readable):
+            copy = unfinished / f"{out.name}_{number}.mcap"
             if entry.whole:
                 shutil.copyfile(entry.file.path, copy)
                 entry.count.name = copy.name
-                counts.append(entry.count)
             else:
-                counts.append(_copy(entry.file.path, copy))
-        write_metadata(workshop, _information((entry.file for entry in entries), counts))
-        workshop.rename(out)
+                entry.count = _copy(entry.file.path, copy)
+        counts = [entry.count for entry in readable]
+        write_metadata(unfinished, _information((entry.file for entry in entries), counts))
+        unfinished.rename(out)
     except OSError as error:
         raise BagError(f"{out}: cannot be written ({error.strerror}): choose another place") from error
     finally:
-        shutil.rmtree(workshop, ignore_errors=True)
+        shutil.rmtree(unfinished, ignore_errors=True)
     return total
 
 
@@ -156,33 +130,31 @@ def salvage_in_place(directory: str | Path) -> SalvageReport:
         raise BagError(f"{directory}: has its {METADATA_FILE}: it is a bag already, nothing to salvage")
     _refuse_living(directory)
     # A file that cannot be read to its end stays as it is: of a disk, another attempt may read more.
-    entries, total = _look(bag_files(directory), parts=False)
-    saved: list[tuple[Path, Path | None, FileCount]] = []  # file, its copy (None: whole), what is in it
+    entries, total = _read_all(bag_files(directory), parts=False)
+    readable = [entry for entry in entries if not entry.problem]
+    copies: dict[Path, Path] = {}  # of the files that are not whole
     try:
-        for entry in (entry for entry in entries if not entry.problem):
+        for entry in readable:
             file = entry.file.path
-            copy = None if entry.whole else file.with_name(f".{file.name}.salvaged")
-            saved.append((file, copy, entry.count))
-            if copy is not None:
-                saved[-1] = (file, copy, _copy(file, copy))
-        for file, copy, count in saved:
-            count.name = file.name
-            if copy is not None:
-                # The copy is MCAP, compressed by chunks.
-                count.name = file.name.removesuffix(ZSTD_SUFFIX).removesuffix(SQLITE_SUFFIX).removesuffix(".mcap")
-                count.name += ".mcap"
-                copy.replace(file.with_name(count.name))
-                if count.name != file.name:
+            if not entry.whole:
+                copies[file] = file.with_name(f".{file.name}.salvaged")
+                entry.count = _copy(file, copies[file])
+        for entry in readable:
+            file, name = entry.file.path, entry.file.path.name
+            if file in copies:  # the copy is MCAP, compressed by chunks
+                name = name.removesuffix(ZSTD_SUFFIX).removesuffix(SQLITE_SUFFIX).removesuffix(".mcap") + ".mcap"
+                copies[file].replace(file.with_name(name))
+                if name != file.name:
                     file.unlink()
-        counts = [count for _, _, count in saved]
-        write_metadata(directory, _information((entry.file for entry in entries), counts))
+            entry.count.name = name
+        information = _information((entry.file for entry in entries), [entry.count for entry in readable])
+        write_metadata(directory, information)
         (directory / RECORDING_MARKER).unlink(missing_ok=True)
     except OSError as error:
         raise BagError(f"{directory}: cannot be written ({error.strerror}): nothing was lost, try again") from error
     finally:
-        for _, copy, _ in saved:
-            if copy is not None:
-                copy.unlink(missing_ok=True)
+        for copy in copies.values():
+            copy.unlink(missing_ok=True)
     return total
 
 
@@ -192,7 +164,7 @@ def _refuse_living(bag: Path) -> None:
         raise BagError(f"{bag}: process {pid} is recording it: stop that first")
 
 
-def _look(files: Sequence[Path], *, parts: bool) -> tuple[list[FileInventory], SalvageReport]:
+def _read_all(files: Sequence[Path], *, parts: bool) -> tuple[list[FileInventory], SalvageReport]:
     """Read all files: what each holds, and the report of all.
 
     With ``parts``, a file that cannot be read any further counts as torn there, otherwise as unreadable.
@@ -304,13 +276,9 @@ class _Channels:
             return self._channels[number]
         channel = self._source.channels[number]
         schema = self._source.schemas.get(channel.schema_id)
-        if schema is None:
-            copied = 0
-        elif schema.id in self._schemas:
-            copied = self._schemas[schema.id]
-        else:
-            copied = self._writer.register_schema(schema.name, schema.encoding, schema.data)
-            self._schemas[schema.id] = copied
+        if schema is not None and schema.id not in self._schemas:
+            self._schemas[schema.id] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+        copied = self._schemas[schema.id] if schema else 0
         copy = self._writer.register_channel(channel.topic, channel.message_encoding, copied, channel.metadata)
         count = self._count.channels.setdefault(channel.topic, channel_count(channel, schema.name if schema else ""))
         self._channels[number] = copy, count

@@ -3,30 +3,102 @@
 
 """A file of a bag, whatever its storage: its topics, and its messages in batches that numpy can work on.
 
-rosbag2 can compress each message by itself (compression mode `message`); such messages are unpacked here.
+Also how new files are compressed and split, and the files of rosbag2's sqlite3 storage.
 """
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import zstandard
 from mcap.records import Attachment, Channel, Metadata, Schema
 
-from msg_analysis.bags.mcap_chunks import MESSAGE_HEAD, RECORD_LIMIT, DamageError, gather
 from msg_analysis.common.arrays import AnyArray, BoolArray, IntArray
-from msg_analysis.errors import BagError
+from msg_analysis.errors import BagError, InputError
 
-# Unpacked bytes for every byte of the file, at most, and those that any file may have. States shrink to two thirds,
-# those of a run without noise to a two hundredth.
+Compression = Literal["none", "zstd", "lz4"]
+COMPRESSIONS: tuple[Compression, ...] = ("none", "zstd", "lz4")
+MEGABYTE = 10**6
+SMALLEST_SPLIT = 0.1  # MB; about the size of a chunk
+SQLITE_SUFFIX, ZSTD_SUFFIX = ".db3", ".zstd"  # the latter of rosbag2's compression mode `file`
+# As in rosbag2: small enough that a killed recorder loses little, large enough that the readers' work per chunk does
+# not matter. With a third of it, reading takes a fifth longer.
+CHUNK_SIZE = 768 * 1024
+BAG_SUFFIXES = (".mcap", ".mcap.zstd", ".db3", ".db3.zstd")  # of the files that can be read
+
+
+@dataclass(frozen=True, slots=True)
+class Storage:
+    """Compression of the chunks, and when the bag goes on in a new file."""
+
+    compression: Compression = "zstd"
+    # Bytes of messages per file; None: one file. A file gets larger by its head, its summary and one chunk.
+    split_size: int | None = None
+    chunk_size: int = CHUNK_SIZE  # bytes
+
+    def __post_init__(self) -> None:
+        """Check them, wherever they came from."""
+        if self.compression not in COMPRESSIONS:
+            raise InputError(f"compression: {self.compression!r}: expected one of {', '.join(COMPRESSIONS)}")
+        if self.split_size is not None and self.split_size <= 0:
+            raise InputError(f"split size: {self.split_size} bytes: expected more than 0")
+
+
+DEFAULT_STORAGE = Storage()
+
+
+RECORD_LIMIT = 2**28  # bytes of one record or chunk; recorders write megabytes, only damage claims more
+# Fields of a message record before the CDR bytes: 22 bytes; times in ns.
+MESSAGE_HEAD = np.dtype([("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<u8"), ("publish_time", "<u8")])
+
+
+class DamageError(Exception):
+    """A record whose content does not fit its type."""
+
+
+def gather(data: bytes, start: IntArray, size: int) -> AnyArray:
+    """(pieces,) of type ``V<size>``: pieces of a buffer, ``size`` >= 1 bytes each, copied from the offsets ``start``.
+
+    ``.view`` gives them their type. IndexError where a piece ends behind the buffer.
+    """
+    count = len(data) - size + 1
+    if count < 1:
+        if len(start):
+            raise IndexError(f"{size} bytes of a buffer of {len(data)}")
+        return np.empty(0, f"V{size}")
+    # One element at every byte, overlapping the next ones: indexing copies whole pieces.
+    windows: AnyArray = np.ndarray(count, f"V{size}", data, strides=(1,))
+    return np.asarray(windows[start])
+
+
+def scatter(data: AnyArray, start: IntArray, pieces: AnyArray) -> None:
+    """Copy (pieces,) of type ``V<size>`` to the offsets ``start`` of a buffer, (bytes,) uint8, where none overlap."""
+    size = pieces.itemsize
+    windows: AnyArray = np.ndarray(len(data) - size + 1, f"V{size}", data, strides=(1,))
+    windows[start] = pieces
+
+
+# Unpacked bytes for every byte of the file, at most, and those that any file may have: states shrink at most 200 times.
 MOST_EXPANSION = 1000
 FREE_EXPANSION = 2**26
 MOST_CHANNELS = 2**13  # of a file: writing the metadata of each topic takes a tenth of a millisecond
 _ZSTD_FRAME = b"\x28\xb5\x2f\xfd"  # first bytes; no CDR message begins like that
 _UNPACKED = 2**22  # bytes of a batch of messages that were unpacked one by one
+# The sqlite3 storage. Of `topics`, the last two columns are not in all versions of rosbag2.
+_AT_ONCE = 2**20  # bytes of a batch of rows, and of a file that are unpacked together
+_WAL = 2  # write version in the head of a file in the mode WAL
+_WRITE_VERSION = 18  # its place
+_ROW = 32  # bytes that a row counts beside its message
+_COLUMNS = ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash")
+_REQUIRED = 4
+_ROWS = "SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,7 +187,10 @@ class StoredFile:
             )
 
     def _unpack(self, batch: Batch, packed: BoolArray) -> Iterator[Batch]:
-        """The same messages unpacked, in several batches if they are large; one that cannot be unpacked stays."""
+        """The same messages, those that rosbag2 compressed one by one (compression mode `message`) unpacked.
+
+        In several batches if they are large; one that cannot be unpacked stays.
+        """
         zstd = zstandard.ZstdDecompressor()
         pieces: list[bytes] = []
         filled = first = 0
@@ -144,6 +219,12 @@ class StoredFile:
         return unpacked
 
 
+def no_time(head: AnyArray) -> BoolArray:
+    """(messages,) whether the log or publish time is 2^63 ns or more, which no clock shows."""
+    octets = head.view(np.uint8).reshape(len(head), MESSAGE_HEAD.itemsize)
+    return np.asarray((octets[:, 13] | octets[:, 21]) >= 128)  # the highest byte of either
+
+
 def batch_of(pieces: list[bytes], head: AnyArray, end: int) -> Batch:
     """A batch of messages that are not in one buffer yet; ``head``, (messages,), and ``end`` as in ``Batch``."""
     size = np.array([len(piece) for piece in pieces], dtype=np.int64)
@@ -162,7 +243,105 @@ def _packed(batch: Batch) -> BoolArray:
     return np.asarray(packed)
 
 
-def no_time(head: AnyArray) -> BoolArray:
-    """(messages,) whether the log or publish time is 2^63 ns or more, which no clock shows."""
-    octets = head.view(np.uint8).reshape(len(head), MESSAGE_HEAD.itemsize)
-    return np.asarray((octets[:, 13] | octets[:, 21]) >= 128)  # the highest byte of either
+@dataclass(slots=True)
+class SqliteFile(StoredFile):
+    """A sqlite3 file (.db3) to be read once, by iterating over ``batches()``; compressed if named *.zstd."""
+
+    def _stored(self) -> Iterator[Batch]:
+        with contextlib.ExitStack() as stack:
+            try:
+                if not self.path.stat().st_size:
+                    raise BagError(f"{self.path}: empty: nothing was recorded")
+                file = self.path
+                if file.suffix == ZSTD_SUFFIX:
+                    file = stack.enter_context(self._unpacked())
+                size = file.stat().st_size
+                connection = _connect(file)
+                stack.callback(connection.close)
+                numbers = self._read_topics(connection)
+            except (OSError, sqlite3.Error, zstandard.ZstdError) as error:
+                raise BagError(f"{self.path}: cannot be read ({error})") from error
+            yield from self._rows(connection, numbers, size)
+
+    @contextlib.contextmanager
+    def _unpacked(self) -> Iterator[Path]:
+        """A temporary file with the content: SQLite needs to read here and there. What is cut off is missing."""
+        with tempfile.NamedTemporaryFile(suffix=".db3") as copy, self.path.open("rb") as packed:
+            reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+            while piece := reader.read(_AT_ONCE):
+                self.count_expanded(len(piece), packed.tell())
+                copy.write(piece)
+            copy.flush()
+            self._expanded = 0
+            yield Path(copy.name)
+
+    def _read_topics(self, connection: sqlite3.Connection) -> dict[int, int]:
+        """Note the topics; number of the channel by number of the topic. BagError: not a bag."""
+        tables = connection.execute(
+            "SELECT name FROM sqlite_master WHERE type = 'table' AND sql NOT LIKE 'CREATE VIRTUAL%'"
+        )
+        names = {name for (name,) in tables}
+        columns = [row[1] for row in connection.execute("PRAGMA table_info(topics)")]
+        if not {"topics", "messages"} <= names or not set(_COLUMNS[:_REQUIRED]) <= set(columns):
+            raise BagError(
+                f"{self.path}: not a bag: expected the tables of ROS 2's sqlite3 storage, topics and messages"
+            )
+        definitions: dict[str, str] = {}
+        if "message_definitions" in names:
+            query = "SELECT topic_type, encoded_message_definition FROM message_definitions WHERE encoding = 'ros2msg'"
+            definitions = dict(connection.execute(f"{query} LIMIT {MOST_CHANNELS}"))
+        wanted = ", ".join(name if name in columns else "''" for name in _COLUMNS)
+        numbers: dict[int, int] = {}
+        schemas: dict[str, int] = {}
+        for topic, *texts in connection.execute(f"SELECT {wanted} FROM topics ORDER BY id LIMIT {MOST_CHANNELS + 1}"):
+            name, kind, encoding, qos, type_hash = map(str, texts)
+            if kind not in schemas:
+                schemas[kind] = len(schemas) + 1
+                definition = str(definitions.get(kind, "")).encode()
+                self.schemas[schemas[kind]] = Schema(schemas[kind], definition, "ros2msg", kind)
+            numbers[topic] = len(numbers) + 1
+            metadata = {"offered_qos_profiles": qos, "topic_type_hash": type_hash}
+            self.add_channel(Channel(numbers[topic], name, encoding, metadata, schemas[kind]))
+        return numbers
+
+    def _rows(self, connection: sqlite3.Connection, numbers: dict[int, int], size: int) -> Iterator[Batch]:
+        """The messages, in the order of their rows, of a file of ``size`` bytes."""
+        pieces: list[bytes] = []
+        heads: list[tuple[int, int, int, int]] = []
+        filled = 0
+        try:
+            for topic, time, data in connection.execute(_ROWS):
+                if type(time) is not int or time < 0 or type(data) is not bytes:
+                    self.damaged_chunks += 1
+                    continue
+                pieces.append(data)
+                heads.append((numbers.get(topic, 0), 0, time, time))
+                filled += len(data) + _ROW
+                if filled > _AT_ONCE:
+                    self.count_expanded(filled, size)
+                    self.whole_bytes = min(size, self.whole_bytes + filled)
+                    yield batch_of(pieces, np.array(heads, MESSAGE_HEAD), self.whole_bytes)
+                    pieces, heads, filled = [], [], 0
+        except sqlite3.Error as error:
+            if not self.whole_bytes and not pieces:
+                raise BagError(f"{self.path}: cannot be read ({error})") from error
+            self.torn = f"cannot be read to its end ({error})"
+        self.whole_bytes = size if self.torn is None else min(size, self.whole_bytes + filled)
+        if pieces:
+            yield batch_of(pieces, np.array(heads, MESSAGE_HEAD), self.whole_bytes)
+
+
+def _connect(file: Path) -> sqlite3.Connection:
+    """Open a file without changing anything, also in a directory that cannot be written.
+
+    Without a log beside it, the mode WAL would make one.
+    """
+    with file.open("rb") as stream:
+        head = stream.read(_WRITE_VERSION + 1)
+    log = file.with_name(file.name + "-wal")
+    alone = head[_WRITE_VERSION:] == bytes([_WAL]) and not (log.exists() and log.stat().st_size)
+    connection = sqlite3.connect(f"{file.absolute().as_uri()}?{'immutable=1' if alone else 'mode=ro'}", uri=True)
+    connection.text_factory = lambda text: text.decode(errors="replace")
+    connection.execute("PRAGMA writable_schema=ON")  # or a file that is cut off could not be read at all
+    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, RECORD_LIMIT)
+    return connection

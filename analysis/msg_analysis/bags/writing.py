@@ -1,11 +1,9 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Writing bags: of a network that runs, and of a whole run.
+"""Writes bags that rosbag2, rosbags, Foxglove and PlotJuggler open: directories with MCAP files.
 
-Writes a bag that rosbag2, rosbags, Foxglove and PlotJuggler open: a directory with MCAP files.
-
-While it is written, the directory has a locked marker instead of metadata.yaml. The files of a split bag follow each
+While a bag is written, its directory has a locked marker instead of metadata.yaml. The files of a split bag follow each
 other in time, and each begins with what is in force of the latched topics.
 """
 
@@ -13,177 +11,43 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import functools
 import heapq
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
-from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Self
 
 import numpy as np
 
-from msg_analysis.bags.files import ChannelCount, FileCount, bag_information, dump, write_metadata
-from msg_analysis.bags.mcap_chunks import DEFAULT_STORAGE, MESSAGE_HEAD, Storage
-from msg_analysis.bags.mcap_writing import McapWriter
-from msg_analysis.common.arrays import IntArray
+from msg_analysis.arithmetic.reproducible import StepClock
+from msg_analysis.arithmetic.update_law import to_payload
+from msg_analysis.bags.files import FileCount, bag_information, write_metadata
+from msg_analysis.bags.mcap_writing import LatchedMessage, WrittenFile
+from msg_analysis.bags.stored_file import DEFAULT_STORAGE, Storage
+from msg_analysis.common.arrays import BLOCK_NUMBERS, IntArray, release
 from msg_analysis.common.files import require_utf8
 from msg_analysis.errors import BagError
-from msg_analysis.messages.topics import Qos, Topic
-
-RECORD_NAME = "msg_agents"  # of the MCAP metadata record with the run record
-ROSBAG2_RECORD = "rosbag2"
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class LatchedMessage:
-    """A message that later files repeat at their heads; in the order of time, then of its topic's messages."""
-
-    time: int  # [ns]
-    sequence: int  # among the messages of its topic, from 0
-    topic: str
-    data: bytes
-    until: int | None  # last time [ns] at which it is in force; None: always
-
-
-class WrittenFile:
-    """A new file; OSError, from every method: exists, or cannot be written.
-
-    A split bag knows where the file ends only when it is full: messages up to ``bound`` still belong into it then.
-    """
-
-    def __init__(self, path: Path, earlier: Sequence[FileCount], storage: Storage, *, begin: int = 0) -> None:
-        self.count = FileCount(path.name)
-        self.begin = begin  # first time that belongs into it [ns]
-        self.bound: int | None = None  # last one [ns]; None: not full
-        self.behind: set[str] = set()  # topics of which messages up to the bound may still come
-        self._earlier, self._storage, self._directory = list(earlier), storage, str(path.parent)
-        self._numbers: dict[str, int] = {}  # of the channels
-        self._stream: BinaryIO = path.open("xb")
-
-    def write_head(
-        self,
-        topics: Sequence[Topic],
-        record: str | None,
-        custom: Mapping[str, str],
-        latched: Iterable[LatchedMessage] = (),
-    ) -> None:
-        """Write the run record, the topics, and what is in force of the latched ones; the first thing to be written."""
-        storage, self._custom = self._storage, custom
-        self.mcap = McapWriter(
-            self._stream,
-            chunk_size=min(storage.chunk_size, storage.split_size or storage.chunk_size),
-            compression=storage.compression,
-            directory=self._directory,
-        )
-        self._add_information()
-        if record is not None:
-            self.mcap.add_metadata(RECORD_NAME, {"record": record})
-        schemas: dict[str, int] = {}
-        for topic in topics:
-            kind = topic.type.full_name
-            if kind not in schemas:
-                schemas[kind] = self.mcap.register_schema(kind, "ros2msg", topic.type.schema.encode())
-            self._add_channel(topic, schemas[kind])
-        for message in latched:
-            self.repeat(message)
-        self.mcap.flush()
-        # The head is not counted: it may be larger than the limit, and every file has it.
-        self._limit = None if storage.split_size is None else self._stream.tell() + storage.split_size
-
-    def _add_channel(self, topic: Topic, schema: int) -> None:
-        offered = topic.qos.offered()
-        self.count.channels[topic.name] = ChannelCount(topic.name, topic.type.full_name, topic.type.type_hash, offered)
-        metadata = {"offered_qos_profiles": _offered(topic.qos), "topic_type_hash": topic.type.type_hash}
-        self._numbers[topic.name] = self.mcap.register_channel(topic.name, "cdr", schema, metadata)
-
-    @property
-    def full(self) -> bool:
-        """Whether it has as many bytes as a file of a split bag should have."""
-        return self._limit is not None and self._stream.tell() >= self._limit
-
-    def add(self, topic: str, data: bytes, time_ns: int, sequence: int) -> None:
-        """Append a message."""
-        self.mcap.add_message(self._numbers[topic], time_ns, data, sequence)
-        self._counted(topic, 1, time_ns, time_ns)
-
-    def repeat(self, message: LatchedMessage) -> None:
-        """Append a message again that another file has: logged at the beginning of this one, published when it was."""
-        self.mcap.add_message(
-            self._numbers[message.topic], self.begin, message.data, message.sequence, published_ns=message.time
-        )
-        self._counted(message.topic, 1, self.begin, self.begin)
-
-    def add_many(
-        self,
-        topics: Sequence[str],
-        of: IntArray,
-        time_ns: IntArray,
-        data: bytes,
-        start: IntArray,
-        size: IntArray,
-        sequences: dict[str, int],
-    ) -> list[str]:
-        """Append messages (see ``BagWriter.write_many``) and count them in ``sequences``; the topics that they have."""
-        head = np.zeros(len(of), MESSAGE_HEAD)
-        head["log_time"] = head["publish_time"] = time_ns
-        order = np.argsort(of.astype(np.uint16), kind="stable")  # a radix sort; channels of MCAP have 16 bits
-        present, first, counts = np.unique(of[order], return_index=True, return_counts=True)
-        names = [topics[topic] for topic in present.tolist()]
-        earlier = [sequences[name] for name in names]
-        head["channel"][order] = np.repeat([self._numbers[name] for name in names], counts)
-        head["sequence"][order] = np.arange(len(of)) + np.repeat(np.array(earlier) - first, counts)
-        self.mcap.add_messages(head, data, start, size)
-        begin, end = int(time_ns.min()), int(time_ns.max())
-        for name, count in zip(names, counts.tolist(), strict=True):
-            sequences[name] += count
-            self._counted(name, count, begin, end)
-        return names
-
-    def _counted(self, topic: str, messages: int, begin: int, end: int) -> None:
-        count = self.count
-        count.channels[topic].messages += messages
-        if end > count.end:
-            count.end = end
-        if begin < count.start:
-            count.start = begin
-
-    def finish(self) -> None:
-        """Write the summary; then the file is whole and on the disk."""
-        self._add_information()
-        self.mcap.finish()
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
-        self._stream.close()
-
-    def abandon(self) -> None:
-        """Close the file as it is."""
-        with contextlib.suppress(OSError):  # closing tries again to write what is left
-            self._stream.close()
-
-    def _add_information(self) -> None:
-        information = bag_information([*self._earlier, self.count], self._custom)
-        self.mcap.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": dump(information)})
-
-
-@functools.cache
-def _offered(qos: Qos) -> str:
-    """Of all agents' topics the same."""
-    return dump(qos.offered())
-
+from msg_analysis.messages.messages import ActiveGraph, StateCodec, encode_string
+from msg_analysis.messages.topics import EXPERIMENT, GRAPH, STATE, TRUTH, Topic, network_topics
+from msg_analysis.model.reception import LOST
+from msg_analysis.model.run import Run
 
 RECORDING_MARKER = ".recording"
 # Files that wait for late messages. An agent so far behind that this is not enough is dead, and its messages, if it
 # comes back, are in a later file.
 MOST_OPEN = 3
+AT_ONCE = 4096  # messages
+# Topic, CDR bytes, time [ns], and of a sojourn the time of the first state behind it [ns].
+_Message = tuple[str, bytes, int, int | None]
 
 
 class BagWriter:
     """A bag being written: its directory, new or empty, has ``.recording`` (locked) and no metadata.yaml.
 
-    The run record (JSON) is kept in every file. A full file is closed, and on the disk, when all topics have passed its
+    The run record (JSON) is in every file. A full file is closed, and on the disk, when all topics have passed its
     end. BagError, here and in the methods: cannot be written; what was written before stays readable.
     """
 
@@ -233,7 +97,7 @@ class BagWriter:
         """Append a message (CDR with encapsulation header) to a topic, by absolute name, at a simulated time [ns].
 
         Files that begin later repeat it if the topic is latched, up to the time ``until`` [ns] (None: always). A split
-        bag keeps a latched message that is ahead of its time until then.
+        bag holds a latched message that is ahead of its time until then.
         """
         if topic not in self._sequences or self._closed:
             raise self._refused("is closed" if self._closed else f"has no topic {topic}")
@@ -395,9 +259,7 @@ class BagWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
         self.close(complete=error is None)
 
 
@@ -417,3 +279,171 @@ def recording_pid(directory: Path) -> int | None:
     except (OSError, ValueError, KeyError, TypeError):  # no marker, or not one of ours
         pass
     return None
+
+
+def write_trajectory(
+    trajectory: Run,
+    directory: str | Path,
+    storage: Storage = DEFAULT_STORAGE,
+    block_numbers: int = BLOCK_NUMBERS,
+) -> None:
+    """Write a bag, whole or not at all; BagError where the directory exists or cannot be written.
+
+    InputError for a name that is not UTF-8.
+    """
+    directory = Path(directory).absolute()
+    require_utf8(directory)
+    if directory.exists():
+        raise exists_already(directory)
+    record = trajectory.record.to_json()
+    try:
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{directory.name}.", dir=directory.parent) as parent:
+            unfinished = Path(parent) / directory.name  # its final name: that of its file derives from it
+            noisy = trajectory.published is not None
+            topics = network_topics(trajectory.record.experiment.agents, truth=noisy)
+            with BagWriter(unfinished, topics, record=record, storage=storage) as bag:
+                bag.write(f"/{EXPERIMENT.name}", encode_string(record), 0)
+                _write(bag, [topic.name for topic in topics], _messages(trajectory, block_numbers))
+            unfinished.rename(directory)
+    except OSError as error:
+        raise BagError(f"{directory}: cannot be written ({error.strerror}): choose another place") from error
+
+
+def _write(bag: BagWriter, names: Sequence[str], messages: Iterator[_Message]) -> None:
+    """Write many messages at once: a fraction of the time of writing each. Sojourns come a little early."""
+    number = {name: index for index, name in enumerate(names)}
+    while part := list(islice(messages, AT_ONCE)):
+        for topic, content, stamp, until in part:
+            if until is not None:
+                bag.write(topic, content, stamp, until)
+        states = [message for message in part if message[3] is None]
+        if not states:
+            continue
+        topics, contents, times, _ = zip(*states, strict=True)
+        size = np.array([len(content) for content in contents], dtype=np.int64)
+        of = np.array([number[topic] for topic in topics], dtype=np.int64)
+        time = np.array(times, dtype=np.int64)
+        bag.write_many(names, of, time, b"".join(contents), np.cumsum(size) - size, size)
+
+
+def _messages(trajectory: Run, block_numbers: int = BLOCK_NUMBERS) -> Iterator[_Message]:
+    """The messages in the order of time."""
+    experiment = trajectory.record.experiment
+    run, dt = trajectory.record.run.bytes, experiment.step_length
+    time = StepClock(dt).nanoseconds
+    truth = STATE if trajectory.published is None else TRUTH
+    streams = [(_names(truth, experiment.agents), trajectory.states)]
+    if trajectory.published is not None:
+        streams.append((_names(STATE, experiment.agents), trajectory.published))
+    codecs = [[StateCodec(run, i + 1, states.shape[2], dt) for i in range(experiment.agents)] for _, states in streams]
+    heard = _heard(trajectory)
+    sojourns = _sojourns(trajectory)
+    sojourn = next(sojourns, None)
+    for steps, agents, times in _in_order(trajectory, block_numbers):
+        if trajectory.agent_modes is not None:
+            graphs = trajectory.agent_modes[steps, agents]
+        else:
+            graphs = np.where(steps > 0, trajectory.modes[steps - 1], -1)
+        values = [states[steps, agents] for _, states in streams]
+        there = [np.asarray(~np.isnan(each).any(axis=1)).tolist() for each in values]
+        cells = zip(steps.tolist(), agents.tolist(), times.tolist(), graphs.tolist(), strict=True)
+        for place, (k, i, now, graph) in enumerate(cells):
+            while sojourn is not None and sojourn.stamp <= now:
+                yield _graph_message(sojourn, time)
+                sojourn = next(sojourns, None)
+            for (topics, _), codec, is_there, value in zip(streams, codecs, there, values, strict=True):
+                if is_there[place]:
+                    payload = to_payload(value[place])
+                    yield topics[i], codec[i].wrap(k, graph + 1, payload, heard(k, i, graph), now), now, None
+        trajectory.release()
+    while sojourn is not None:
+        yield _graph_message(sojourn, time)
+        sojourn = next(sojourns, None)
+
+
+def _in_order(trajectory: Run, block_numbers: int) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
+    """Steps, agents and times (e,) of all states by time, those of one time by step and agent, a part at once."""
+    count, m, made = len(trajectory.states), trajectory.states.shape[1], trajectory.made
+    clock = StepClock(trajectory.record.experiment.step_length)
+    rows = max(1, block_numbers // trajectory.states[:1].size)
+    # Nothing of step k or a later one is earlier than later[k].
+    later = np.empty(count + 1, dtype=np.int64)
+    later[count] = np.iinfo(np.int64).max
+    for first in range(0, count if made is not None else 0, rows):
+        assert made is not None
+        times = made[first : first + rows]
+        later[first : first + len(times)] = np.where(times < 0, later[count], times).min(axis=1)
+        release(made)
+    later[:count] = np.minimum.accumulate(later[::-1])[::-1][:count]
+    waiting = np.empty(0, dtype=np.int64)
+    for first in range(0, count, rows):
+        end = min(first + rows, count)
+        cells = np.concatenate([waiting, np.arange(first * m, end * m)])
+        steps, agents = np.divmod(cells, m)
+        if made is None:
+            yield steps, agents, np.repeat(clock.times(np.arange(first, end)), m)
+            continue
+        times = made[steps, agents]
+        by = np.lexsort((cells, times))
+        ready, behind = np.split(by, [int(np.searchsorted(times[by], later[end], side="left"))])
+        waiting = cells[behind]
+        yield steps[ready], agents[ready], times[ready]
+
+
+def _graph_message(sojourn: ActiveGraph, time: Callable[[int], int]) -> _Message:
+    return f"/{GRAPH.name}", sojourn.encode(), sojourn.stamp, time(sojourn.last_step + 1)
+
+
+def _names(topic: Topic, agents: int) -> list[str]:
+    return [f"/{topic.of(i)}" for i in range(agents)]
+
+
+def _heard(trajectory: Run) -> Callable[[int, int, int], list[int]]:
+    """Function of (k, agent and graph from 0): ``heard`` of that state, the steps used in the step that led there.
+
+    Empty in lockstep where nothing was lost; complete in real time.
+    """
+    lost, values = trajectory.lost, trajectory.used
+    if lost is None and values is None:
+        return lambda _k, _i, _graph: []
+    model, delay = trajectory.record.model, trajectory.record.experiment.noise.delay
+    modes, agents = range(model.modes), range(model.agents)
+    counts = [[len(model.neighbours(mode, i)) for i in agents] for mode in modes]
+
+    def listed(k: int, i: int, graph: int) -> list[int]:
+        if k == 0:
+            return []
+        neighbours = counts[graph][i]
+        newest = max(0, k - 1 - delay)
+        if values is not None:
+            steps = values[k - 1, i, :neighbours].tolist()
+            if trajectory.made is None and all(step == newest for step in steps):
+                return []
+            return [LOST if step < 0 else step for step in steps]
+        if lost is None or not lost[k - 1, i].any():
+            return []
+        return [LOST if gone else newest for gone in lost[k - 1, i, :neighbours].tolist()]
+
+    return listed
+
+
+def _sojourns(trajectory: Run) -> Iterator[ActiveGraph]:
+    """The stretches of equal graph, without those whose graph is not known."""
+    experiment, modes = trajectory.record.experiment, trajectory.modes
+    time = StepClock(experiment.step_length).nanoseconds
+    first = np.flatnonzero(np.diff(modes, prepend=-2))
+    last = np.append(first[1:], len(modes)) - 1
+    known = modes[first] >= 0
+    for sequence, (start, end) in enumerate(zip(first[known].tolist(), last[known].tolist(), strict=True)):
+        graph = experiment.graph_list[modes[start]]
+        yield ActiveGraph(
+            stamp=time(start),
+            run=trajectory.record.run.bytes,
+            sequence=sequence,
+            mode=int(modes[start]) + 1,
+            name=graph.name,
+            first_step=start,
+            last_step=end,
+            arcs=graph.arcs,
+        )

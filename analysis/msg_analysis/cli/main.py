@@ -31,12 +31,12 @@ from msg_analysis.cli.options import (
     storage,
     storage_options,
 )
-from msg_analysis.common.version import __version__
+from msg_analysis.common.resources import __version__
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
-    from msg_analysis.bags.mcap_chunks import Compression
-    from msg_analysis.sweeps.results import OtherSoftware
+    from msg_analysis.bags.stored_file import Compression
+    from msg_analysis.sweeps.workers import OtherSoftware
 
 
 @click.group(cls=CommandGroup)
@@ -306,7 +306,7 @@ def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Pa
 def schema(what: str) -> None:
     """Print the JSON Schema of a kind of file, for editors."""
     if what == "sweep":
-        from msg_analysis.sweeps.sweep_file import json_schema
+        from msg_analysis.sweeps.grid import json_schema
     else:
         from msg_analysis.experiment.experiment import json_schema
 

@@ -19,7 +19,7 @@ from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
     from msg_analysis import Experiment
-    from msg_analysis.bags.mcap_chunks import Compression, Storage
+    from msg_analysis.bags.stored_file import Compression, Storage
 
 # As in the modules of bags and results, whose imports take longer than --help may take.
 BAG_SUFFIXES = (".mcap", ".mcap.zstd", ".db3", ".db3.zstd")
@@ -50,7 +50,7 @@ def storage_options(command: Callable[..., None]) -> Callable[..., None]:
 
 def storage(compression: Compression, split_size: float | None) -> Storage:
     """The storage that these options ask for; ``split_size`` [MB, 10^6 bytes] is None for one file."""
-    from msg_analysis.bags.mcap_chunks import MEGABYTE, Storage
+    from msg_analysis.bags.stored_file import MEGABYTE, Storage
 
     try:
         size = None if split_size is None else round(split_size * MEGABYTE)

@@ -19,8 +19,9 @@ from msg_analysis.errors import ExitCode, InputError, killed_by
 from msg_analysis.sweeps.points import require_libraries
 
 if TYPE_CHECKING:
-    from msg_analysis.sweeps.points import Job
-    from msg_analysis.sweeps.results import Conducted, OtherSoftware, OutcomeStore
+    from msg_analysis.sweeps.points import Job, JobResults
+    from msg_analysis.sweeps.results import ResultStore
+    from msg_analysis.sweeps.workers import OtherSoftware
 
 
 other_software = click.option(
@@ -96,13 +97,12 @@ def sweep(
     from msg_analysis.report.list_pages import write_sweep_page
     from msg_analysis.report.sweep_plots import write_figure
     from msg_analysis.report.tables import describe_sweep, print_sweep, summary
-    from msg_analysis.sweeps.figure_series import picture
     from msg_analysis.sweeps.points import options
-    from msg_analysis.sweeps.results import OutcomeStore, judge_sweep, rows_of, write_tables
+    from msg_analysis.sweeps.results import ResultStore, evaluate_sweep, picture, rows_of, write_tables
 
     directory = out or Path("sweeps") / plan.name
     network = options(directory, keep_bags, workers or 1) if plan.kind == "network" else None
-    with OutcomeStore.open(directory) as store:
+    with ResultStore.open(directory) as store:
         done = _conduct(
             context,
             plan.name,
@@ -113,7 +113,7 @@ def sweep(
             network=network,
             **how,
         )
-        judgement = judge_sweep(done.outcomes, plan.spec.level)
+        judgement = evaluate_sweep(done.outcomes, plan.spec.level)
         rows = rows_of(plan, done.outcomes, judgement)
         document = finite(describe_sweep(plan, done, judgement, rows))
         try:
@@ -147,11 +147,10 @@ def _end(number: int, _: object) -> None:
     raise _EndedBySignal(number)
 
 
-def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: OutcomeStore, **how: Any) -> Conducted:
+def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: ResultStore, **how: Any) -> JobResults:
     """Do all jobs, with progress on stderr; if interrupted, say what is kept and exit."""
     from msg_analysis.cli.console import SweepProgress
-    from msg_analysis.sweeps.results import conduct
-    from msg_analysis.sweeps.workers import ENDING, WorkersLostError
+    from msg_analysis.sweeps.workers import ENDING, WorkersLostError, run_jobs
 
     if store.damaged:
         print_note(f"{store.directory}: {store.damaged} lines cannot be read: their points are computed again")
@@ -160,7 +159,7 @@ def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Out
             signal.signal(number, _end)
     try:
         with SweepProgress(title) as progress:
-            return conduct(jobs, store, watch=progress.done, **how)
+            return run_jobs(jobs, store, watch=progress.done, **how)
     except (KeyboardInterrupt, WorkersLostError) as error:
         there = sum(job.id in store.outcomes for job in jobs)
         kept = f"{there} of {len(jobs)} points are kept in {store.directory}: the same command continues"
@@ -186,13 +185,13 @@ def emulate(
     """``msg-analysis figures --emulate``: run the networks, write the figures; returns the exit code."""
     from msg_analysis.paper.figures import disagreeing, measured, runs_of, summary, write_figures
     from msg_analysis.sweeps.points import FAILED, options
-    from msg_analysis.sweeps.results import OutcomeStore
+    from msg_analysis.sweeps.results import ResultStore
 
     require_libraries()
     runs = [run for number in numbers for run in runs_of(number)]
     directory = out / "emulation"
     network = options(directory, False, 1)
-    with OutcomeStore.open(directory) as store:
+    with ResultStore.open(directory) as store:
         jobs = [run.job() for run in runs]
         done = _conduct(context, "networks", jobs, store, network=network, other_software=other_software, retry=True)
     points = measured(runs, done.outcomes)

@@ -23,7 +23,7 @@ AnyArray = NDArray[Any]
 
 
 LARGE = 2**27  # bytes from which an array is in a file
-BLOCK_NUMBERS = 2_000_000  # numbers of a large array that are looked at together: 16 MB
+BLOCK_NUMBERS = 2_000_000  # numbers of a large array that are processed together: 16 MB
 SMALL_BLOCK = 200_000  # the same where there are several such arrays: they stay in the caches, and memory is used again
 
 
@@ -46,29 +46,30 @@ class LargeRows:
     def __init__(self, columns: int, dtype: Any) -> None:
         self._shape, self._dtype = (-1, columns), np.dtype(dtype)
         self._parts: list[AnyArray] = []
-        self._kept = self._written = 0  # bytes
+        self._held = self._written = 0  # bytes
         self._file: IO[bytes] | None = None
 
     def append(self, rows: AnyArray) -> int:
         """Add rows; the number of those before."""
         part = np.ascontiguousarray(rows, self._dtype)
-        before: int = (self._kept + self._written) // (self._shape[1] * self._dtype.itemsize)
+        before: int = (self._held + self._written) // (self._shape[1] * self._dtype.itemsize)
         self._parts.append(part)
-        self._kept += part.nbytes
-        if self._kept + self._written >= LARGE // 8:
+        self._held += part.nbytes
+        if self._held + self._written >= LARGE // 8:
             self._move()
         return before
 
     def array(self) -> AnyArray:
         """(rows, columns), when all have been added: read-only where it is in a file."""
-        kept = np.concatenate([np.empty((0, self._shape[1]), self._dtype), *self._parts])
+        in_memory = np.concatenate([np.empty((0, self._shape[1]), self._dtype), *self._parts])
         if self._file is None:
-            return kept
+            return in_memory
         with self._file as file:
             if not self._written:
-                return kept
+                return in_memory
             written = np.memmap(file, dtype=self._dtype, mode="r", shape=(self._written // self._dtype.itemsize,))
-        return np.concatenate([written.reshape(self._shape), kept]) if len(kept) else written.reshape(self._shape)
+        rows: AnyArray = written.reshape(self._shape)
+        return np.concatenate([rows, in_memory]) if len(in_memory) else rows
 
     def _move(self) -> None:
         """Into the file; they stay in memory where the disk is full."""
@@ -81,7 +82,7 @@ class LargeRows:
                 while left:
                     left = left[self._file.write(left) :]
                 self._written += self._parts[0].nbytes
-                self._kept -= self._parts.pop(0).nbytes
+                self._held -= self._parts.pop(0).nbytes
 
 
 def in_file(array: AnyArray) -> bool:
@@ -97,7 +98,7 @@ def release(array: AnyArray) -> None:
 
 
 def pieces(array: AnyArray) -> Iterator[slice]:
-    """Stretches of the first axis of ``BLOCK_NUMBERS`` numbers; each is released when it has been looked at."""
+    """Stretches of the first axis of ``BLOCK_NUMBERS`` numbers; each is released when it has been processed."""
     length = max(1, BLOCK_NUMBERS // max(1, array[:1].size))
     for first in range(0, len(array), length):
         yield slice(first, first + length)

@@ -1,20 +1,28 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Cores, threads of linear algebra, and the progress of long work."""
+"""Cores, threads of linear algebra, the progress of long work, and the versions of the software."""
 
 from __future__ import annotations
 
 import functools
+import importlib.util
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
+
+try:
+    __version__ = version("msg_analysis")
+except PackageNotFoundError:  # run from a source tree that is not installed
+    __version__ = "0.0.0"
 
 
 def available_cores() -> list[int]:
@@ -107,3 +115,20 @@ def tell(what: str, done: int, total: int) -> None:
     watch = _watch.get()
     if watch is not None:
         watch(what, done, total)
+
+
+@functools.cache
+def ros_distribution() -> str:
+    """Name of the ROS 2 that rclpy is imported from: jazzy, kilted, ...; empty where nothing tells it."""
+    spec = importlib.util.find_spec("rclpy")
+    place = Path(spec.origin).parents[1] if spec is not None and spec.origin else None
+    return distribution_at(place, os.environ.get("ROS_DISTRO", ""))
+
+
+def distribution_at(place: Path | None, sourced: str) -> str:
+    """The same, for an rclpy in the folder ``place`` and the ROS_DISTRO of a sourced ROS 2.
+
+    Wheels set no variable; ros-<name>-rclpy is installed beside theirs. ROS_DISTRO may be that of another ROS 2 then.
+    """
+    wheels = sorted(place.glob("ros_*_rclpy-*.dist-info")) if place else []
+    return wheels[0].name.split("_")[1] if wheels else sourced

@@ -14,7 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.common.arrays import FloatArray, IntArray, column, large_zeros, pieces, release
 from msg_analysis.inference.observation import Observation, Timers
 from msg_analysis.model.reception import neighbour_tables

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray, large_zeros, pieces, release
 from msg_analysis.common.resources import tell
 from msg_analysis.common.text import agent_text

@@ -12,8 +12,8 @@ from itertools import chain
 
 import numpy as np
 
-from msg_analysis.arithmetic.step_clock import StepClock
-from msg_analysis.bags.state_columns import own_layout
+from msg_analysis.arithmetic.reproducible import StepClock
+from msg_analysis.bags.states import own_layout
 from msg_analysis.common.arrays import AnyArray, FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.acceptance import Refusal

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.inference.messages import UnheardMessages, unheard_messages
 from msg_analysis.inference.observation import Observation

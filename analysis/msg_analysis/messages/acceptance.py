@@ -1,16 +1,10 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which messages of a run are accepted, and why others are rejected.
+"""Which messages of a run are accepted, and why others are rejected: the rules of all nodes and of the bag reader.
 
-Why messages are refused: the reasons that all receivers, the bag reader and the documentation use.
-
-They are keys in results (``refused``, ``strangers``) and in diagnostics: docs/faults.md and docs/messages.md list them.
-
-Signatures of the messages that steer a run: only processes that have the run's record with its key can make them.
-
-Progress, end, epoch, leave and requests to resend cannot be compared with the record as the graph can. Who forges one
-could end the run for all.
+What follows from the run record is compared with it, as the graph is. Progress, end, epoch, leave and requests to
+resend do not: they are signed with the key of the record, since who forges one could end the run for all.
 """
 
 from __future__ import annotations
@@ -22,7 +16,7 @@ from dataclasses import fields, replace
 from functools import cached_property
 from typing import TypeVar
 
-from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.arithmetic.update_law import all_finite
 from msg_analysis.messages.cdr import CdrError
 from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, StateFrame, decode_string, encode_string
@@ -33,7 +27,7 @@ from msg_analysis.model.step_model import first_graph
 
 
 class Refusal:
-    """A reason for each kind of message, from general to particular."""
+    """Why a message is rejected: keys in results and diagnostics; docs/faults.md and docs/messages.md list them."""
 
     OTHER_RUN = "other run"
     OTHER_EPOCH = "other epoch"
@@ -95,10 +89,7 @@ Message = TypeVar("Message", ActiveGraph, Progress)
 
 
 class RunRules:
-    """Which messages belong to a run: the rules of all its nodes, for all topics but those of the states.
-
-    What follows from the run record is compared with it; what does not is signed with its key.
-    """
+    """Which messages belong to a run, on all topics but those of the states."""
 
     def __init__(self, record: RunRecord) -> None:
         self._record = record

@@ -1,9 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Fields in CDR bytes, and many states in one message.
-
-Fields of messages in CDR bytes (OMG CDR, or XCDR1, as ROS 2 middleware sends it).
+"""Fields of messages in CDR bytes (OMG CDR, or XCDR1, as ROS 2 middleware sends it), and many states in one message.
 
 Layout: a 4-byte encapsulation header (00 01: little-endian, 00 00: big-endian, two bytes of options), then the fields
 in order, each primitive aligned to its own size, counted from the end of the header. A string is its length with the
@@ -18,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.common.arrays import AnyArray, IntArray
 
 LITTLE_ENDIAN = b"\x00\x01\x00\x00"

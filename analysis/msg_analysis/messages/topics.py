@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from msg_analysis.messages import schemas
-from msg_analysis.messages.schemas import MessageType
+from msg_analysis.messages import messages
+from msg_analysis.messages.messages import MessageType
 
 _NUMBER = "<i>"
 
@@ -23,17 +23,14 @@ _NUMBER = "<i>"
 class Qos:
     """Quality of service of a publisher or a subscription."""
 
-    depth: int | None = None  # messages kept for slow or late readers; None: all
+    depth: int | None = None  # messages stored for slow or late readers; None: all
     reliable: bool = True
-    latched: bool = False  # transient-local: late readers get the kept messages
+    latched: bool = False  # transient-local: late readers get the stored messages
 
     def __str__(self) -> str:
         depth = "keep-all" if self.depth is None else f"keep-last {self.depth}"
-        reliability, durability = (
-            "reliable" if self.reliable else "best-effort",
-            "latched" if self.latched else "volatile",
-        )
-        return f"{reliability}, {depth}, {durability}"
+        durability = "latched" if self.latched else "volatile"
+        return f"{'reliable' if self.reliable else 'best-effort'}, {depth}, {durability}"
 
     def offered(self) -> list[dict[str, Any]]:
         """The one profile that the publishers offer, as rosbag2 writes it."""
@@ -62,7 +59,7 @@ NEWEST = Qos(1, latched=True)
 RECENT = Qos(10)
 PASSIVE, PASSIVE_NEWEST = Qos(5000, reliable=False), Qos(1, reliable=False)
 """Of readers that no writer waits for: they miss messages if they are too slow. PASSIVE_NEWEST: what such a reader has
-not read yet is replaced, and nothing is kept for it."""
+not read yet is replaced, and nothing is stored for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,45 +83,31 @@ def agent_node_name(agent: int) -> str:
     return f"agent_{agent + 1}"
 
 
-EXPERIMENT = Topic("experiment", schemas.STRING, LATCHED, "switcher", "recorder, live, markers", recorded=True)
-GRAPH = Topic("graph", schemas.ACTIVE_GRAPH, LATCHED, "switcher", "agents, recorder", recorded=True)
+EXPERIMENT = Topic("experiment", messages.STRING, LATCHED, "switcher", "recorder, live, markers", recorded=True)
+GRAPH = Topic("graph", messages.ACTIVE_GRAPH, LATCHED, "switcher", "agents, recorder", recorded=True)
 STATE = Topic(
-    f"agent_{_NUMBER}/state", schemas.AGENT_STATE, STREAM, "agent", "neighbours, live, markers", recorded=True
+    f"agent_{_NUMBER}/state", messages.AGENT_STATE, STREAM, "agent", "neighbours, live, markers", recorded=True
 )
-TRUTH = Topic(f"agent_{_NUMBER}/truth", schemas.AGENT_STATE, STREAM, "agent", "live", recorded=True)
+TRUTH = Topic(f"agent_{_NUMBER}/truth", messages.AGENT_STATE, STREAM, "agent", "live", recorded=True)
 # The same messages for the recorder, which records them under the topics above: many in one message, since each message
 # costs a reader as much as recording a hundred states. The first agent of every process publishes them.
 # Processes that hear most of the network read STATES as well.
-STATES = Topic("states", schemas.STATE_BATCH, STREAM, "agent", "recorder, agents of dense networks")
-TRUTHS = Topic("truths", schemas.STATE_BATCH, STREAM, "agent", "recorder")
-PROGRESS = Topic("progress", schemas.PROGRESS, LATCHED, "agents, recorder", "switcher")
-RESEND = Topic("resend", schemas.PROGRESS, LATCHED, "agents", "agents")
-EPOCH = Topic("epoch", schemas.PROGRESS, LATCHED, "switcher", "agents")
-END = Topic("end", schemas.PROGRESS, LATCHED, "switcher", "agents, recorder, live, markers")
+STATES = Topic("states", messages.STATE_BATCH, STREAM, "agent", "recorder, agents of dense networks")
+TRUTHS = Topic("truths", messages.STATE_BATCH, STREAM, "agent", "recorder")
+PROGRESS = Topic("progress", messages.PROGRESS, LATCHED, "agents, recorder", "switcher")
+RESEND = Topic("resend", messages.PROGRESS, LATCHED, "agents", "agents")
+EPOCH = Topic("epoch", messages.PROGRESS, LATCHED, "switcher", "agents")
+END = Topic("end", messages.PROGRESS, LATCHED, "switcher", "agents, recorder, live, markers")
 # Before the end of a run that ends early (`--until`): at which step. Recorded, so that a bag is that of a shorter run.
-STOP = Topic("stop", schemas.PROGRESS, LATCHED, "switcher", "agents, recorder", recorded=True)
-LEAVE = Topic("leave", schemas.PROGRESS, LATCHED, "agents, switcher, recorder", "agents, switcher, recorder")
-ESTIMATE = Topic("estimate", schemas.ESTIMATE, NEWEST, "live", "")
+STOP = Topic("stop", messages.PROGRESS, LATCHED, "switcher", "agents, recorder", recorded=True)
+LEAVE = Topic("leave", messages.PROGRESS, LATCHED, "agents, switcher, recorder", "agents, switcher, recorder")
+ESTIMATE = Topic("estimate", messages.ESTIMATE, NEWEST, "live", "")
 MARKERS = Topic("markers", MessageType("visualization_msgs", "MarkerArray"), NEWEST, "markers", "")
 DIAGNOSTICS = Topic("/diagnostics", MessageType("diagnostic_msgs", "DiagnosticArray"), RECENT, "every process", "")
 CLOCK = Topic("/clock", MessageType("rosgraph_msgs", "Clock"), RECENT, "player", "nodes with use_sim_time")
 TOPICS = (
-    EXPERIMENT,
-    GRAPH,
-    STATE,
-    TRUTH,
-    STATES,
-    TRUTHS,
-    PROGRESS,
-    RESEND,
-    EPOCH,
-    END,
-    STOP,
-    LEAVE,
-    ESTIMATE,
-    MARKERS,
-    DIAGNOSTICS,
-    CLOCK,
+    *(EXPERIMENT, GRAPH, STATE, TRUTH, STATES, TRUTHS, PROGRESS, RESEND, EPOCH, END, STOP, LEAVE),
+    *(ESTIMATE, MARKERS, DIAGNOSTICS, CLOCK),
 )
 
 

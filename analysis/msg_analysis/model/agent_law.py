@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK
+from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK
 from msg_analysis.arithmetic.update_law import combine, from_payload, to_payload
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.protocols import AgentProtocol

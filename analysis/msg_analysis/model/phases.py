@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msg_analysis.arithmetic.random_streams import Stream, generator
+from msg_analysis.arithmetic.reproducible import Stream, generator
 from msg_analysis.common.arrays import FloatArray
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
+from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK, Stream, normals
 from msg_analysis.arithmetic.update_law import weighted_sum
 from msg_analysis.common.arrays import FloatArray
 

@@ -27,7 +27,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, link_number, normals, uniforms
+from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK, Stream, link_number, normals, uniforms
 from msg_analysis.arithmetic.update_law import Reception, from_payload, to_payload
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment

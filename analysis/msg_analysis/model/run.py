@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
-    from msg_analysis.bags.mcap_chunks import Storage
+    from msg_analysis.bags.stored_file import Storage
     from msg_analysis.inference.comparison import Comparison
     from msg_analysis.report.export import Table
 
@@ -235,8 +235,8 @@ class Run:
         BagError
             the directory exists or cannot be written
         """
-        from msg_analysis.bags.mcap_chunks import DEFAULT_STORAGE
-        from msg_analysis.bags.run_writer import write_trajectory
+        from msg_analysis.bags.stored_file import DEFAULT_STORAGE
+        from msg_analysis.bags.writing import write_trajectory
 
         write_trajectory(self, directory, storage or DEFAULT_STORAGE)
         return Path(directory)

@@ -23,7 +23,7 @@ from typing import Any, Self
 import numpy as np
 
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.common.version import __version__, ros_distribution
+from msg_analysis.common.resources import __version__, ros_distribution
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.protocols import info_of

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from msg_analysis.arithmetic.matrix_exponential import exponential
+from msg_analysis.arithmetic.reproducible import exponential
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.common.resources import one_blas_thread
 from msg_analysis.experiment.markov_chain import MarkovChain

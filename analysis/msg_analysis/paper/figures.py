@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The paper's figures."""
+"""The paper's figures: curves by the theory and, if wanted, points that real networks measured."""
 
 from __future__ import annotations
 
@@ -25,32 +25,16 @@ from msg_analysis.experiment.graphs import Graph
 from msg_analysis.inference.statistics import holm
 from msg_analysis.paper import examples
 from msg_analysis.paper.examples import CENTRALITY, NODE, SYSTEM, Curve, Example
-from msg_analysis.report.figures import (
-    BLACK,
-    BLUE,
-    DARK_GREY,
-    GREEN,
-    INK,
-    ORANGE,
-    PURPLE,
-    STYLE,
-    VERMILLION,
-    draw_graph,
-    rendered,
-)
+from msg_analysis.report import figures as look
+from msg_analysis.report.figures import BLACK, DARK_GREY, draw_graph, rendered
 from msg_analysis.sweeps.grid import own_seed
 from msg_analysis.sweeps.points import DONE, Job, Outcome
 
-DT = 0.025
-"""Simulated time of a step: its errors are about 2 % above those of continuous time."""
-
+DT = 0.025  # simulated time of a step: its errors are about 2 % above those of continuous time
 REPLICAS = 32
 DURATION = 100.0
-CYCLES = 30
-"""Least length of a run, in sums of the mean holding times of all graphs: intervals of shorter runs are unreliable."""
-
-LEVEL = 0.01
-"""Probability that any point is said to disagree although all networks follow their law."""
+CYCLES = 30  # least length of a run, in sums of the mean holding times of all graphs: shorter intervals are unreliable
+LEVEL = 0.01  # probability that any point is said to disagree although all networks follow the model
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +42,7 @@ class Run:
     """One run of a network, in lockstep, with ``REPLICAS`` replicas."""
 
     example: int  # 1, 2 or 3
-    network: str  # key of _NETWORKS
+    network: str  # key of ``NETWORKS``
     epsilon: float  # [1 / unit of simulated time], scales r12 and r21
     r12: float
     r21: float
@@ -67,13 +51,13 @@ class Run:
 
     def job(self) -> Job:
         """The run as a job for a sweep worker."""
-        graphs, generator = _NETWORKS[self.network]
-        rates = generator(self.epsilon, self.r12, self.r21)
+        network = examples.NETWORKS[self.network]
+        rates = network.generator(self.epsilon, self.r12, self.r21)
         least = CYCLES * float(np.sum(-1.0 / np.diag(rates)))
         duration = self.duration or DT * round(max(DURATION, least) / DT)
         document: dict[str, Any] = {
             "name": self.network,
-            "graphs": graphs,
+            "graphs": network.graphs,
             "switching": {"generator": rates.tolist()},
             "run": {"dt": DT, "duration": duration, "replicas": REPLICAS},
         }
@@ -92,14 +76,6 @@ class Run:
             return nodes
         drawn = 1.0 in (self.r12, self.r21) if self.example == 1 else self.epsilon in examples.NODE_SCALES
         return [(SYSTEM, None), *(nodes if drawn else [])]
-
-
-_NETWORKS: dict[str, tuple[dict[str, Any], examples.Generator]] = {
-    "line_ring": (examples.LINE_RING, examples.two_graphs),
-    "three_lines": (examples.THREE_LINES, examples.three_graphs),
-    "knife_edge": (examples.KNIFE_EDGE, examples.two_graphs),
-    "smallest": (examples.SMALLEST, examples.two_graphs),
-}
 
 
 def runs_of(example: int) -> list[Run]:
@@ -153,21 +129,7 @@ def measured(runs: Sequence[Run], outcomes: Sequence[Outcome]) -> list[Measured]
     return [dataclasses.replace(point, p_holm=float(p)) for point, p in zip(found, adjusted, strict=True)]
 
 
-COLUMNS = (
-    "network",
-    "quantity",
-    "agent",
-    "epsilon [1/time]",
-    "r12",
-    "r21",
-    "value [1/variance]",
-    "low",
-    "high",
-    "predicted",
-    "z",
-    "p",
-    "p_holm",
-)
+COLUMNS = (*examples.RATES, "value [1/variance]", "low", "high", "predicted", "z", "p", "p_holm")
 
 
 def csv_text(number: int, points: Sequence[Measured]) -> str:
@@ -176,15 +138,12 @@ def csv_text(number: int, points: Sequence[Measured]) -> str:
         f"Example {number}: networks of ROS 2 processes in lockstep, dt = {DT:g}, {REPLICAS} replicas, F = I",
         "agent 0 is the system; low to high is the 95 % interval; predicted is exact for the steps of the run",
     )
-    rows = [
-        (
-            *(point.run.network, point.quantity, 0 if point.agent is None else point.agent + 1),
-            *(point.run.epsilon, point.run.r12, point.run.r21),
-            *(point.value, point.low, point.high, point.predicted, point.z, point.p, point.p_holm),
-        )
-        for point in points
-        if point.run.example == number
-    ]
+    rows = []
+    for point in points:
+        run, agent = point.run, 0 if point.agent is None else point.agent + 1
+        numbers = (point.value, point.low, point.high, point.predicted, point.z, point.p, point.p_holm)
+        if run.example == number:
+            rows.append((run.network, point.quantity, agent, run.epsilon, run.r12, run.r21, *numbers))
     return examples.commented_csv(comments, COLUMNS, rows)
 
 
@@ -208,39 +167,24 @@ def disagreeing(points: Sequence[Measured], level: float = LEVEL) -> list[Measur
 FORMATS = ("png", "svg", "pdf")
 WIDTH = 7.16  # inches: two columns of a journal
 _DPI = 300
-_STYLE = STYLE | {
-    "font.size": 8,
-    "axes.titlesize": 8,
-    "axes.labelsize": 8,
-    "axes.labelcolor": BLACK,
-    "axes.edgecolor": DARK_GREY,
-    "axes.linewidth": 0.6,
-    "xtick.labelsize": 7.5,
-    "ytick.labelsize": 7.5,
-    "xtick.color": BLACK,
-    "ytick.color": BLACK,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    "grid.linewidth": 0.5,
-    "legend.fontsize": 7.5,
-    "legend.handlelength": 2.6,
-    "legend.borderaxespad": 0.2,
-    "lines.linewidth": 1.3,
-    "lines.markersize": 3.6,
-    "mathtext.fontset": "dejavusans",
-    "pdf.fonttype": 42,  # TrueType: text stays text
-    "svg.fonttype": "path",  # looks the same where the font is missing
-}
-# Colour, dashes and marker of the first, second ... curve of a panel; each of the three alone is distinctive.
-_LOOKS = (
-    (BLUE, "-", "o"),
-    (VERMILLION, (0, (5, 1.5)), "s"),
-    (GREEN, (0, (5, 1.5, 1, 1.5)), "^"),
-    (ORANGE, (0, (1, 1)), "D"),
-    (PURPLE, (0, (8, 2)), "v"),
+_STYLE = (
+    look.STYLE
+    | dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), 8)
+    | dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize", "legend.title_fontsize"), 7.5)
+    | dict.fromkeys(("axes.linewidth", "xtick.major.width", "ytick.major.width"), 0.6)
+    | dict.fromkeys(("axes.labelcolor", "xtick.color", "ytick.color"), BLACK)
+    | {"axes.edgecolor": DARK_GREY, "grid.linewidth": 0.5, "legend.handlelength": 2.0, "legend.borderaxespad": 0.2}
+    | {"lines.linewidth": 1.3, "lines.markersize": 3.6, "mathtext.fontset": "dejavusans"}
+    | {"pdf.fonttype": 42, "svg.fonttype": "path"}  # TrueType: text stays text; the same where the font is missing
 )
-_MARKERS = 5  # on a curve
-_LINE = 0.125  # inches between labels
+# Colour, dashes and marker of the first, second ... curve of a panel; each of the three alone is distinctive.
+_LINES = (
+    (look.BLUE, "-", "o"),
+    (look.VERMILLION, (0, (5, 1.5)), "s"),
+    (look.GREEN, (0, (5, 1.5, 1, 1.5)), "^"),
+    (look.ORANGE, (0, (1, 1)), "D"),
+    (look.PURPLE, (0, (8, 2)), "v"),
+)
 _SIDE = 0.05  # inches between points at the same rate
 _NOTE = (
     "Curves: continuous time.  Points: networks of ROS 2 processes, 95 % intervals.  "
@@ -249,10 +193,7 @@ _NOTE = (
 
 
 def write_figures(
-    numbers: Sequence[int],
-    directory: str | Path,
-    formats: Sequence[str] = FORMATS,
-    measured: Sequence[Measured] = (),
+    numbers: Sequence[int], directory: str | Path, formats: Sequence[str] = FORMATS, measured: Sequence[Measured] = ()
 ) -> list[Path]:
     """Write ``example_<number>`` in every format and as CSV; with measured points, ``example_<number>_emulated``.
 
@@ -282,7 +223,12 @@ def draw(example: Example, measured: Sequence[Measured] = ()) -> Figure:
     figure = {1: _draw_1, 2: _draw_2, 3: _draw_3}[example.number](example, measured)
     if measured:
         figure.supxlabel(_NOTE, size=7.5, color=DARK_GREY)
-    _settle(figure)
+    layout = figure.get_layout_engine()
+    assert layout
+    layout.execute(figure)
+    figure.set_layout_engine("none")
+    for axes in figure.axes:  # rounded: the last digits depend on the iteration order of a set
+        axes.set_position(np.round(axes.get_position(original=True).bounds, 5).tolist())
     return figure
 
 
@@ -290,21 +236,21 @@ def _draw_1(example: Example, measured: Sequence[Measured]) -> Figure:
     figure = Figure(figsize=(WIDTH, 4.2), layout="constrained")
     grid = figure.add_gridspec(2, 3, width_ratios=(0.6, 1, 1))
     for row, graph in enumerate(example.networks["line_ring"]):
-        _draw_network(figure.add_subplot(grid[row, 0]), graph, f"({'ab'[row]}) $G_{row + 1}$: {graph.name}")
+        _draw_network(
+            figure.add_subplot(grid[row, 0]), graph, f"({'ab'[row]}) $G_{row + 1}$: {graph.name}", reconstructed=False
+        )
     for row, (swept, held) in enumerate((("r12", "r21"), ("r21", "r12"))):
         system, node = figure.add_subplot(grid[row, 1]), figure.add_subplot(grid[row, 2])
         for value, name, side in ((0.5, "$G_1$ held", "top"), (1.0, "$G_2$ held", "bottom")):
             system.axhline(value, color=DARK_GREY, lw=0.7, zorder=1)
-            system.text(
-                2.5, value + (0.012 if side == "bottom" else -0.012), name, color=DARK_GREY, va=side, ha="center"
-            )
+            system.annotate(name, (2.5, value), color=DARK_GREY, va=side, ha="center")
         system.set(ylabel="system certainty $1/E$", ylim=(0.43, 1.07), xlim=(0, 5), xlabel=_rate(swept))
         node.set(ylabel="node certainty $1/E_i$", ylim=(1.3, 5.4), xlim=(0, 5), xlabel=_rate(swept))
         curves = [c for c in example.select("line_ring", SYSTEM) if np.ptp(getattr(c, swept)) > 0]
         named = [(f"{getattr(curve, held)[0]:g}", curve) for curve in curves]
-        _plot(system, swept, named, heading=_rate(held), height=1.45, measured=measured)
+        _plot(system, swept, named, _rate(held), measured)
         nodes = _coinciding([c for c in example.select("line_ring", NODE) if np.ptp(getattr(c, swept)) > 0])
-        _plot(node, swept, nodes, heading="agents", height=1.45, measured=measured)
+        _plot(node, swept, nodes, "agents", measured)
         system.set_title(rf"({'cd'[row]}) $\epsilon$ = {curves[0].epsilon[0]:g}", loc="left")
         node.set_title(f"({'ef'[row]}) {_rate(held)} = 1", loc="left")
     return figure
@@ -315,17 +261,13 @@ def _draw_2(example: Example, measured: Sequence[Measured]) -> Figure:
     grid = figure.add_gridspec(1, 3, width_ratios=(0.5, 1, 1))
     places = grid[0].subgridspec(3, 1)
     for row, graph in enumerate(example.networks["three_lines"]):
-        panel = figure.add_subplot(places[row])
-        _draw_network(panel, graph, f"({'abc'[row]}) $G_{row + 1}$")
-    _note_reconstruction(panel)
+        _draw_network(figure.add_subplot(places[row]), graph, f"({'abc'[row]}) $G_{row + 1}$")
     rates = "$r_{12} = r_{32}$    ($r_{21} = r_{23} = 0.05$)"
     system = figure.add_subplot(grid[1])
     system.set(ylabel="system certainty $1/E$", xlabel=rates, xlim=(0, 1), ylim=(0.495, 0.645))
     curves = example.select("three_lines", SYSTEM)
-    _plot(
-        system, "r12", [(f"{c.epsilon[0]:g}", c) for c in curves], heading=r"$\epsilon$", height=3.1, measured=measured
-    )
-    for (colour, _, _), curve in zip(_LOOKS, curves, strict=False):
+    _plot(system, "r12", [(f"{c.epsilon[0]:g}", c) for c in curves], r"$\epsilon$", measured=measured)
+    for (colour, _, _), curve in zip(_LINES, curves, strict=False):
         peak = (curve.r12[curve.peak], curve.value[curve.peak])
         system.plot(*peak, "*", ms=9, color=colour, mec="white", mew=0.6, zorder=4)
         text = "" if measured else f"{peak[1]:.4f}"
@@ -336,7 +278,7 @@ def _draw_2(example: Example, measured: Sequence[Measured]) -> Figure:
     for letter, panel, scale in zip("ef", panels, examples.NODE_SCALES, strict=True):
         panel.set(ylabel="node certainty $1/E_i$", xlabel=rates, xlim=(0, 1), ylim=(1.5, 5.2))
         nodes = _coinciding([c for c in example.select("three_lines", NODE) if c.epsilon[0] == scale])
-        _plot(panel, "r12", nodes, heading="agents", height=1.4, measured=measured)
+        _plot(panel, "r12", nodes, "agents", measured)
         panel.set_title(rf"({letter}) $\epsilon$ = {scale:g}", loc="left")
     return figure
 
@@ -350,9 +292,7 @@ def _draw_3(example: Example, measured: Sequence[Measured]) -> Figure:
         grid = rows[row].subgridspec(2, 4, width_ratios=(0.62, 1, 1, 1))
         for mode, graph in enumerate(example.networks[network]):
             name = f"{names[network]}\n" if mode == 0 else ""
-            panel = figure.add_subplot(grid[mode, 0])
-            _draw_network(panel, graph, f"{name}({next(letters)}) $G_{mode + 1}$")
-        _note_reconstruction(panel)
+            _draw_network(figure.add_subplot(grid[mode, 0]), graph, f"{name}({next(letters)}) $G_{mode + 1}$")
         centrality, certainty, lead = (figure.add_subplot(grid[:, column]) for column in (1, 2, 3))
         central, certain = example.select(network, CENTRALITY), example.select(network, NODE)
         for axes in (centrality, certainty, lead):
@@ -365,8 +305,15 @@ def _draw_3(example: Example, measured: Sequence[Measured]) -> Figure:
             low = min([c.value.min() for c in curves] + [point.low for point in found])
             high = max([c.value.max() for c in curves] + [point.high for point in found])
             axes.set_ylim(low - 0.06 * (high - low), high + 0.36 * (high - low))
-            _plot(axes, "epsilon", [(_agent(c), c) for c in curves], heading="agent", height=1.8, measured=measured)
-            axes.text(0.03, 0.985, _orders(curves), transform=axes.transAxes, va="top", size=7, color=DARK_GREY)
+            _plot(axes, "epsilon", [(_agent(c), c) for c in curves], "agent", measured)
+            orders = [
+                "-".join(
+                    str(agent + 1) for agent in examples.order(curves, int(np.abs(curves[0].epsilon - at).argmin()))
+                )
+                + rf" at $\epsilon$ = {at:g}"
+                for at in (0.1, 1.0, 10.0)
+            ]
+            axes.text(0.03, 0.985, "\n".join(orders), transform=axes.transAxes, va="top", size=7, color=DARK_GREY)
         lead.set(ylabel="agent 1 above agent 3 [%]", ylim=(-2, 2))
         lead.set_yscale("symlog", linthresh=0.01, linscale=0.6)
         lead.set_yticks([-1, -0.1, -0.01, 0, 0.01, 0.1, 1], ["−1", "−0.1", "−0.01", "0", "0.01", "0.1", "1"])
@@ -376,64 +323,31 @@ def _draw_3(example: Example, measured: Sequence[Measured]) -> Figure:
             (name, dataclasses.replace(curves[0], value=100 * (curves[0].value / curves[2].value - 1)))
             for name, curves in (("centrality", central), ("certainty", certain))
         ]
-        _plot(lead, "epsilon", ahead, heading="in", height=1.8)
+        _plot(lead, "epsilon", ahead, "in")
     return figure
 
 
-def _orders(curves: Sequence[Curve]) -> str:
-    """Order of the agents at epsilon = 0.1, 1 and 10."""
-    lines = []
-    for epsilon in (0.1, 1.0, 10.0):
-        point = int(np.abs(curves[0].epsilon - epsilon).argmin())
-        order = "-".join(str(agent + 1) for agent in examples.order(curves, point))
-        lines.append(rf"{order} at $\epsilon$ = {epsilon:g}")
-    return "\n".join(lines)
-
-
 def _plot(
-    axes: Axes,
-    swept: str,
-    curves: Sequence[tuple[str, Curve]],
-    *,
-    heading: str,
-    height: float,
-    measured: Sequence[Measured] = (),
+    axes: Axes, swept: str, curves: Sequence[tuple[str, Curve]], heading: str, measured: Sequence[Measured] = ()
 ) -> None:
-    """Curves over one of their rates, with labels at the right end under a heading; set the limits before.
+    """Curves over one of their rates, with a legend on the right under a heading; set the limits before.
 
-    Measured points, if any, have the markers instead of the curves. ``height`` of the axes [inches] is approximate: the
-    layout is not known yet.
+    Measured points, if any, have the markers instead of the curves.
     """
     logarithmic = axes.get_xscale() == "log"
     points = [_on_curve(label, curve, swept, measured) for label, curve in curves]
     ends = [end for found in points for point in found for end in (point.low, point.high)]
     axes.set_ylim(min([axes.get_ylim()[0], *ends]), max([axes.get_ylim()[1], *ends]))
     if ends and not logarithmic:  # room for points at the end of the curves
-        axes.set_xlim(right=1.03 * max(curve_x.max() for curve_x in (getattr(curve, swept) for _, curve in curves)))
-    for look, (_, curve) in enumerate(curves):
-        colour, dashes, marker = _LOOKS[look]
-        x = getattr(curve, swept)
-        place = np.log(x) if logarithmic else x
-        places = (np.arange(_MARKERS) + (look + 0.2) / len(_LOOKS)) / _MARKERS  # markers do not overlap
-        marked = sorted({int(np.abs(place - target).argmin()) for target in place[0] + places * np.ptp(place)})
-        axes.plot(
-            x,
-            curve.value,
-            color=colour,
-            ls=dashes,
-            marker="" if measured else marker,
-            markevery=marked,
-            mec="white",
-            mew=0.4,
-        )
-        beside = 0.4 * _SIDE * (look - (len(curves) - 1) / 2) if logarithmic else 0.0
-        _plot_points(axes, swept, points[look], colour, marker, beside)
-    ends = [*axes.get_ylim(), *(curve.value[-1] for _, curve in curves)]
-    low, high, *ends = axes.transScale.transform([(1.0, end) for end in ends])[:, 1]
-    heights = _apart([(end - low) / (high - low) for end in ends], _LINE / height)
-    for (label, _), share, (colour, _, _) in zip(curves, heights, _LOOKS, strict=False):
-        _beside(axes, label, share, 0, colour, "center_baseline")
-    _beside(axes, heading, 1.0, 5, BLACK, "bottom")
+        axes.set_xlim(right=1.03 * max(getattr(curve, swept).max() for _, curve in curves))
+    for number, (label, curve) in enumerate(curves):
+        colour, dashes, marker = _LINES[number]
+        every = (0.04 * (number + 1), 0.2)  # so that markers do not overlap
+        (line,) = axes.plot(getattr(curve, swept), curve.value, color=colour, ls=dashes, label=label, markevery=every)
+        line.set(marker="" if measured else marker, mec="white", mew=0.4)
+        beside = 0.4 * _SIDE * (number - (len(curves) - 1) / 2) if logarithmic else 0.0
+        _plot_points(axes, swept, points[number], colour, marker, beside)
+    axes.legend(title=heading, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
 
 
 def _on_curve(label: str, curve: Curve, swept: str, measured: Sequence[Measured]) -> list[Measured]:
@@ -463,77 +377,35 @@ def _plot_points(axes: Axes, swept: str, points: Sequence[Measured], colour: str
         axes.plot(x, point.predicted, "_", color=BLACK, ms=4.5, mew=0.8, zorder=5, transform=place)
 
 
-def _beside(axes: Axes, text: str, height: float, raised: float, colour: str, align: str) -> None:
-    """A text to the right of the axes, at a share of their height, ``raised`` by some points."""
-    axes.annotate(
-        text, (1, height), (4, raised), xycoords="axes fraction", textcoords="offset points", color=colour, va=align
-    )
-
-
-def _apart(heights: Sequence[float], gap: float) -> list[float]:
-    """Heights moved as little as possible to be ``gap`` apart: neighbours that are too close keep their mean."""
-    order = sorted(range(len(heights)), key=lambda i: heights[i])
-    blocks: list[tuple[float, list[int]]] = []  # (middle, members)
-    for i in order:
-        middle, members = heights[i], [i]
-        while blocks and middle - blocks[-1][0] < gap * (len(members) + len(blocks[-1][1])) / 2:
-            other, more = blocks.pop()
-            middle = (middle * len(members) + other * len(more)) / (len(members) + len(more))
-            members = more + members
-        blocks.append((middle, members))
-    moved = list(heights)
-    for middle, members in blocks:
-        for rank, i in enumerate(members):
-            moved[i] = middle + gap * (rank - (len(members) - 1) / 2)
-    return moved
-
-
-def _note_reconstruction(axes: Axes) -> None:
-    """Write below the axes that the graphs are reconstructed."""
-    axes.annotate(
-        "reconstructed", (0.5, 0.0), (0, -5), xycoords="axes fraction", textcoords="offset points", size=7,
-        color=DARK_GREY, style="italic", ha="center", va="top",
-    )  # fmt: skip
-
-
-def _settle(figure: Figure) -> None:
-    """Make the layout, and round it: its last digits depend on the iteration order of a set."""
-    layout = figure.get_layout_engine()
-    assert layout
-    layout.execute(figure)
-    figure.set_layout_engine("none")
-    for axes in figure.axes:
-        axes.set_position(np.round(axes.get_position(original=True).bounds, 5).tolist())
-
-
-def _draw_network(axes: Axes, graph: Graph, title: str) -> None:
+def _draw_network(axes: Axes, graph: Graph, title: str, *, reconstructed: bool = True) -> None:
     angles = np.pi / 2 - 2 * np.pi * np.arange(graph.agents) / graph.agents
     places = {agent: np.array([np.cos(angle), np.sin(angle)]) for agent, angle in enumerate(angles)}
-    draw_graph(axes, graph, places, INK, size=110)
+    draw_graph(axes, graph, places, look.INK, size=110)
     for artist in axes.collections:
         artist.set_clip_on(False)
     axes.set_title("")
     axes.set_title(title, loc="left")
     axes.set_axis_off()
+    if reconstructed:
+        style: dict[str, Any] = {"size": 7, "color": DARK_GREY, "style": "italic", "ha": "center", "va": "top"}
+        axes.text(0.5, 0.0, "reconstructed", transform=axes.transAxes, **style)
 
 
 def _coinciding(curves: Sequence[Curve]) -> list[tuple[str, Curve]]:
     """Curves that are equal by symmetry, once, under the numbers of all their agents."""
-    groups: list[tuple[list[str], Curve]] = []
+    groups: list[list[Curve]] = []
     for curve in curves:
-        for agents, other in groups:
-            if np.allclose(curve.value, other.value, rtol=1e-9):
-                agents.append(_agent(curve))
-                break
-        else:
-            groups.append(([_agent(curve)], curve))
-    return [(", ".join(agents), curve) for agents, curve in groups]
+        alike = (group for group in groups if np.allclose(curve.value, group[0].value, rtol=1e-9))
+        group = next(alike, None)
+        if group is None:
+            groups.append(group := [])
+        group.append(curve)
+    return [(", ".join(map(_agent, group)), group[0]) for group in groups]
 
 
 def _agent(curve: Curve) -> str:
     """Number of a curve's agent, from 1."""
-    assert curve.agent is not None
-    return str(curve.agent + 1)
+    return "" if curve.agent is None else str(curve.agent + 1)
 
 
 def _rate(name: str) -> str:

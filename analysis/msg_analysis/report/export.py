@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.common.arrays import BLOCK_NUMBERS, AnyArray, BoolArray, FloatArray, IntArray, pieces, release
 from msg_analysis.common.files import require_place, written_whole
 from msg_analysis.common.resources import tell

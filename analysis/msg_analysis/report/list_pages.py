@@ -25,9 +25,17 @@ from msg_analysis.inference.comparison import flat
 from msg_analysis.report import plot_style, sweep_plots
 from msg_analysis.report.page import pack, page_template
 from msg_analysis.runs import RunEntry
-from msg_analysis.sweeps.figure_series import Picture, picture, several_values, value_text
-from msg_analysis.sweeps.grid import Sweep, axis_name, column_words, key_words
-from msg_analysis.sweeps.results import Row
+from msg_analysis.sweeps.grid import Sweep
+from msg_analysis.sweeps.results import (
+    Picture,
+    Row,
+    axis_name,
+    column_words,
+    key_words,
+    picture,
+    several_values,
+    value_text,
+)
 
 _OPEN_TABLE = 30  # most rows with which the table is open at first
 

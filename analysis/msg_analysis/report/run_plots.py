@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, PlainText, Range1d, RangeTool, UIElement
 
-from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray, pieces
 from msg_analysis.common.text import agent_text, counted
 from msg_analysis.model.phases import phases

@@ -45,8 +45,7 @@ from msg_analysis.report.figures import (
     shorten,
 )
 from msg_analysis.report.plot_style import BLACK, DARK_SCALE, GREY, INK, LINES, SANS, SCALE, new_figure
-from msg_analysis.sweeps.figure_series import Picture, Place, Series, value_text
-from msg_analysis.sweeps.grid import axis_name, column_words, key_words
+from msg_analysis.sweeps.results import Picture, Place, Series, axis_name, column_words, key_words, value_text
 from msg_analysis.theory.prediction import LAW_NAMES
 
 MOST_LINES = 8  # series of one figure; of more values, some

@@ -20,10 +20,9 @@ from rich.text import Text
 from msg_analysis.common.text import agent_name, counted, half_width_text, listed, number_text, p_text, z_text
 from msg_analysis.experiment.loading import amount
 from msg_analysis.runs import RunEntry
-from msg_analysis.sweeps.figure_series import Picture, value_text
 from msg_analysis.sweeps.grid import Sweep
-from msg_analysis.sweeps.points import FAILED
-from msg_analysis.sweeps.results import Conducted, Judgement
+from msg_analysis.sweeps.points import FAILED, JobResults
+from msg_analysis.sweeps.results import Picture, SweepVerdict, value_text
 from msg_analysis.sweeps.results import Row as SweepRow
 
 Row = TypeVar("Row")
@@ -360,7 +359,7 @@ def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Cons
             console.print(Text(f"damaged: {run.problem}", style="yellow"))
 
 
-def describe_sweep(sweep: Sweep, done: Conducted, judgement: Judgement, rows: Sequence[SweepRow]) -> dict[str, Any]:
+def describe_sweep(sweep: Sweep, done: JobResults, judgement: SweepVerdict, rows: Sequence[SweepRow]) -> dict[str, Any]:
     """The document of ``msg-analysis sweep --json``, without the names of the files; ``rows`` of ``rows_of``."""
     failed = sum(outcome.status == FAILED for outcome in done.outcomes)
     return {
@@ -372,7 +371,7 @@ def describe_sweep(sweep: Sweep, done: Conducted, judgement: Judgement, rows: Se
         "verdict": judgement.verdict,
         "done": len(rows) - failed,
         "failed": failed,
-        "kept": done.kept,
+        "kept": done.reused,
         "points": list(rows),
     }
 

@@ -1,13 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The points of a sweep: keys, values and their names.
-
-Dotted keys: places in the document of an experiment.
-
-Names are joined by dots, places in lists stand in brackets and count from 1: ``noise.process[3]``.
-
-From a sweep file to its points: every one of them is a valid experiment before anything is computed.
+"""The sweep file and its grid: every point of it is a valid experiment before anything is computed.
 
 All mistakes are reported together, each once, with the points that have it.
 """
@@ -17,21 +11,160 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from pydantic import ValidationError
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidator, ValidationError
 
-from msg_analysis.common.text import agent_text
+from msg_analysis.errors import InputError
 from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import other_kind, read_yaml
+from msg_analysis.experiment.network_spec import Count, expected, is_number
 from msg_analysis.experiment.problems import ExperimentError, problem, show, translate
+from msg_analysis.model.run_record import Until
 from msg_analysis.sweeps.points import Job, JobKind
-from msg_analysis.sweeps.sweep_file import MOST_POINTS, SweepSpec
+
+MOST_POINTS = 20_000  # of a sweep: the experiments of all are held in memory
+
+_KEYS = {"values", "from", "to", "count", "step", "spacing"}
+_FORMS = "a list of values, {from, to, count}, {from, to, count, spacing: log} or {from, to, step}"
+
+
+class Axis(list[Any]):
+    """The values of a key, in order."""
+
+    logarithmic: bool | None = None  # spacing, which a figure then follows; None: not stated
+
+
+def _axis(value: object) -> Axis:
+    """The values that a list or a range stands for."""
+    if isinstance(value, Axis):
+        return value
+    if isinstance(value, list):
+        value = {"values": value}
+    if not isinstance(value, dict) or not value or not set(value) <= _KEYS:
+        raise expected(_FORMS)
+    if "values" in value:
+        listed = value["values"]
+        if len(value) > 1 or not isinstance(listed, list) or not listed:
+            raise expected("values to be a list with at least one entry, and no other key")
+        return Axis(listed)
+    first, last = value.get("from"), value.get("to")
+    if not is_number(first) or not is_number(last) or ("count" in value) == ("step" in value):
+        raise expected("numbers `from` and `to`, and either `count` or `step`")
+    return _range(float(first), float(last), value)  # type: ignore[arg-type]
+
+
+def _range(first: float, last: float, value: dict[str, Any]) -> Axis:
+    spacing = value.get("spacing", "linear")
+    if spacing not in ("linear", "log"):
+        raise expected("spacing to be linear or log")
+    whole = all(isinstance(value[key], int) for key in ("from", "to", "step") if key in value)
+    if "step" in value:
+        step = value["step"]
+        if not is_number(step) or step == 0 or (last - first) / step < 0 or spacing == "log":
+            raise expected("step to lead from `from` to `to`, with linear spacing")
+        count = math.floor((last - first) / step * (1 + 1e-12) + 1e-12) + 1
+    else:
+        count = value["count"]
+        if not isinstance(count, int) or isinstance(count, bool) or count < 1 or (count == 1 and first != last):
+            raise expected("count to be a whole number >= 2")
+    if count > MOST_POINTS:
+        raise expected(f"at most {MOST_POINTS} values")
+    if spacing == "log":
+        if first <= 0 or last <= 0:
+            raise expected("`from` and `to` > 0 with spacing: log")
+        numbers = np.geomspace(first, last, count)
+    elif "step" in value:
+        numbers = first + float(value["step"]) * np.arange(count)
+    else:
+        numbers = np.linspace(first, last, count)
+    # Without the last digits, which are rounding: 0.30000000000000004.
+    axis = Axis(float(f"{number:.12g}") for number in numbers)
+    if whole and spacing == "linear" and all(number.is_integer() for number in axis):
+        axis = Axis(int(number) for number in axis)
+    axis.logarithmic = spacing == "log"
+    return axis
+
+
+_RangeSchema = dict[Literal["values", "from", "to", "count", "step", "spacing"], Any]
+
+
+def _experiment(value: object) -> str | dict[str, Any]:
+    if (isinstance(value, str) and value) or (isinstance(value, dict) and value):
+        return value
+    raise expected("the name of a file, or the keys of an experiment")
+
+
+def _precision(value: str) -> str:
+    try:
+        until = Until.parse(value)
+    except InputError as error:
+        raise expected("a precision such as 5%") from error
+    if until.decided:  # the runs of a sweep are tested together
+        raise expected("a precision such as 5%")
+    return str(until)
+
+
+class SweepSpec(BaseModel):
+    """One experiment at many values of its keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    experiment: Annotated[
+        str | dict[str, Any], PlainValidator(_experiment, json_schema_input_type=str | dict[str, Any])
+    ] = Field(
+        description="an experiment file, relative to this file, the name of an example, or the experiment itself",
+        examples=["line_ring"],
+    )
+    kind: JobKind = Field(
+        "predict",
+        description="at every point: predict the errors; simulate a run with the offline twin and compare it; or run a "
+        "network of ROS 2 processes and compare it",
+        examples=["predict"],
+    )
+    over: dict[str, Annotated[Axis, PlainValidator(_axis, json_schema_input_type=list[Any] | _RangeSchema)]] = Field(
+        min_length=1,
+        description="keys of the experiment, with dots, and their values: a list, or a range {from, to, count} with "
+        "spacing linear or log, or {from, to, step}",
+        examples=[{"switching.scale": {"from": 0.1, "to": 10, "count": 9, "spacing": "log"}}],
+    )
+    combine: Literal["grid", "zip"] = Field(
+        "grid",
+        description="grid: every value of a key with every value of the others; zip: the first values together, then "
+        "the second, and so on",
+        examples=["grid"],
+    )
+    repetitions: Count = Field(
+        1, description="runs at every point, each with a seed of its own (simulate, network)", examples=[5]
+    )
+    seeds: Literal["independent", "common"] = Field(
+        "independent",
+        description="independent: every run has its own seed, made of run.seed and its point; common: run.seed, "
+        "run.seed + 1, ... at every point, so that differences between points are seen better",
+        examples=["independent"],
+    )
+    until: Annotated[str, AfterValidator(_precision)] | None = Field(
+        None,
+        description="network: every run ends when its system error is known to this precision, at its duration at "
+        "the latest",
+        examples=["5%"],
+    )
+    level: Annotated[float, Field(strict=True, gt=0, le=0.5)] = Field(
+        0.01, description="probability of a false 'disagrees', all runs together", examples=[0.01]
+    )
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON Schema of the sweep file, for editors."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | SweepSpec.model_json_schema()
+
 
 _PART = re.compile(r"([^\[\]]+)|\[(\d+)\]")
 
@@ -57,10 +190,10 @@ def _split(key: str) -> list[str | int]:
     for piece in key.split("."):
         found = list(_PART.finditer(piece))
         if not found or "".join(match[0] for match in found) != piece or found[0][1] is None:
-            raise KeyProblemError(_problem(key, "not a key", "names joined by dots, places in lists in brackets"))
+            raise _problem(key, "not a key", "names joined by dots, places in lists in brackets")
         for match in found:
             if match[2] == "0":
-                raise KeyProblemError(_problem(key, f"place {match[0]}", "places from 1"))
+                raise _problem(key, f"place {match[0]}", "places from 1")
             parts.append(match[1] if match[1] is not None else int(match[2]) - 1)
     return parts
 
@@ -72,11 +205,11 @@ def _put(here: Any, parts: list[str | int], value: Any, key: str, path: str) -> 
     if isinstance(name, int):
         if not isinstance(here, list) or not name < len(here):
             size = f"{len(here)} entries" if isinstance(here, list) else show(here)
-            raise KeyProblemError(_problem(key, f"{path} has {size}", f"a list with at least {name + 1} entries"))
+            raise _problem(key, f"{path} has {size}", f"a list with at least {name + 1} entries")
         shown = f"{path}[{name + 1}]"
     else:
         if not isinstance(here, dict):
-            raise KeyProblemError(_problem(key, f"{path} is {show(here)}", "keys with values there"))
+            raise _problem(key, f"{path} is {show(here)}", "keys with values there")
         shown = f"{path}.{name}" if path else name
     if not rest:
         here[name] = value
@@ -100,76 +233,8 @@ def _name(here: Any, parts: list[str | int]) -> tuple[str | int, int]:
     return parts[0], 1
 
 
-def _problem(key: str, found: str, wanted: str) -> str:
-    return problem(f"over.{key}", found, f"expected {wanted}", "correct the key")
-
-
-_KEYS = {
-    "agents": "number of agents",
-    "leaders.agents": "leaders",
-    "leaders.gain": "gain of the leaders",
-    "leaders.reference": "reference",
-    "noise.broadcast": "noise of published values",
-    "noise.burst": "messages lost in a row",
-    "noise.delay": "delay of messages, in steps",
-    "noise.link": "noise of received values",
-    "noise.loss": "loss of messages",
-    "noise.loss.default": "loss of messages",
-    "noise.on_loss": "in place of a lost value",
-    "noise.process": "process noise",
-    "problem": "problem",
-    "run.dt": "step length dt",
-    "run.duration": "simulated time",
-    "run.pace": "pace",
-    "run.delivery": "delivery",
-    "run.processes": "number of processes",
-    "run.replicas": "number of replicas",
-    "run.seed": "seed",
-    "run.speed": "speed of real time",
-    "run.start": "start",
-    "switching.generator": "generator",
-    "switching.initial": "first graph",
-    "switching.scale": "factor of the switching rates",
-    "switching.transition": "transition matrix",
-    "time": "time",
-}
-_COLUMNS = {
-    "node_errors": "error of {}",
-    "rate": "decay rate",
-    "seconds": "computing time [s]",
-    "system_certainty": "system certainty",
-    "system_error": "system error",
-}
-_LAWS = {"continuous": "continuous time", "discrete": "discrete time", "emulated": "with steps", "static": "one graph"}
-
-
-def key_words(key: str, names: Sequence[str] | None = None) -> str:
-    """A key in words, such as "step length dt"; the key itself if it has none. ``names``: of the agents."""
-    if key in _KEYS:
-        return _KEYS[key]
-    if found := re.fullmatch(r"noise\.process\[(\d+)\]", key):
-        return f"process noise of {agent_text(int(found[1]), names)}"
-    if found := re.fullmatch(r"switching\.rates\.([^.]+)\.([^.]+)", key):
-        return f"switching rate from {found[1]} to {found[2]}"
-    return key
-
-
-def axis_name(key: str, names: Sequence[str] | None = None) -> str:
-    """A key in words, with the key in brackets, such as "step length dt [run.dt]"."""
-    words = key_words(key, names)
-    return words if words == key else f"{words} [{key}]"
-
-
-def column_words(column: str, names: Sequence[str] | None = None) -> str:
-    """A column in words, such as "error of agent 3"; the column itself if it has none."""
-    law, _, rest = column.partition(".")
-    if law in _LAWS and rest:
-        return f"{column_words(rest, names)}, {_LAWS[law]}"
-    found = re.fullmatch(r"(\w+?)(?:\[(\d+)\])?", column)
-    words = _COLUMNS.get(found[1]) if found else None
-    if found is None or words is None or ("{}" in words) != (found[2] is not None):
-        return column
-    return words.format(agent_text(int(found[2]), names)) if found[2] else words
+def _problem(key: str, found: str, wanted: str) -> KeyProblemError:
+    return KeyProblemError(problem(f"over.{key}", found, f"expected {wanted}", "correct the key"))
 
 
 SEED = "run.seed"
@@ -228,16 +293,14 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
         raise ExperimentError(str(path), found) from error
     directory = path.parent
     base: Any = spec.experiment
+    lines = []
     if isinstance(base, str):
         file = find(base, directory)
         directory = file.parent
         base = read_yaml(file)
         if not isinstance(base, Mapping):
-            raise ExperimentError(
-                str(path), [problem("experiment", show(base), "expected a file of keys", "correct it")]
-            )
-    lines = _spec_problems(spec)
-    if lines:
+            lines = [problem("experiment", show(base), "expected a file of keys", "correct it")]
+    if lines := lines or _spec_problems(spec):
         raise ExperimentError(str(path), lines)
     return points_of(path, spec, base, directory, checked)
 
@@ -257,23 +320,17 @@ def _spec_problems(spec: SweepSpec) -> list[str]:
         found.append(problem("until", spec.until, wanted, "remove it, or use kind: network"))
     if SEED in spec.over and spec.repetitions > 1:
         found.append(problem("repetitions", spec.repetitions, f"expected 1, since {SEED} is swept", "use one of both"))
-    total = spec.repetitions
-    for length in lengths.values() if spec.combine == "grid" else [max(lengths.values())]:
-        total *= length
+    total = spec.repetitions * (math.prod(lengths.values()) if spec.combine == "grid" else max(lengths.values()))
     if total > MOST_POINTS:
         found.append(problem("over", f"{total} points", f"expected at most {MOST_POINTS}", "sweep fewer values"))
     return found
 
 
-def _combinations(spec: SweepSpec) -> Iterator[dict[str, Any]]:
-    joined = itertools.product(*spec.over.values()) if spec.combine == "grid" else zip(*spec.over.values(), strict=True)
-    for values in joined:
-        yield dict(zip(spec.over, values, strict=True))
-
-
 def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
     """The sweep of a document; every point is checked. ExperimentError: all mistakes, with their points."""
-    combinations = list(_combinations(spec))
+    axes = spec.over.values()
+    joined = itertools.product(*axes) if spec.combine == "grid" else zip(*axes, strict=True)
+    combinations = [dict(zip(spec.over, values, strict=True)) for values in joined]
     wrong: dict[str, list[int]] = {}  # line: indices of the combinations that have it
     points: list[Point] = []
     name, named = "", set()
@@ -320,19 +377,15 @@ def own_seed(seed: int, values: Mapping[str, Any], repetition: int) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big")
 
 
-def label(values: Mapping[str, Any]) -> str:
-    """A point in words: the swept keys and their values."""
-    return ", ".join(f"{key} = {show(value)}" for key, value in values.items())
-
-
 def _grouped(wrong: Mapping[str, Sequence[int]], combinations: Sequence[Mapping[str, Any]]) -> list[str]:
     """Each problem once, with the points that have it."""
     lines = []
     for line, numbers in wrong.items():
-        if len(numbers) == len(combinations) > 1:
-            lines.append(f"every point: {line}")
-            continue
-        named = "; ".join(f"point {number + 1} ({label(combinations[number])})" for number in numbers[:_NAMED])
+        named = []
+        for number in numbers[:_NAMED]:
+            values = ", ".join(f"{key} = {show(value)}" for key, value in combinations[number].items())
+            named.append(f"point {number + 1} ({values})")
         more = f" and {len(numbers) - _NAMED} more" if len(numbers) > _NAMED else ""
-        lines.append(f"{named}{more}: {line}")
+        every = len(numbers) == len(combinations) > 1
+        lines.append(f"every point: {line}" if every else f"{'; '.join(named)}{more}: {line}")
     return lines

@@ -18,9 +18,10 @@ from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import plain
 from msg_analysis.experiment.problems import ExperimentError, translate
 from msg_analysis.sweeps import grid
+from msg_analysis.sweeps.grid import SweepSpec
 from msg_analysis.sweeps.points import JobKind, evaluate, options
-from msg_analysis.sweeps.results import Judgement, OutcomeStore, Row, arrow_table, conduct, judge_sweep, rows_of
-from msg_analysis.sweeps.sweep_file import SweepSpec
+from msg_analysis.sweeps.results import ResultStore, Row, SweepVerdict, arrow_table, evaluate_sweep, rows_of
+from msg_analysis.sweeps.workers import run_jobs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,7 +44,7 @@ class Sweep:
 
     points: grid.Sweep
     rows: list[Row]
-    judgement: Judgement
+    judgement: SweepVerdict
 
     def __repr__(self) -> str:
         verdict = f"; {self.judgement.verdict}" if self.judgement.verdict else ""
@@ -90,7 +91,7 @@ class Sweep:
 
         from msg_analysis.report.figures import STYLE
         from msg_analysis.report.sweep_plots import draw
-        from msg_analysis.sweeps.figure_series import picture
+        from msg_analysis.sweeps.results import picture
 
         with mpl.rc_context(STYLE):
             return draw(picture(self.points, self.rows, column), f"{self.points.experiment}: {self.points.kind}")
@@ -156,8 +157,8 @@ def sweep(
     if workers is None and kind != "network":
         outcomes = tuple(evaluate(job) for job in jobs)
     else:
-        with tempfile.TemporaryDirectory() as folder, closing(OutcomeStore.open(folder)) as store:
+        with tempfile.TemporaryDirectory() as folder, closing(ResultStore.open(folder)) as store:
             network = options(Path(folder), False, workers or 1) if kind == "network" else None
-            outcomes = conduct(jobs, store, workers=workers, network=network).outcomes
-    judgement = judge_sweep(outcomes, level)
+            outcomes = run_jobs(jobs, store, workers=workers, network=network).outcomes
+    judgement = evaluate_sweep(outcomes, level)
     return Sweep(points, rows_of(points, outcomes, judgement), judgement)

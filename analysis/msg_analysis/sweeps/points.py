@@ -1,15 +1,10 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One point of a sweep: prediction, twin or network.
+"""One point of a sweep: what is done there, on a worker, and what is left of it.
 
-Runs of networks for a sweep: ``msg-agents run`` as a process of its own, a limited number at a time on a machine.
-
-Nothing of ROS is imported here: only the process that is started needs it.
-
-One point of a sweep: what is done there, and what is kept of it. This is what runs on the workers.
-
-Theory, twin and statistics are imported only in the jobs that need them.
+Theory, twin and statistics are imported only in the jobs that need them; a network is a process of its own,
+``msg-agents run``, so nothing of ROS is imported.
 """
 
 from __future__ import annotations
@@ -30,16 +25,18 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from msg_analysis.common.resources import SINGLE_THREAD
-from msg_analysis.common.version import __version__
+from msg_analysis.common.resources import SINGLE_THREAD, __version__
 from msg_analysis.errors import InputError
 
 # What the result of a job depends on: the folders and modules that ``evaluate`` imports.
-_SOURCES = ("common", "model", "theory", "twin", "inference", "sweep/jobs", "errors.py", "protocol.py", "types.py")
+_SOURCES = (
+    *("arithmetic", "common", "experiment", "model", "theory", "twin", "inference"),
+    *("sweep/points.py", "errors.py", "protocol.py"),
+)
 _LIBRARIES = ("distributed", "pyarrow")
 
 
@@ -55,8 +52,8 @@ def require_libraries() -> None:
 @functools.cache
 def installed_software() -> str:
     """Versions of msg_analysis, numpy and scipy in one line, with a digest of the code that results depend on."""
-    libraries = " ".join(f"{name} {_version(name)}" for name in ("numpy", "scipy"))
-    return f"msg_analysis {__version__} ({source_digest(Path(__file__).parents[2])}), {libraries}"
+    libraries = " ".join(f"{name} {version(name)}" for name in ("numpy", "scipy"))
+    return f"msg_analysis {__version__} ({source_digest(Path(__file__).parents[1])}), {libraries}"
 
 
 def source_digest(package: Path) -> str:
@@ -71,13 +68,6 @@ def source_files(package: Path) -> list[Path]:
     """These files: Python and C, in order."""
     found = [file for name in _SOURCES for file in [package / name, *(package / name).rglob("*")]]
     return sorted(file for file in found if file.suffix in (".py", ".c") and file.is_file())
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "unknown"
 
 
 JobKind = Literal["predict", "simulate", "network"]
@@ -112,12 +102,10 @@ class Job:
     @classmethod
     def of(cls, kind: JobKind, document: Mapping[str, Any], level: float = 0.01, until: str | None = None) -> Self:
         """The job for an experiment, a document as in its file; ``level`` of the tests of a run."""
-        text = json.dumps(document)
         what = json.dumps([kind, None if kind == "predict" else level, document], sort_keys=True)
         # The order of the graphs, which sort_keys hides, is that of the modes.
-        what += json.dumps(list(document["graphs"]))
-        what += until or ""
-        return cls(hashlib.sha256(what.encode()).hexdigest()[:20], kind, text, level, until)
+        what += json.dumps(list(document["graphs"])) + (until or "")
+        return cls(hashlib.sha256(what.encode()).hexdigest()[:20], kind, json.dumps(document), level, until)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,17 +115,26 @@ class Outcome:
     id: str  # of the job
     status: str  # ``DONE`` or ``FAILED``
     reason: str | None  # why it failed
-    result: Mapping[str, Any]  # what is kept, also of an incomplete run; empty where it failed otherwise
+    result: Mapping[str, Any]  # also of an incomplete run; empty where it failed otherwise
     seconds: float  # wall time [s]
     place: str  # host:process id
-    software: str  # see ``software.installed_software``
+    software: str  # see ``installed_software``
+
+
+@dataclass(frozen=True, slots=True)
+class JobResults:
+    """What became of all jobs."""
+
+    outcomes: tuple[Outcome, ...]  # in the order of the jobs
+    reused: int  # jobs that had been done before
+    others: int  # outcomes in the store that belong to none of the jobs
 
 
 PROGRAM = "msg-agents"
 POLL = 0.1  # s
 # Signals, and the seconds that a run then has to end: it ends its own processes in order.
 ESCALATION = ((signal.SIGINT, 30.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 5.0))
-_LEASH = Path(__file__).with_name("end_with_parent.py")
+_END_WITH_PARENT = Path(__file__).with_name("end_with_parent.py")
 
 
 def find_program() -> str:
@@ -181,8 +178,11 @@ def run_network(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
         directory.mkdir(parents=True)
         file = directory / "experiment.json"
         file.write_text(job.document, encoding="utf-8")
+        report = "always" if options.keep else "on-failure"
+        arguments = ["run", str(file), "--out", str(directory), "--write-report", report, "--json"]
+        arguments += ["--until", job.until] if job.until else []
         try:
-            document, said, code = _run(options, job.until, file, directory, slot, stopping)
+            document, said, code = _run([options.program, *arguments], slot, stopping)
         except NetworkStoppedError:
             shutil.rmtree(directory, ignore_errors=True)
             raise
@@ -196,20 +196,20 @@ def run_network(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
     return document
 
 
-def _run(
-    options: NetworkOptions,
-    until: str | None,
-    file: Path,
-    directory: Path,
-    slot: int,
-    stopping: Callable[[], bool],
-) -> tuple[dict[str, Any] | None, str, int]:
+def _run(command: Sequence[str], slot: int, stopping: Callable[[], bool]) -> tuple[dict[str, Any] | None, str, int]:
     """Its result (None: not JSON), what it wrote to stderr, and its exit code."""
-    report = "always" if options.keep else "on-failure"
-    arguments = ["run", str(file), "--out", str(directory), "--write-report", report, "--json"]
-    arguments += ["--until", until] if until else []
     with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
-        process = _start(options.program, arguments, [stdout.fileno(), stderr.fileno(), slot])
+        # In a session of its own: Ctrl-C in the terminal ends the sweep, which then ends the network in order. The slot
+        # is inherited: if this worker is killed, the next network waits until this one has ended.
+        process = subprocess.Popen(
+            [sys.executable, str(_END_WITH_PARENT), str(os.getpid()), *command],
+            stdin=subprocess.DEVNULL,
+            stdout=stdout,
+            stderr=stderr,
+            env={**os.environ, **SINGLE_THREAD},  # networks and workers share the cores
+            start_new_session=True,
+            pass_fds=[slot],
+        )
         try:
             while process.poll() is None:
                 time.sleep(POLL)
@@ -219,34 +219,17 @@ def _run(
             _end(process)
         stdout.seek(0)
         stderr.seek(0)
-        said = stderr.read().decode(errors="replace")
         try:
             document: dict[str, Any] | None = json.loads(stdout.read())
         except ValueError:
             document = None
-    return document, said, process.wait()
-
-
-def _start(program: str, arguments: Sequence[str], descriptors: Sequence[int]) -> subprocess.Popen[bytes]:
-    """Start the command; the descriptors are for its stdout, its stderr and the slot."""
-    # In a session of its own: Ctrl-C in the terminal ends the sweep, which then ends the network in order. The slot is
-    # inherited: if this worker is killed, the next network waits until this one has ended.
-    stdout, stderr, slot = descriptors
-    return subprocess.Popen(
-        [sys.executable, str(_LEASH), str(os.getpid()), program, *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=stdout,
-        stderr=stderr,
-        env={**os.environ, **SINGLE_THREAD},  # networks and workers share the cores
-        start_new_session=True,
-        pass_fds=[slot],
-    )
+        return document, stderr.read().decode(errors="replace"), process.wait()
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    for number, patience in ESCALATION:
+    for number, timeout in ESCALATION:
         process.send_signal(number)
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + timeout
         while process.poll() is None and time.monotonic() < deadline:
             time.sleep(POLL)
         if process.poll() is not None:
@@ -320,7 +303,7 @@ def _result(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
 
 
 def of_prediction(document: Mapping[str, Any]) -> dict[str, Any]:
-    """What is kept of a prediction, as ``predict --json`` prints it: the errors under every law, without matrices."""
+    """What is left of a prediction, as ``predict --json`` prints it: the errors under every law, without matrices."""
     from msg_analysis.theory.prediction import LAW_NAMES
 
     keys = ("system_error", "system_certainty", "node_errors")
@@ -330,28 +313,14 @@ def of_prediction(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def of_comparison(document: Mapping[str, Any]) -> dict[str, Any]:
-    """What is kept of a comparison, as ``compare --json`` prints it: the errors and the least p-value of its tests.
+    """What is left of a comparison, as ``compare --json`` prints it: the errors and the least p-value of its tests.
 
     As the p-values are adjusted, the least one is a p-value of the hypothesis that the run follows its law.
     """
-    tests = document.get("tests") or []
-    least = min(tests, key=lambda test: test["p_adjusted"], default=None)
-    kept = {
-        key: document.get(key)
-        for key in (
-            "verdict",
-            "unpredicted",
-            "steps",
-            "simulated_time",
-            "law",
-            "system_error",
-            "node_errors",
-            "bag",
-            "rate",
-        )
-    }
+    least = min(document.get("tests") or [], key=lambda test: test["p_adjusted"], default=None)
+    keys = ("verdict", "unpredicted", "steps", "simulated_time", "law", "system_error", "node_errors", "bag", "rate")
     causes = document.get("blame") or []
-    return kept | {
+    return {key: document.get(key) for key in keys} | {
         "p": least["p_adjusted"] if least else None,
         "least": least["name"] if least else None,
         "blame": "; ".join(cause["words"] for cause in causes) or None,

@@ -1,47 +1,75 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""A sweep from its start to its table of results.
-
-Conducting a sweep: outcomes that are there are kept, the other jobs are done, and all are judged together.
-
-``jobs.workers`` decides where a job runs, ``jobs.evaluate`` what is done in it.
-"""
+"""The results of a sweep: on disk, tested together, as a table, and as the series of a figure."""
 
 from __future__ import annotations
 
-import dataclasses
 import fcntl
 import io
 import json
+import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from msg_analysis.common.files import write_whole
-from msg_analysis.common.text import json_text
+from msg_analysis.common.text import HALF_WIDTH_95, agent_text, json_text
 from msg_analysis.errors import ExitCode, InputError
+from msg_analysis.experiment.problems import show
 from msg_analysis.inference.statistics import holm
 from msg_analysis.sweeps.grid import Sweep
-from msg_analysis.sweeps.points import DONE, FAILED, Job, NetworkOptions, Outcome, evaluate, installed_software
-from msg_analysis.sweeps.workers import Lost, Workers, deferring_interrupts
+from msg_analysis.sweeps.points import DONE, FAILED, Outcome
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-
 JOURNAL = "points.jsonl"
 _FIELDS = {field.name for field in fields(Outcome)}
 
+Row = dict[str, Any]
+_LEFT_OUT = {"agents", "stationary", "failure", "bag", "verdict"}
+_ESTIMATE = ("measured", "predicted", "standard_error", "z", "p", "p_holm")
+
+_KEYS = {
+    "agents": "number of agents",
+    "leaders.agents": "leaders",
+    "leaders.gain": "gain of the leaders",
+    "noise.broadcast": "noise of published values",
+    "noise.burst": "messages lost in a row",
+    "noise.delay": "delay of messages, in steps",
+    "noise.link": "noise of received values",
+    "noise.loss": "loss of messages",
+    "noise.loss.default": "loss of messages",
+    "noise.on_loss": "in place of a lost value",
+    "noise.process": "process noise",
+    "run.dt": "step length dt",
+    "run.duration": "simulated time",
+    "run.processes": "number of processes",
+    "run.replicas": "number of replicas",
+    "run.speed": "speed of real time",
+    "switching.initial": "first graph",
+    "switching.scale": "factor of the switching rates",
+    "switching.transition": "transition matrix",
+}
+_LAST_PART = {"leaders.reference", "run.pace", "run.delivery", "run.seed", "run.start", "switching.generator"}
+_COLUMNS = {
+    "node_errors": "error of {}",
+    "rate": "decay rate",
+    "seconds": "computing time [s]",
+    "system_certainty": "system certainty",
+    "system_error": "system error",
+}
+_LAWS = {"continuous": "continuous time", "discrete": "discrete time", "emulated": "with steps", "static": "one graph"}
+
 
 @dataclass(slots=True)
-class OutcomeStore:
+class ResultStore:
     """The outcomes in a directory; a lock lets one process at a time write there."""
 
     directory: Path
@@ -65,23 +93,21 @@ class OutcomeStore:
             raise InputError(f"{place}: {error.strerror}: choose another place with --out") from error
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            outcomes, damaged, whole = _read(path)
         except OSError as error:
             os.close(descriptor)
+            if not isinstance(error, BlockingIOError):
+                raise
             raise InputError(
                 f"{path}: another sweep is writing it: wait for its end, or choose another --out"
             ) from error
-        try:
-            outcomes, damaged, whole = _read(path)
-        except OSError:
-            os.close(descriptor)
-            raise
         # A last line without its end was being written when a sweep was killed: drop it.
         os.truncate(descriptor, whole)
         os.lseek(descriptor, 0, os.SEEK_END)
         return cls(directory, outcomes, damaged, descriptor)
 
     def add(self, outcomes: Iterable[Outcome]) -> None:
-        """Keep outcomes: when this returns, they are on the disk."""
+        """Add outcomes: when this returns, they are on the disk."""
         lines = b""
         for outcome in outcomes:
             self.outcomes[outcome.id] = outcome
@@ -98,9 +124,7 @@ class OutcomeStore:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -122,85 +146,8 @@ def _read(path: Path) -> tuple[dict[str, Outcome], int, int]:
     return outcomes, damaged, whole
 
 
-OtherSoftware = Literal["refuse", "redo", "keep"]
-NETWORK_PATIENCE = 60.0  # s that running networks have to end in order
-
-SweepProgress = Callable[[int, int, int], None]  # outcomes available, total, how many of them failed
-
-
 @dataclass(frozen=True, slots=True)
-class Conducted:
-    """What was done."""
-
-    outcomes: tuple[Outcome, ...]  # in the order of the jobs
-    kept: int  # jobs that had been done before
-    others: int  # outcomes in the store that belong to none of the jobs
-
-
-def conduct(
-    jobs: Sequence[Job],  # equal ones are done once
-    store: OutcomeStore,
-    *,
-    workers: int | None = None,  # processes here; None: one per CPU, or a single one where networks run
-    scheduler: str | None = None,  # of a Dask cluster, whose workers are used instead
-    network: NetworkOptions | None = None,  # needed where jobs run networks
-    other_software: OtherSoftware = "refuse",  # what to do with outcomes that other software made
-    retry: bool = False,  # whether failed jobs are done again
-    watch: SweepProgress = lambda _done, _total, _failed: None,
-) -> Conducted:
-    """Do all jobs that have not been done; outcomes are kept in ``store`` as soon as they come.
-
-    InputError: outcomes of other software ("refuse"), or no workers. WorkersLostError: the cluster went away.
-    """
-    todo = _todo(jobs, store, other_software, retry)
-    kept = len(jobs) - sum(job.id in todo for job in jobs)
-    total = len({job.id for job in jobs})
-    failed = sum(store.outcomes[job.id].status == FAILED for job in jobs if job.id not in todo)
-    done = total - len(todo)
-    watch(done, total, failed)
-    if todo:
-        runs_networks = any(job.kind == "network" for job in todo.values())
-        if runs_networks and not scheduler:
-            workers = workers or 1
-        items = [dataclasses.replace(job, network=network) for job in todo.values()]
-        patience = {"patience": NETWORK_PATIENCE} if runs_networks else {}
-        with Workers(workers, scheduler) as pool, closing(pool.outcomes(evaluate, items, **patience)) as batches:
-            for batch in batches:
-                found = [_lost(job, result) if isinstance(result, Lost) else result for job, result in batch]
-                with deferring_interrupts():  # what is said to be kept is what is on the disk
-                    store.add(found)
-                done += len(found)
-                failed += sum(outcome.status == FAILED for outcome in found)
-                watch(done, total, failed)
-    outcomes = tuple(store.outcomes[job.id] for job in jobs)
-    return Conducted(outcomes, kept, len(store.outcomes.keys() - {job.id for job in jobs}))
-
-
-def _todo(jobs: Sequence[Job], store: OutcomeStore, other_software: OtherSoftware, retry: bool) -> dict[str, Job]:
-    """The jobs that have to be done, by id."""
-    todo, others = {}, {}
-    for job in jobs:
-        known = store.outcomes.get(job.id)
-        if known is None or (retry and known.status == FAILED):
-            todo[job.id] = job
-        elif known.software != installed_software() and other_software != "keep":
-            others[job.id] = known.software
-            todo[job.id] = job
-    if others and other_software == "refuse":
-        was = " and ".join(sorted(set(others.values())))
-        raise InputError(
-            f"{store.directory}: {len(others)} results were made with other software ({was}), not "
-            f"{installed_software()}: choose another --out, or use --other-software redo or keep"
-        )
-    return todo
-
-
-def _lost(job: Job, lost: Lost) -> Outcome:
-    return Outcome(job.id, FAILED, lost.reason, {}, 0.0, "", installed_software())
-
-
-@dataclass(frozen=True, slots=True)
-class Judgement:
+class SweepVerdict:
     """What the runs of a sweep say together; the tuples are in the order of the outcomes."""
 
     p_holm: tuple[float | None, ...]  # p-values, adjusted over all of them (Holm); None where there is none
@@ -217,8 +164,8 @@ class Judgement:
         return ExitCode.INCOMPLETE if self.verdict == "incomplete" else ExitCode.FINE
 
 
-def judge_sweep(outcomes: Sequence[Outcome], level: float) -> Judgement:
-    """Judge all runs together (Holm): the chance of any false "disagrees" is at most ``level``."""
+def evaluate_sweep(outcomes: Sequence[Outcome], level: float) -> SweepVerdict:
+    """Test all runs together (Holm): the probability of any false "disagrees" is at most ``level``."""
     p_values: list[float | None] = [outcome.result.get("p") if outcome.status == DONE else None for outcome in outcomes]
     tested = [place for place, p in enumerate(p_values) if p is not None]
     adjusted: list[float | None] = [None] * len(outcomes)
@@ -226,29 +173,21 @@ def judge_sweep(outcomes: Sequence[Outcome], level: float) -> Judgement:
         for place, p in zip(tested, holm(np.array([p_values[place] for place in tested], dtype=float)), strict=True):
             adjusted[place] = float(p)
     verdicts = tuple(_verdict(outcome, p, level) for outcome, p in zip(outcomes, adjusted, strict=True))
-    whole: str | None = "agrees" if any(verdicts) else None
+    whole = "agrees" if any(verdicts) else None
     if any(outcome.status == FAILED for outcome in outcomes):
         whole = "incomplete"
-    if "disagrees" in verdicts:
-        whole = "disagrees"
-    return Judgement(tuple(adjusted), verdicts, whole)
+    return SweepVerdict(tuple(adjusted), verdicts, "disagrees" if "disagrees" in verdicts else whole)
 
 
 def _verdict(outcome: Outcome, p_holm: float | None, level: float) -> str | None:
-    result: Mapping[str, Any] = outcome.result
-    if outcome.status == FAILED or "verdict" not in result:
+    if outcome.status == FAILED or "verdict" not in outcome.result:
         return None
     if p_holm is not None and p_holm < level:
         return "disagrees"
-    return "unpredicted" if result.get("unpredicted") else "agrees"
+    return "unpredicted" if outcome.result.get("unpredicted") else "agrees"
 
 
-Row = dict[str, Any]
-_LEFT_OUT = {"agents", "stationary", "failure", "bag", "verdict"}
-_ESTIMATE = ("measured", "predicted", "standard_error", "z", "p", "p_holm")
-
-
-def rows_of(sweep: Sweep, outcomes: Sequence[Outcome], judgement: Judgement) -> list[Row]:
+def rows_of(sweep: Sweep, outcomes: Sequence[Outcome], verdict: SweepVerdict) -> list[Row]:
     """One row for each point, by name of the column; what a row does not have is empty there.
 
     Columns that are empty in all rows are left out, except ``reason`` and the swept keys.
@@ -260,45 +199,39 @@ def rows_of(sweep: Sweep, outcomes: Sequence[Outcome], judgement: Judgement) -> 
             row |= {"repetition": point.repetition + 1, "seed": point.seed}
         row |= {"status": outcome.status, "reason": outcome.reason}
         if sweep.kind != "predict":
-            row |= {"verdict": judgement.verdicts[number], "p_holm": judgement.p_holm[number]}
+            row |= {"verdict": verdict.verdicts[number], "p_holm": verdict.p_holm[number]}
         for key, value in outcome.result.items():
             if key not in _LEFT_OUT:
                 row |= _columns(key, value)
         if sweep.kind == "network":
             row["bag"] = outcome.result.get("bag")
-        row |= {"seconds": outcome.seconds, "software": outcome.software}
-        rows.append(row)
+        rows.append(row | {"seconds": outcome.seconds, "software": outcome.software})
     used = {name for row in rows for name, value in row.items() if value is not None} | {"reason", *sweep.keys}
     return [{name: value for name, value in row.items() if name in used} for row in rows]
 
 
 def _columns(name: str, value: Any) -> Row:
     """Columns of one key of a result: of an estimate, of a law, or of each agent (from 1)."""
+    if isinstance(value, Mapping) and "interval" in value:
+        low, high = value["interval"]
+        numbers = {key: value[key] for key in _ESTIMATE if value.get(key) is not None}
+        return {f"{name}.{key}": entry for key, entry in (numbers | {"low": low, "high": high}).items()}
     if isinstance(value, list):
-        return {
-            column: entry
-            for place, part in enumerate(value, start=1)
-            for column, entry in _columns(f"{name}[{place}]", part).items()
-        }
-    if not isinstance(value, Mapping):
+        parts = {f"{name}[{place}]": part for place, part in enumerate(value, start=1)}
+    elif isinstance(value, Mapping):
+        parts = {f"{name}.{key}": part for key, part in value.items()}
+    else:
         return {name: value}
-    if "interval" not in value:
-        return {
-            column: entry for key, part in value.items() for column, entry in _columns(f"{name}.{key}", part).items()
-        }
-    low, high = value["interval"]
-    numbers = {key: value[key] for key in _ESTIMATE if value.get(key) is not None}
-    return {f"{name}.{key}": entry for key, entry in (numbers | {"low": low, "high": high}).items()}
+    return {column: entry for key, part in parts.items() for column, entry in _columns(key, part).items()}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def column_names(rows: Sequence[Row]) -> list[str]:
     """Of all rows, in the order in which they first appear."""
     return list(dict.fromkeys(name for row in rows for name in row))
-
-
-def is_number(value: object) -> bool:
-    """Whether it is a number; a boolean is not."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def arrow_table(rows: Sequence[Row]) -> pa.Table:
@@ -311,17 +244,14 @@ def arrow_table(rows: Sequence[Row]) -> pa.Table:
         given = [value for value in values if value is not None]
         if given and all(isinstance(value, bool) for value in given):
             columns[name] = pa.array(values, pa.bool_())
-        elif given and all(is_number(value) and isinstance(value, int) for value in given):
+        elif given and all(_is_number(value) and isinstance(value, int) for value in given):
             columns[name] = pa.array(values, pa.int64() if max(map(abs, given)) < 2**63 else pa.float64())
-        elif given and all(map(is_number, given)):
+        elif given and all(map(_is_number, given)):
             columns[name] = pa.array([None if value is None else float(value) for value in values], pa.float64())
         else:
-            columns[name] = pa.array([value if value is None else _text(value) for value in values], pa.string())
+            texts = [value if value is None or isinstance(value, str) else json.dumps(value) for value in values]
+            columns[name] = pa.array(texts, pa.string())
     return pa.table(columns)
-
-
-def _text(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
 
 
 def write_tables(rows: Sequence[Row], document: Mapping[str, Any], directory: Path) -> list[Path]:
@@ -333,9 +263,173 @@ def write_tables(rows: Sequence[Row], document: Mapping[str, Any], directory: Pa
     parquet, text = io.BytesIO(), io.BytesIO()
     pyarrow.parquet.write_table(table, parquet)
     pyarrow.csv.write_csv(table, text, pyarrow.csv.WriteOptions(quoting_style="needed"))
-    content = {
-        "parquet": parquet.getvalue(),
-        "csv": text.getvalue(),
-        "json": json_text(document, 1).encode() + b"\n",
-    }
+    content = {"parquet": parquet.getvalue(), "csv": text.getvalue(), "json": json_text(document, 1).encode() + b"\n"}
     return [write_whole(directory / f"results.{name}", data) for name, data in content.items()]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """The rows of one combination of values, repetitions taken together."""
+
+    x: Any  # value of the key along the axis
+    value: float | None  # mean over the repetitions
+    low: float | None  # 95 % interval of a measured value
+    high: float | None
+    predicted: float | None  # mean of the exact expectations of what is measured
+    reference: float | None  # of a predicted value: the same in continuous time
+    reason: str | None = None  # why there is no value
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Places along the axis."""
+
+    values: tuple[tuple[str, Any], ...]  # of the other keys that have several
+    places: tuple[Place, ...]  # in the order of the axis
+
+    @property
+    def label(self) -> str:
+        """Keys and values; empty where there are none."""
+        return ", ".join(f"{key} = {value_text(value)}" for key, value in self.values)
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """What a figure shows: one column of the table over a swept key, for each value of the other keys."""
+
+    x: str  # the key along the axis
+    y: str  # the column
+    logarithmic: bool  # the axis of x
+    measured: bool  # whether there are intervals
+    series: tuple[Series, ...]  # one for each combination of values of the other keys
+    names: Sequence[str] | None = None  # of the agents, if all points have the same
+
+    def words(self, values: Iterable[tuple[str, Any]]) -> str:
+        """Keys in words, with their values; empty where there are none."""
+        return ", ".join(f"{key_words(key, self.names)} = {value_text(value)}" for key, value in values)
+
+    @property
+    def numeric(self) -> bool:
+        """Whether all values along the axis are numbers."""
+        return all(_is_number(place.x) for series in self.series for place in series.places)
+
+
+def several_values(sweep: Sweep) -> list[str]:
+    """The keys with several values, in the order of the file."""
+    return [key for key, values in sweep.spec.over.items() if len(values) > 1]
+
+
+def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None, along: str | None = None) -> Picture:
+    """Choose what to draw of ``rows_of``; InputError where there is no such column of numbers.
+
+    ``along``: the key along the axis, by default the first one with several values. ``column`` may be the beginning of
+    a name: ``system_error`` stands for what is measured or predicted of it.
+    """
+    wanted = column or "system_error"
+    names = _drawn_columns(rows, wanted)
+    if not names["value"]:
+        if column is not None:
+            raise InputError(f"--column {wanted}: not a column of numbers: expected one of {_offer(rows)}")
+        names["value"] = wanted  # nothing but failures
+    several = several_values(sweep)
+    along = along or next(iter(several), sweep.keys[0])
+    others = [key for key in several if key != along] if sweep.spec.combine == "grid" else []
+    groups: dict[tuple[str, ...], dict[str, list[Row]]] = {}
+    values: dict[tuple[str, ...], tuple[tuple[str, Any], ...]] = {}
+    for row in rows:
+        group = tuple(show(row[key]) for key in others)
+        values.setdefault(group, tuple((key, row[key]) for key in others))
+        groups.setdefault(group, {}).setdefault(show(row[along]), []).append(row)
+    found = tuple(
+        Series(values[group], tuple(_place(along, rows_here, names) for rows_here in places.values()))
+        for group, places in groups.items()
+    )
+    return Picture(along, wanted, _logarithmic(sweep, along), names["error"] is not None, found, sweep.names)
+
+
+def _drawn_columns(rows: Sequence[Row], wanted: str) -> dict[str, str | None]:
+    """Names of the columns of a value, its standard error, its expectation and its reference; None: not there."""
+    numeric = _numeric(rows)
+    for value, error, predicted, reference in (
+        (f"{wanted}.measured", f"{wanted}.standard_error", f"{wanted}.predicted", None),
+        (f"emulated.{wanted}", None, None, f"continuous.{wanted}"),
+        (f"discrete.{wanted}", None, None, None),
+        (wanted, None, None, None),
+    ):
+        if value in numeric:
+            names = {"value": value, "error": error, "predicted": predicted, "reference": reference}
+            return {key: name if name in numeric else None for key, name in names.items()}
+    return dict.fromkeys(("value", "error", "predicted", "reference"))
+
+
+def _numeric(rows: Sequence[Row]) -> set[str]:
+    """The columns of numbers."""
+    given = {name: [row[name] for row in rows if row.get(name) is not None] for name in column_names(rows)}
+    return {name for name, values in given.items() if values and all(map(_is_number, values))}
+
+
+def _offer(rows: Sequence[Row]) -> str:
+    """Names of columns of numbers; those of agents other than the first are left out."""
+    short = {name.removesuffix(".measured") for name in _numeric(rows)}
+    return ", ".join(sorted(name for name in short if "[" not in name or "[1]" in name))
+
+
+def _place(along: str, rows: Sequence[Row], names: Mapping[str, str | None]) -> Place:
+    """The mean of repetitions, and the 95 % interval of the mean."""
+    numbers = {
+        key: [float(row[name]) for row in rows if row.get(name) is not None] if name else []
+        for key, name in names.items()
+    }
+    value, predicted, reference = (
+        math.fsum(found) / len(found) if (found := numbers[key]) else None
+        for key in ("value", "predicted", "reference")
+    )
+    errors = numbers["error"]
+    half = HALF_WIDTH_95 * math.hypot(*errors) / len(errors) if errors else None
+    known = value is not None and half is not None
+    low, high = (value - half, value + half) if known else (None, None)  # type: ignore[operator]
+    reason = next((row["reason"] for row in rows if row.get("reason")), None) if value is None else None
+    return Place(rows[0][along], value, low, high, predicted, reference, reason)
+
+
+def _logarithmic(sweep: Sweep, along: str) -> bool:
+    """As the file says; else whether all values are numbers > 0 that span a factor of 50 or more."""
+    axis = sweep.spec.over[along]
+    if axis.logarithmic is not None:
+        return axis.logarithmic
+    numbers = list(filter(_is_number, axis))
+    return len(numbers) == len(axis) and min(numbers) > 0 and max(numbers) / min(numbers) >= 50
+
+
+def value_text(value: Any) -> str:
+    """A value of a key for a table or a label: numbers with six digits."""
+    return f"{value:.6g}" if isinstance(value, float) else show(value)
+
+
+def key_words(key: str, names: Sequence[str] | None = None) -> str:
+    """A key in words, such as "step length dt"; the key itself if it has none. ``names``: of the agents."""
+    if key in _KEYS or key in _LAST_PART:
+        return _KEYS.get(key, key.rpartition(".")[2])
+    if found := re.fullmatch(r"noise\.process\[(\d+)\]", key):
+        return f"process noise of {agent_text(int(found[1]), names)}"
+    if found := re.fullmatch(r"switching\.rates\.([^.]+)\.([^.]+)", key):
+        return f"switching rate from {found[1]} to {found[2]}"
+    return key
+
+
+def axis_name(key: str, names: Sequence[str] | None = None) -> str:
+    """A key in words, with the key in brackets, such as "step length dt [run.dt]"."""
+    words = key_words(key, names)
+    return words if words == key else f"{words} [{key}]"
+
+
+def column_words(column: str, names: Sequence[str] | None = None) -> str:
+    """A column in words, such as "error of agent 3"; the column itself if it has none."""
+    law, _, rest = column.partition(".")
+    if law in _LAWS and rest:
+        return f"{column_words(rest, names)}, {_LAWS[law]}"
+    found = re.fullmatch(r"(\w+?)(?:\[(\d+)\])?", column)
+    words = _COLUMNS.get(found[1]) if found else None
+    if found is None or words is None or ("{}" in words) != (found[2] is not None):
+        return column
+    return words.format(agent_text(int(found[2]), names)) if found[2] else words

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Worker pool: processes of this machine, or a Dask cluster; a worker that dies is replaced.
+"""The jobs of a sweep on workers: processes of this machine, or a Dask cluster; a worker that dies is replaced.
 
 Items are sent in batches of about half a second of work. What kills workers is tried again alone, then given up.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import dataclasses
 import logging
 import math
 import multiprocessing
@@ -19,17 +20,19 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 from msg_analysis.common.resources import SINGLE_THREAD, count_cores, one_blas_thread
 from msg_analysis.errors import InputError
-from msg_analysis.sweeps.points import installed_software
+from msg_analysis.sweeps.points import FAILED, Job, JobResults, NetworkOptions, Outcome, evaluate, installed_software
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Future
+
+    from msg_analysis.sweeps.results import ResultStore
 
 
 T = TypeVar("T")
@@ -42,6 +45,7 @@ NOTICE = 0.5  # s between two checks of a worker whether the work is being ended
 # Signals that end a sweep as Ctrl-C does: that of a cluster's queue, and that of a terminal that is closed.
 ENDING = (signal.SIGTERM, signal.SIGHUP)
 _CONNECT = 10.0  # s
+NETWORK_TIMEOUT = 60.0  # s that running networks have to end in order
 # Less of what Dask does besides the work, which costs time on two cores.
 _QUIET = {
     "distributed.worker.profile.enabled": False,
@@ -52,17 +56,23 @@ _NEEDED = ("msg_analysis.theory.prediction", "msg_analysis.inference.verdict", "
 
 # What is done with an item; the second argument says whether the work is being ended.
 Function = Callable[[T, Callable[[], bool]], R]
+OtherSoftware = Literal["refuse", "redo", "keep"]
+SweepProgress = Callable[[int, int, int], None]  # outcomes available, total, how many of them failed
 
 
 class WorkersLostError(Exception):
     """The cluster went away in the middle of the work."""
 
 
-class Lost:
-    """In place of a result: the item killed every worker that tried it; ``reason`` is a text for the user."""
+class EndedError(Exception):
+    """The work was ended before it was done."""
 
-    def __init__(self, reason: str) -> None:
-        self.reason = reason
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """In place of a result: the item killed every worker that tried it."""
+
+    reason: str  # for the user
 
 
 def warm_up() -> None:
@@ -74,9 +84,15 @@ def warm_up() -> None:
         return
     from multiprocessing import forkserver
 
-    with _environment(SINGLE_THREAD), _ignoring(signal.SIGINT):
+    previous = {name: os.environ.get(name) for name in SINGLE_THREAD}
+    os.environ.update(SINGLE_THREAD)
+    with _ignoring(signal.SIGINT):
         multiprocessing.get_context("forkserver").set_forkserver_preload(["distributed", *_NEEDED])
         forkserver.ensure_running()
+    for name, value in previous.items():
+        del os.environ[name]
+        if value is not None:
+            os.environ[name] = value
 
 
 class Workers:
@@ -88,7 +104,7 @@ class Workers:
     def __init__(self, count: int | None = None, scheduler: str | None = None) -> None:
         self._count = count or count_cores()
         self._scheduler = scheduler
-        self._client: Client | None = None
+        self._client: Any = None  # of Dask, from ``__enter__`` on
         self._cluster: Any = None
         self._stop_name = f"msg-sweep-stop-{uuid.uuid4().hex}"
 
@@ -117,24 +133,17 @@ class Workers:
         dask.config.set({"distributed.worker.multiprocessing-method": method, **_QUIET})
         try:
             with deferring_interrupts():
-                self._cluster = distributed.LocalCluster(
-                    n_workers=self._count,
-                    threads_per_worker=1,
-                    processes=True,
-                    host="127.0.0.1",
-                    dashboard_address="127.0.0.1:0",
-                    scheduler_kwargs={"dashboard": False},
-                    silence_logs=logging.CRITICAL + 1,
-                )
+                quiet = {"scheduler_kwargs": {"dashboard": False}, "silence_logs": logging.CRITICAL + 1}
+                place = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+                size = {"n_workers": self._count, "threads_per_worker": 1, "processes": True}
+                self._cluster = distributed.LocalCluster(**size, **place, **quiet)
                 self._client = distributed.Client(self._cluster)
         except KeyboardInterrupt:
             self._close()
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._close()
 
     def _close(self) -> None:
@@ -148,32 +157,30 @@ class Workers:
     @property
     def threads(self) -> int:
         """Items that can be worked on at a time now; 0 where a cluster has no worker yet."""
-        assert self._client is not None
         return sum(self._client.nthreads().values()) if self._scheduler else self._count
 
     def outcomes(
-        self, function: Function[T, R], items: Sequence[T], *, patience: float = 2 * NOTICE
+        self, function: Function[T, R], items: Sequence[T], *, timeout: float = 2 * NOTICE
     ) -> Generator[list[tuple[T, R | Lost]], None, None]:
         """Results of ``function`` (at the top of a module) for all items, in batches, as they are ready.
 
-        An item that kills its workers again when tried alone is ``Lost``. If interrupted, running work has ``patience``
+        An item that kills its workers again when tried alone is ``Lost``. If interrupted, running work has ``timeout``
         [s] to end. WorkersLostError: the scheduler is gone; InputError: other software on a worker.
         """
         from distributed import as_completed
 
-        assert self._client is not None
         pending = deque(items)
-        suspects: deque[T] = deque()
+        suspected: deque[T] = deque()
         running: dict[Future, list[T]] = {}
         seconds = math.inf
         done = as_completed()
         try:
-            while pending or suspects or running:
+            while pending or suspected or running:
                 while pending and len(running) < QUEUED * max(self.threads, 1):
                     self._submit(function, _take(pending, seconds, self.threads), running, done)
                 alone = not running
                 if alone:
-                    self._submit(function, [suspects.popleft()], running, done)
+                    self._submit(function, [suspected.popleft()], running, done)
                 future = next(done)
                 batch = running.pop(future)
                 found = self._result(future)
@@ -185,15 +192,14 @@ class Workers:
                 elif alone:
                     yield [(batch[0], Lost("killed every worker that tried it, or used up its memory"))]
                 else:
-                    suspects += batch
+                    suspected += batch
         except BaseException as error:
-            self._stop(list(running), patience)
+            self._stop(list(running), timeout)
             if isinstance(error, OSError | asyncio.CancelledError | concurrent.futures.CancelledError):
                 raise WorkersLostError("the scheduler has gone") from error
             raise
 
     def _submit(self, function: Function[T, R], batch: list[T], running: dict[Future, list[T]], done: Any) -> None:
-        assert self._client is not None
         future = self._client.submit(_do, function, batch, self._stop_name, installed_software(), pure=False)
         running[future] = batch
         done.add(future)
@@ -205,7 +211,6 @@ class Workers:
         """
         from distributed import KilledWorker
 
-        assert self._client is not None
         if future.status == "finished":
             found: tuple[list[Any], float] = future.result()
             return found
@@ -221,29 +226,25 @@ class Workers:
             raise WorkersLostError("the scheduler has gone")
         return None  # the only worker that had the result died
 
-    def _stop(self, running: Sequence[Future], patience: float) -> None:
-        """Tell the workers to stop, and wait up to ``patience`` seconds for the running batches."""
+    def _stop(self, running: Sequence[Future], timeout: float) -> None:
+        """Tell the workers to stop, and wait up to ``timeout`` seconds for the running batches."""
         from distributed import Event, wait
 
         with _ignoring(signal.SIGINT, signal.SIGTERM), suppress(Exception):
-            assert self._client is not None
             Event(self._stop_name, client=self._client).set()
-            wait(running, timeout=patience)
+            wait(running, timeout=timeout)
 
     def _compare_software(self) -> None:
         """Refuse workers with other software; those that join later refuse themselves in ``_do``."""
-        assert self._client is not None
+        where, own = f"--scheduler {self._scheduler}", installed_software()
         try:
             found = self._client.run(installed_software)
         except ModuleNotFoundError as error:
-            raise InputError(
-                f"--scheduler {self._scheduler}: {error}: install the same software on its workers"
-            ) from error
-        for worker, software in found.items():
-            if software != installed_software():
+            raise InputError(f"{where}: {error}: install the same software on its workers") from error
+        for worker, other in found.items():
+            if other != own:
                 raise InputError(
-                    f"--scheduler {self._scheduler}: worker {worker} has {software}: expected "
-                    f"{installed_software()}: install the same software there"
+                    f"{where}: worker {worker} has {other}: expected {own}: install the same software there"
                 )
 
 
@@ -269,10 +270,6 @@ def _do(function: Function[T, R], batch: Sequence[T], stop_name: str, software: 
     return results, time.perf_counter() - begin
 
 
-class EndedError(Exception):
-    """The work was ended before it was done."""
-
-
 class _Stopping:
     """Whether the work is to end; asks the scheduler every ``NOTICE`` seconds, and is true if that has gone."""
 
@@ -294,47 +291,92 @@ class _Stopping:
 
 
 @contextmanager
-def _ignoring(*numbers: signal.Signals) -> Iterator[None]:
-    """Ignore signals for a while, if this is the main thread; processes started meanwhile ignore them for good."""
+def _handling(handler: Any, numbers: Iterable[signal.Signals]) -> Iterator[None]:
+    """Another handler of signals for a while, if this is the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
+    previous = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        for number, former in previous.items():
+            signal.signal(number, former)
+
+
+def _ignoring(*numbers: signal.Signals) -> AbstractContextManager[None]:
+    """Ignore signals for a while; processes started meanwhile ignore them for good."""
+    return _handling(signal.SIG_IGN, numbers)
 
 
 @contextmanager
 def deferring_interrupts() -> Iterator[None]:
     """Postpone signals that end the program until the block is done; then the first one is raised."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     received: list[int] = []
     numbers = [signal.SIGINT, *(number for number in ENDING if callable(signal.getsignal(number)))]
-    previous = {number: signal.signal(number, lambda number, _: received.append(number)) for number in numbers}
-    try:
+    with _handling(lambda number, _: received.append(number), numbers):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
     if received:
         signal.raise_signal(received[0])
 
 
-@contextmanager
-def _environment(changes: dict[str, str]) -> Iterator[None]:
-    """Other values of environment variables for a while."""
-    previous = {name: os.environ.get(name) for name in changes}
-    os.environ.update(changes)
-    try:
-        yield
-    finally:
-        for name, value in previous.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def run_jobs(
+    jobs: Sequence[Job],  # equal ones are done once
+    store: ResultStore,
+    *,
+    workers: int | None = None,  # processes here; None: one per CPU, or a single one where networks run
+    scheduler: str | None = None,  # of a Dask cluster, whose workers are used instead
+    network: NetworkOptions | None = None,  # needed where jobs run networks
+    other_software: OtherSoftware = "refuse",  # what to do with outcomes that other software made
+    retry: bool = False,  # whether failed jobs are done again
+    watch: SweepProgress = lambda _done, _total, _failed: None,
+) -> JobResults:
+    """Do all jobs that have not been done; outcomes are written to ``store`` as soon as they come.
+
+    InputError: outcomes of other software ("refuse"), or no workers. WorkersLostError: the cluster went away.
+    """
+    todo = _todo(jobs, store, other_software, retry)
+    reused = len(jobs) - sum(job.id in todo for job in jobs)
+    total = len({job.id for job in jobs})
+    failed = sum(store.outcomes[job.id].status == FAILED for job in jobs if job.id not in todo)
+    done = total - len(todo)
+    watch(done, total, failed)
+    if todo:
+        runs_networks = any(job.kind == "network" for job in todo.values())
+        if runs_networks and not scheduler:
+            workers = workers or 1
+        items = [dataclasses.replace(job, network=network) for job in todo.values()]
+        timeout = {"timeout": NETWORK_TIMEOUT} if runs_networks else {}
+        with Workers(workers, scheduler) as pool, closing(pool.outcomes(evaluate, items, **timeout)) as batches:
+            for batch in batches:
+                found = [_lost(job, result) if isinstance(result, Lost) else result for job, result in batch]
+                with deferring_interrupts():  # the outcomes that are counted are on the disk
+                    store.add(found)
+                done += len(found)
+                failed += sum(outcome.status == FAILED for outcome in found)
+                watch(done, total, failed)
+    outcomes = tuple(store.outcomes[job.id] for job in jobs)
+    return JobResults(outcomes, reused, len(store.outcomes.keys() - {job.id for job in jobs}))
+
+
+def _todo(jobs: Sequence[Job], store: ResultStore, other_software: OtherSoftware, retry: bool) -> dict[str, Job]:
+    """The jobs that have to be done, by id."""
+    todo, others = {}, {}
+    for job in jobs:
+        known = store.outcomes.get(job.id)
+        if known is None or (retry and known.status == FAILED):
+            todo[job.id] = job
+        elif known.software != installed_software() and other_software != "keep":
+            others[job.id] = known.software
+            todo[job.id] = job
+    if others and other_software == "refuse":
+        was = " and ".join(sorted(set(others.values())))
+        raise InputError(
+            f"{store.directory}: {len(others)} results were made with other software ({was}), not "
+            f"{installed_software()}: choose another --out, or use --other-software redo or keep"
+        )
+    return todo
+
+
+def _lost(job: Job, lost: Lost) -> Outcome:
+    return Outcome(job.id, FAILED, lost.reason, {}, 0.0, "", installed_software())

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK
+from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK
 from msg_analysis.arithmetic.update_law import from_payload, to_payload
 from msg_analysis.arithmetic.update_law import step as update
 from msg_analysis.common.arrays import FloatArray, IntArray

@@ -25,8 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
-from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK, StepClock, Stream, normals
 from msg_analysis.arithmetic.update_law import ManySteps, Round, from_payload, to_payload, weighted_sum
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray, large_zeros, release
 from msg_analysis.errors import InputError

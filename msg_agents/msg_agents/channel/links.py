@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from msg_agents.channel.namespaces import device_overflow
-from msg_analysis.arithmetic.random_streams import Stream, generator, link_number
+from msg_analysis.arithmetic.reproducible import Stream, generator, link_number
 from msg_analysis.common.files import write_whole
 
 _MODE = struct.Struct("<q")

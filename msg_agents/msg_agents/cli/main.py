@@ -42,7 +42,7 @@ from msg_analysis.cli.runs import runs
 
 if TYPE_CHECKING:
     from msg_agents.run.result import ReportWhen
-    from msg_analysis.bags.mcap_chunks import Compression
+    from msg_analysis.bags.stored_file import Compression
 
 
 class _Commands(CommandGroup):

@@ -34,7 +34,7 @@ from msg_analysis.errors import ExitCode
 if TYPE_CHECKING:
     from msg_agents.nodes.base import NetworkNode
     from msg_agents.stepping.newest_values import ClockOffsets
-    from msg_analysis.bags.mcap_chunks import Compression
+    from msg_analysis.bags.stored_file import Compression
     from msg_analysis.model.run_record import RunRecord
 
 

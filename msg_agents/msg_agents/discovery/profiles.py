@@ -11,7 +11,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from pathlib import Path
 
-from msg_analysis.common.version import ros_distribution
+from msg_analysis.common.resources import ros_distribution
 
 
 def has_fast_dds_3(distribution: str) -> bool:

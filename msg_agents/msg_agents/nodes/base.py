@@ -24,7 +24,7 @@ from msg_agents.environment import discovery_scope
 from msg_agents.nodes.diagnostics import Health
 from msg_agents.nodes.ros import LeanNode, every
 from msg_agents.process_layout import RECORDER, SWITCHER
-from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.errors import InputError
 from msg_analysis.messages import topics
 from msg_analysis.messages.acceptance import Refusal, RunRules, sign

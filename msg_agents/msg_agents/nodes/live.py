@@ -16,7 +16,7 @@ from std_msgs.msg import Header
 
 from msg_agents.nodes.ros import every, until_shutdown
 from msg_agents.nodes.watch_process import Watcher, run_watcher
-from msg_analysis.arithmetic.step_clock import SECOND, StepClock
+from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.inference.online_errors import LiveEstimate, LiveReport
 from msg_analysis.messages import topics
 from msg_analysis.messages.acceptance import Refusal, decode_of_run

@@ -25,7 +25,7 @@ from msg_agents.nodes.process import leave
 from msg_agents.nodes.ros import LeanNode, RCLError, ros_profile
 from msg_agents.replay import BagClock, parse_remaps, select_topics
 from msg_agents.terminal import Interruption, JobControl, Keyboard
-from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.bags.playback import Message, Playback
 from msg_analysis.errors import InputError
 from msg_analysis.messages.topics import CLOCK, LATCHED, STREAM

@@ -16,7 +16,7 @@ from msg_agents.nodes.ros import DueTimer
 from msg_agents.nodes.switcher import EPOCH_DELAY
 from msg_agents.stepping.newest_values import CLOCK_MARGIN, NewestOnAir, NewestValues, Schedule
 from msg_agents.stepping.synchronizer import NOTHING
-from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.experiment.protocols import ProtocolError
 from msg_analysis.messages import topics
 from msg_analysis.messages.acceptance import Refusal

@@ -18,7 +18,7 @@ from msg_agents.nodes.base import NOT_AN_AGENT, NetworkNode
 from msg_agents.nodes.diagnostics import Health
 from msg_agents.nodes.ros import every
 from msg_agents.stepping.state_receiver import StateReceiver
-from msg_analysis.bags.mcap_chunks import DEFAULT_STORAGE, Storage
+from msg_analysis.bags.stored_file import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.writing import BagWriter
 from msg_analysis.errors import BagError
 from msg_analysis.messages import topics

@@ -25,7 +25,7 @@ from msg_agents.process_layout import RECORDER, SWITCHER
 from msg_agents.recovery import StopFiles
 from msg_agents.stepping.newest_values import MILLISECOND, ClockOffsets, Schedule
 from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW
-from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.messages import topics
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.messages import encode_string

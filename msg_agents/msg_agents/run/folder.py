@@ -19,8 +19,9 @@ from typing import Any
 from msg_agents.environment import MEMORY, free_space
 from msg_analysis.common.files import require_utf8
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import Experiment, ExperimentError
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import read_yaml
+from msg_analysis.experiment.problems import ExperimentError
 
 PREFIX = "msg_agents_run_"
 SPARE = 4  # times the room that is needed must be free there, so that other programs have enough

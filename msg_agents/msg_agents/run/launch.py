@@ -25,7 +25,7 @@ from msg_agents.process_layout import RECORDER, ProcessPlan, plan_network
 from msg_agents.replay import parse_rate
 from msg_agents.run.folder import load_with_overrides, make_bag_directory, workshop
 from msg_agents.run.supervisor import failure_of
-from msg_analysis.bags.mcap_chunks import MEGABYTE, SMALLEST_SPLIT, Storage
+from msg_analysis.bags.stored_file import MEGABYTE, SMALLEST_SPLIT, Storage
 from msg_analysis.common.files import REPORT_FILE
 from msg_analysis.common.resources import SINGLE_THREAD
 from msg_analysis.errors import ExitCode, InputError

@@ -35,9 +35,9 @@ from msg_agents.stepping.stall_detection import ClockDetector, LagDetector, Stal
 from msg_agents.terminal import Interruption
 from msg_agents.watch.observer import EarlyEnd
 from msg_agents.watch.panel import View
-from msg_analysis.bags.mcap_chunks import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
+from msg_analysis.bags.stored_file import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.writing import RECORDING_MARKER
 from msg_analysis.common.resources import available_cores
 from msg_analysis.common.text import agent_text, with_names

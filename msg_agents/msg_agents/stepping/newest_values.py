@@ -23,7 +23,7 @@ from math import inf
 from typing import Any
 
 from msg_agents.stepping.synchronizer import NOTHING, AgentInputs, Value
-from msg_analysis.arithmetic.step_clock import SECOND, StepClock
+from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.messages.acceptance import Refusal
 
 MILLISECOND = 1e6  # ns

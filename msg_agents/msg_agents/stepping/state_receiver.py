@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from msg_agents.stepping.synchronizer import KEPT_AFTER_USE, RESEND_LIMIT, ReceivedSteps, Synchronizer, Value, marks_of
-from msg_analysis.bags.mcap_chunks import gather
-from msg_analysis.bags.state_columns import States, own_layout, run_number
+from msg_analysis.bags.states import States, own_layout, run_number
+from msg_analysis.bags.stored_file import gather
 from msg_analysis.common.arrays import BoolArray, IntArray
 from msg_analysis.messages.acceptance import Refusal, fault_of, state_frame, why_refused
 from msg_analysis.messages.cdr import CdrError, decode_batch

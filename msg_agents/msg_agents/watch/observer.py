@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from msg_agents.recovery import MARK, StopFiles, entry_size, published_size, room_for
-from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.common.resources import one_blas_thread
 from msg_analysis.errors import InputError

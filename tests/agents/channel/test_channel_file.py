@@ -13,7 +13,8 @@ import yaml
 
 from msg_agents.channel.channel_file import BASE, Channel, ChannelSpec, PairSpec, TwoStates, json_schema
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import Experiment, ExperimentError
+from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.experiment.problems import ExperimentError
 
 ROOT = Path(__file__).parents[3]
 TWO = {"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}}

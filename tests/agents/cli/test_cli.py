@@ -21,7 +21,7 @@ pytest.importorskip("rclpy")
 
 
 from msg_agents.cli.main import main
-from msg_analysis.bags.run_writer import write_trajectory
+from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import new_record, simulate
 

@@ -23,7 +23,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header, String
 
 from msg_analysis.messages import messages
-from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, ESTIMATE, PROGRESS, STRING, MessageType
+from msg_analysis.messages.messages import ACTIVE_GRAPH, AGENT_STATE, ESTIMATE, PROGRESS, STRING, MessageType
 
 U32, U64 = st.integers(0, 2**32 - 1), st.integers(0, 2**64 - 1)
 NANOSECOND = st.integers(0, (2**31 - 1) * 10**9 + 999_999_999)

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from msg_agents.replay import BagClock, parse_remaps, select_topics
-from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.errors import InputError
 
 TOPICS = ["/experiment", "/graph", "/agent_1/state", "/agent_2/state", "/lab/agent_1/state"]

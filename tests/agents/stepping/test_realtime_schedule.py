@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from msg_agents.stepping.newest_values import Schedule
-from msg_analysis.arithmetic.step_clock import SECOND
+from msg_analysis.arithmetic.reproducible import SECOND
 
 DAY = 86_400 * SECOND
 speeds = st.floats(1e-3, 1e3)

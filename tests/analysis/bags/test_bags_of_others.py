@@ -14,9 +14,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 
 from experiments import Run, compare, line_ring, read_bag, simulate, write_trajectory
-from msg_analysis.bags.mcap_chunks import Storage
 from msg_analysis.bags.reading import read_record
 from msg_analysis.bags.salvage import salvage
+from msg_analysis.bags.stored_file import Storage
 from msg_analysis.errors import BagError
 from msg_analysis.report.documents import describe_bag
 

@@ -13,7 +13,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from experiments import Run, line_ring, read_bag, simulate, write_trajectory
-from msg_analysis.bags.mcap_chunks import COMPRESSIONS, Compression, Storage
+from msg_analysis.bags.stored_file import COMPRESSIONS, Compression, Storage
 from msg_analysis.errors import InputError
 
 AGENTS, STEPS, REPLICAS = 3, 120, 4

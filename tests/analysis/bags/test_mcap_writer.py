@@ -14,8 +14,8 @@ from mcap.records import Attachment
 from mcap.writer import CompressionType, Writer
 
 from msg_analysis.bags import mcap_writing
-from msg_analysis.bags.mcap_chunks import MESSAGE_HEAD, Compression
 from msg_analysis.bags.mcap_writing import McapWriter
+from msg_analysis.bags.stored_file import MESSAGE_HEAD, Compression
 
 TIMES = st.integers(0, 2**64 - 1)
 TYPES = {"none": CompressionType.NONE, "zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4}

@@ -14,8 +14,16 @@ from experiments import Run, check, compare, read_bag, write_trajectory
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.messages.acceptance import Refusal
-from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, encode_string
-from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE, PROGRESS, STRING
+from msg_analysis.messages.messages import (
+    ACTIVE_GRAPH,
+    AGENT_STATE,
+    PROGRESS,
+    STRING,
+    ActiveGraph,
+    AgentState,
+    Progress,
+    encode_string,
+)
 from msg_analysis.model.run_record import Until
 from msg_analysis.model.step_model import build_model
 

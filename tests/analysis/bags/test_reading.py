@@ -21,11 +21,10 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
 from experiments import Experiment, Run, RunRecord, read_bag, write_trajectory
-from msg_analysis.bags.mcap_chunks import DamageError, locate, unpack
-from msg_analysis.bags.mcap_reading import MAGIC, McapFile
+from msg_analysis.bags.mcap_reading import MAGIC, McapFile, locate, unpack
+from msg_analysis.bags.stored_file import DamageError
 from msg_analysis.messages.cdr import CdrError
-from msg_analysis.messages.messages import ActiveGraph, AgentState, encode_string
-from msg_analysis.messages.schemas import AGENT_STATE, STRING
+from msg_analysis.messages.messages import AGENT_STATE, STRING, ActiveGraph, AgentState, encode_string
 
 STEPS, AGENTS, WIDTH, LOST = 5, 3, 2, 2**64 - 1
 NEIGHBOURS = ([0, 0, 0], [1, 2, 1], [2, 1, 1])  # how many: no graph, line, star

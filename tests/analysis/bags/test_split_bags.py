@@ -17,9 +17,9 @@ from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
 from experiments import Run, read_bag, write_trajectory
-from msg_analysis.bags.mcap_chunks import Storage
 from msg_analysis.bags.playback import Playback
 from msg_analysis.bags.salvage import salvage_in_place
+from msg_analysis.bags.stored_file import Storage
 from msg_analysis.bags.writing import BagWriter
 from msg_analysis.messages.messages import ActiveGraph, stamp_ns
 from msg_analysis.messages.topics import network_topics

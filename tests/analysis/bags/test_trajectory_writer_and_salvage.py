@@ -20,8 +20,8 @@ from rosbags.highlevel import AnyReader
 
 from experiments import Completeness, Run, line_ring, read_bag, simulate, write_trajectory
 from msg_analysis.bags import salvage as salvage_module
-from msg_analysis.bags.mcap_chunks import Compression, Storage
 from msg_analysis.bags.salvage import salvage, salvage_in_place
+from msg_analysis.bags.stored_file import Compression, Storage
 from msg_analysis.bags.writing import BagWriter
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.messages.messages import encode_string

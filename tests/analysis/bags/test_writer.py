@@ -14,8 +14,8 @@ import yaml
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from msg_analysis.bags.mcap_chunks import Storage
 from msg_analysis.bags.salvage import salvage_in_place
+from msg_analysis.bags.stored_file import Storage
 from msg_analysis.bags.writing import BagWriter, recording_pid
 from msg_analysis.errors import BagError
 from msg_analysis.messages.messages import StateCodec, encode_string, stamp_ns

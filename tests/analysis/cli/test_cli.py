@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from experiments import golden, predict, simulate, write_trajectory
-from msg_analysis.bags.mcap_chunks import Storage
+from msg_analysis.bags.stored_file import Storage
 from msg_analysis.cli import main as cli
 from msg_analysis.experiment import experiment as experiments
 

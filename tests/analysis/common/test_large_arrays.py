@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments import compare, line_ring, read_bag, simulate, write_trajectory
-from msg_analysis.bags import run_builder
+from msg_analysis.bags import states
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import LARGE, LargeRows, in_file, large_zeros, release
 
@@ -70,8 +70,8 @@ def test_a_run_that_is_read_into_files(
     write_trajectory(run, tmp_path / "bag")
     one = read_bag(tmp_path / "bag")
     monkeypatch.setattr(arrays, "LARGE", 1)
-    monkeypatch.setattr(run_builder, "RELEASED_AT_ONCE", 100)
-    monkeypatch.setattr(run_builder, "_CELLS", 7)
+    monkeypatch.setattr(states, "RELEASED_AT_ONCE", 100)
+    monkeypatch.setattr(states, "_CELLS", 7)
     other = read_bag(tmp_path / "bag")
     assert in_file(other.states)
     assert not in_file(one.states)
@@ -110,11 +110,11 @@ assert not large_arrays.in_file(array)
 array[:] = 1.0
 large_arrays.LARGE = 8
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-rows, parts = large_arrays.LargeRows(2, np.int64), [np.full((20_000, 2), number) for number in range(9)]
+rows, parts = arrays.LargeRows(2, np.int64), [np.full((20_000, 2), number) for number in range(9)]
 for part in parts:
     rows.append(part)
 found = rows.array()
-assert not large_arrays.in_file(found)
+assert not arrays.in_file(found)
 assert np.array_equal(found, np.concatenate(parts))
 """
     subprocess.run(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from msg_analysis.common.version import distribution_at, ros_distribution
+from msg_analysis.common.resources import distribution_at, ros_distribution
 
 
 def installed(site: Path, *packages: str) -> Path:

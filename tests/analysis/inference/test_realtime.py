@@ -8,7 +8,7 @@ import pytest
 from p_values import assert_calibrated
 
 from experiments import CORRELATED, TRACKING, Completeness, Observation, compare, directed, observed, predict, simulate
-from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK, Stream, normals
+from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK, Stream, normals
 from msg_analysis.common.text import percent
 from msg_analysis.errors import InputError
 from msg_analysis.inference.event_order import order_events

@@ -19,9 +19,15 @@ from hypothesis import strategies as st
 from processors import another_processor
 
 from msg_analysis.arithmetic import update_law
-from msg_analysis.arithmetic.matrix_exponential import exponential, reproducible_product
-from msg_analysis.arithmetic.random_streams import Stream, generator, link_number, normals
-from msg_analysis.arithmetic.step_clock import StepClock
+from msg_analysis.arithmetic.reproducible import (
+    StepClock,
+    Stream,
+    exponential,
+    generator,
+    link_number,
+    normals,
+    reproducible_product,
+)
 
 DOUBLES = st.floats(width=64)
 SHAPES = st.tuples(st.integers(1, 5), st.integers(1, 20))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments import Experiment, RunRecord
-from msg_analysis.experiment.experiment import ExperimentError
+from msg_analysis.experiment.problems import ExperimentError
 from msg_analysis.inference.comparison import law_identity
 
 TOWNS = ["Ulm", "Bonn", "Kiel", "Jena"]

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments import Experiment, line_ring
-from msg_analysis.experiment.experiment import ExperimentError
+from msg_analysis.experiment.problems import ExperimentError
 from msg_analysis.model.reception import NOTHING, Air, Losses, loss_probabilities
 
 BLOCK = 256

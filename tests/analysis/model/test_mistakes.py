@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from msg_analysis.experiment import loading
-from msg_analysis.experiment.experiment import Experiment, ExperimentError
+from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.experiment.problems import ExperimentError
 
 GOOD: dict[str, Any] = {
     "name": "good",

@@ -17,7 +17,7 @@ from msg_analysis.cli.main import main
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import protocols
-from msg_analysis.experiment.experiment import ExperimentError
+from msg_analysis.experiment.problems import ExperimentError
 from msg_analysis.protocol import Heard, LinearProtocol, Parameters, Protocol
 
 SATURATED, METROPOLIS = {"name": "saturated"}, {"name": "metropolis"}

@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,6 @@ import networkx as nx
 import numpy as np
 import pytest
 import scipy.linalg
-from hypothesis import given
-from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -172,7 +169,7 @@ def test_table(examples: dict[int, Example], number: int) -> None:
     lines = paper.csv_text(example).splitlines()
     comments = [line for line in lines if line.startswith("# ")]
     assert lines[: len(comments)] == comments
-    assert any("reconstructed" in line for line in comments) == (number != 1) == example.reconstructed
+    assert any("reconstructed" in line for line in comments) == (number != 1)
     rows = list(csv.DictReader(lines[len(comments) :]))
     assert tuple(rows[0]) == paper.COLUMNS
     assert len(rows) == sum(len(curve.value) for curve in example.curves)
@@ -204,18 +201,6 @@ def test_figure_shows_graphs_and_says_what_is_reconstructed(examples: dict[int, 
         styles = {(line.get_color(), str(line.get_linestyle()), line.get_marker()) for line in axes.lines}
         curves = [line for line in axes.lines if len(line.get_xdata()) > 2]
         assert len(styles) >= len(curves)  # each its own colour, dashes and marker
-
-
-def test_labels_do_not_overlap_and_keep_their_order() -> None:
-    @given(st.lists(st.floats(0, 1), min_size=1, max_size=6), st.floats(0.01, 0.15))
-    def check(heights: list[float], gap: float) -> None:
-        moved = figures._apart(heights, gap)
-        order = sorted(range(len(heights)), key=lambda i: heights[i])
-        assert all(moved[b] - moved[a] >= gap * (1 - 1e-9) for a, b in pairwise(order))
-        assert sum(moved) == pytest.approx(sum(heights), abs=1e-9)
-        assert moved == heights or any(heights[b] - heights[a] < gap for a, b in pairwise(order))
-
-    check()
 
 
 def few_points(monkeypatch: pytest.MonkeyPatch) -> None:

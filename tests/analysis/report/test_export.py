@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from msg_analysis import Experiment, InputError, NotAvailableError, Run, read_bag
 from msg_analysis.cli.main import main
-from msg_analysis.messages.schemas import ACTIVE_GRAPH, AGENT_STATE
+from msg_analysis.messages.messages import ACTIVE_GRAPH, AGENT_STATE
 from msg_analysis.report import export as export_files
 from msg_analysis.report import export as run_tables
 

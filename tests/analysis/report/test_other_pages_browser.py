@@ -14,7 +14,8 @@ from msg_analysis import Experiment
 from msg_analysis.report.figures import shifted
 from msg_analysis.report.list_pages import write_runs_page, write_sweep_page
 from msg_analysis.runs import RunEntry
-from msg_analysis.sweeps.grid import axis_name, column_words, load_sweep
+from msg_analysis.sweeps.grid import load_sweep
+from msg_analysis.sweeps.results import axis_name, column_words
 
 DOCUMENT = {"name": "line", "graphs": {"line": {"path": [1, 2, 3]}}}
 CUT_OFF = """() => [...document.querySelectorAll("body *")].filter((one) => {

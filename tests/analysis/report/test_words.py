@@ -16,7 +16,8 @@ from msg_analysis.errors import InputError
 from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.report.comparison_text import furthest, order_statements, sentence
 from msg_analysis.report.page import page_title, run_facts
-from msg_analysis.sweeps.grid import axis_name, column_words, load_sweep
+from msg_analysis.sweeps.grid import load_sweep
+from msg_analysis.sweeps.results import axis_name, column_words
 
 AGENTS = ["agent 1", "agent 2", "agent 3"]
 

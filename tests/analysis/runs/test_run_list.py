@@ -151,8 +151,11 @@ def test_dates_without_a_name(tmp_path: Path) -> None:
     run = Experiment.parse(PAIR).simulate()
     began = datetime(2026, 9, 1, 12, tzinfo=UTC)
     for name, start in (("recorded", began), ("clocked", None), ("pair_20269999_120000", None)):  # not a date
-        record = dataclasses.replace(run.record, started=start)
+        record = dataclasses.replace(run.record, started=start or began)
         dataclasses.replace(run, record=record).save(tmp_path / name)
+        if start is None:
+            (file,) = (tmp_path / name).glob("*.mcap")
+            file.write_bytes(file.read_bytes().replace(b'"started"', b'"no_time"'))
     metadata = tmp_path / "clocked" / "metadata.yaml"
     metadata.write_text(metadata.read_text().replace("epoch: 0\n", "epoch: 1795000000000000000\n", 1))
     (file,) = (tmp_path / "pair_20269999_120000").glob("*.mcap")

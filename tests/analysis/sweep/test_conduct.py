@@ -16,11 +16,10 @@ import experiments
 from experiments import Experiment, simulate
 from msg_analysis.errors import InputError
 from msg_analysis.sweeps import results as conducting
-from msg_analysis.sweeps.figure_series import picture
 from msg_analysis.sweeps.grid import load_sweep
 from msg_analysis.sweeps.points import DONE, FAILED, Job, Outcome, evaluate
-from msg_analysis.sweeps.results import JOURNAL, OutcomeStore, arrow_table, conduct, judge_sweep, rows_of
-from msg_analysis.sweeps.workers import Lost, Workers
+from msg_analysis.sweeps.results import JOURNAL, ResultStore, arrow_table, evaluate_sweep, picture, rows_of
+from msg_analysis.sweeps.workers import Lost, Workers, run_jobs
 
 
 def document(rate: float = 1.0, **run: Any) -> dict[str, Any]:
@@ -66,9 +65,9 @@ def test_ctrl_c_while_an_outcome_is_written(tmp_path: Path, monkeypatch: pytest.
         return written(descriptor, data)
 
     monkeypatch.setattr("msg_analysis.sweeps.results.os.write", write)
-    with OutcomeStore.open(tmp_path) as store:
+    with ResultStore.open(tmp_path) as store:
         with pytest.raises(KeyboardInterrupt):
-            conduct([Job.of("predict", document(rate)) for rate in (0.5, 1.0)], store)
+            run_jobs([Job.of("predict", document(rate)) for rate in (0.5, 1.0)], store)
         assert len(store.outcomes) == (tmp_path / JOURNAL).read_bytes().count(b"\n") == 1
 
 
@@ -87,18 +86,18 @@ def test_what_fails_fails_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     done = in_this_process(monkeypatch)
     bad = document(dt=0.55, duration=55) | {"noise": {"delay": 3}}
     jobs = [Job.of("predict", document()), Job.of("predict", bad), Job.of("predict", document(2.0))]
-    with OutcomeStore.open(tmp_path) as store:
-        conducted = conduct(jobs, store)
+    with ResultStore.open(tmp_path) as store:
+        conducted = run_jobs(jobs, store)
     assert [outcome.status for outcome in conducted.outcomes] == [DONE, FAILED, DONE]
     assert "grow without bound" in (conducted.outcomes[1].reason or "")
     assert len(done) == 3
-    judgement = judge_sweep(conducted.outcomes, 0.01)
+    judgement = evaluate_sweep(conducted.outcomes, 0.01)
     assert (judgement.verdict, judgement.exit_code) == ("incomplete", 3)
     # Again: nothing is done, unless what failed is to be tried again.
-    with OutcomeStore.open(tmp_path) as store:
-        assert conduct(jobs, store).kept == 3
+    with ResultStore.open(tmp_path) as store:
+        assert run_jobs(jobs, store).reused == 3
         assert len(done) == 3
-        conduct(jobs, store, retry=True)
+        run_jobs(jobs, store, retry=True)
         assert [job.id for job in done[3:]] == [jobs[1].id]
 
 
@@ -112,27 +111,27 @@ def test_defects_fail_alone_too(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_equal_points_are_done_once_and_others_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done = in_this_process(monkeypatch)
     one, two = Job.of("predict", document()), Job.of("predict", document(2.0))
-    with OutcomeStore.open(tmp_path) as store:
-        conducted = conduct([one, one, two], store)
+    with ResultStore.open(tmp_path) as store:
+        conducted = run_jobs([one, one, two], store)
         assert len(done) == 2
         assert conducted.outcomes[0] == conducted.outcomes[1]
-        again = conduct([two], store)
-        assert (again.kept, again.others) == (1, 1)
+        again = run_jobs([two], store)
+        assert (again.reused, again.others) == (1, 1)
 
 
 def test_other_software_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done = in_this_process(monkeypatch)
     job = Job.of("predict", document())
-    with OutcomeStore.open(tmp_path) as store:
-        conduct([job], store)
+    with ResultStore.open(tmp_path) as store:
+        run_jobs([job], store)
         store.add([dataclasses.replace(store.outcomes[job.id], software="msg_analysis 0.0.1")])
         with pytest.raises(InputError, match=r"1 results were made with other software \(msg_analysis 0.0.1\)"):
-            conduct([job], store)
-        assert conduct([job], store, other_software="keep").outcomes[0].software == "msg_analysis 0.0.1"
+            run_jobs([job], store)
+        assert run_jobs([job], store, other_software="keep").outcomes[0].software == "msg_analysis 0.0.1"
         assert len(done) == 1
-        assert conduct([job], store, other_software="redo").outcomes[0].software != "msg_analysis 0.0.1"
+        assert run_jobs([job], store, other_software="redo").outcomes[0].software != "msg_analysis 0.0.1"
         assert len(done) == 2
-        conduct([job], store)
+        run_jobs([job], store)
         assert len(done) == 2
 
 
@@ -146,15 +145,15 @@ def test_other_software_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     ],
 )
 def test_all_runs_are_judged_together(p_values: Any, p_holm: Any, verdict: str, code: int) -> None:
-    judgement = judge_sweep([with_p(p) for p in p_values], 0.01)
+    judgement = evaluate_sweep([with_p(p) for p in p_values], 0.01)
     assert judgement.p_holm == pytest.approx(p_holm)
     assert (judgement.verdict, judgement.exit_code) == (verdict, code)
 
 
 def test_a_failure_does_not_hide_a_disagreement() -> None:
-    assert judge_sweep([with_p(1e-9), FAILURE], 0.01).exit_code == 1
-    assert judge_sweep([with_p(0.5), FAILURE], 0.01).exit_code == 3
-    assert judge_sweep([with_p(0.5, unpredicted="a protocol")], 0.01).verdicts == ("unpredicted",)
+    assert evaluate_sweep([with_p(1e-9), FAILURE], 0.01).exit_code == 1
+    assert evaluate_sweep([with_p(0.5), FAILURE], 0.01).exit_code == 3
+    assert evaluate_sweep([with_p(0.5, unpredicted="a protocol")], 0.01).verdicts == ("unpredicted",)
 
 
 def cubes(number: int, _stopping: Any) -> int:
@@ -189,9 +188,9 @@ def test_columns_and_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     file = {"experiment": document(), "kind": "simulate", "over": over, "repetitions": 3}
     (tmp_path / "try.yaml").write_text(yaml.safe_dump(file, sort_keys=False))
     sweep = load_sweep(tmp_path / "try.yaml")
-    with OutcomeStore.open(tmp_path) as store:
-        outcomes = conduct([point.job for point in sweep.points], store).outcomes
-    rows = rows_of(sweep, outcomes, judge_sweep(outcomes, 0.01))
+    with ResultStore.open(tmp_path) as store:
+        outcomes = run_jobs([point.job for point in sweep.points], store).outcomes
+    rows = rows_of(sweep, outcomes, evaluate_sweep(outcomes, 0.01))
     table = arrow_table(rows)
     assert table.num_rows == 12
     assert str(table.schema.field("node_errors[2].measured").type) == "double"

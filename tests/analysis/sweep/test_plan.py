@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.sweeps.grid import KeyProblemError, Sweep, load_sweep, own_seed, put
-from msg_analysis.sweeps.sweep_file import json_schema
+from msg_analysis.sweeps.grid import KeyProblemError, Sweep, json_schema, load_sweep, own_seed, put
 
 EXPERIMENT: dict[str, Any] = {
     "name": "two",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments import Completeness, Experiment, Run, check, flipped, new_record, stored
-from msg_analysis.arithmetic.random_streams import STEPS_PER_BLOCK
+from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK
 from msg_analysis.arithmetic.update_law import from_payload, to_payload
 from msg_analysis.model.agent_law import agent_law
 from msg_analysis.model.graph_path import mode_path

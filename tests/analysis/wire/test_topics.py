@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import msg_analysis.messages
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import CdrError, decode_batch, encode_batch
-from msg_analysis.messages.schemas import (
+from msg_analysis.messages.messages import (
     ACTIVE_GRAPH,
     AGENT_STATE,
     ESTIMATE,
