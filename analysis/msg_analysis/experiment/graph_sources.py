@@ -23,7 +23,7 @@ from msg_analysis.common.files import read_bytes
 from msg_analysis.common.text import agent_name, agent_text, listed
 from msg_analysis.experiment.graphs import Graph, hops
 from msg_analysis.experiment.markov_chain import Time
-from msg_analysis.experiment.network_spec import NAME_PATTERN, GraphSpec, Link, LossSpec, is_number
+from msg_analysis.experiment.network_spec import NAME_PATTERN, GraphSpec, Link, LossSpec, WrittenLink, is_number
 from msg_analysis.experiment.problems import problem, show
 
 _COLUMNS = ("source", "target", "weight", "type")
@@ -213,7 +213,8 @@ def from_adjacency(key: str, rows: Sequence[Sequence[float]]) -> GraphSpec:
     return _spec(links, directed=directed)
 
 
-def _spec(links: list[Link], *, directed: bool) -> GraphSpec:
+def _spec(found: Iterable[Link], *, directed: bool) -> GraphSpec:
+    links: list[WrittenLink] = list(found)
     return GraphSpec.model_construct(arcs=links) if directed else GraphSpec.model_construct(edges=links)
 
 
