@@ -236,9 +236,6 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
             raise ExperimentError(
                 str(path), [problem("experiment", show(base), "expected a file of keys", "correct it")]
             )
-    lines = _spec_problems(spec)
-    if lines:
-        raise ExperimentError(str(path), lines)
     return points_of(path, spec, base, directory, checked)
 
 
@@ -273,6 +270,8 @@ def _combinations(spec: SweepSpec) -> Iterator[dict[str, Any]]:
 
 def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
     """The sweep of a document; every point is checked. ExperimentError: all mistakes, with their points."""
+    if lines := _spec_problems(spec):
+        raise ExperimentError(str(path), lines)
     combinations = list(_combinations(spec))
     wrong: dict[str, list[int]] = {}  # line: indices of the combinations that have it
     points: list[Point] = []
