@@ -170,3 +170,8 @@ class ExperimentSpec(Section):
     )
     leaders: LeadersSpec | None = Field(None, examples=[{"agents": [3], "gain": 1.0, "reference": 0.0}])
     run: RunSpec = Field(default_factory=RunSpec, examples=[{"dt": 0.05, "duration": 400}])
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON Schema of the experiment file, for editors."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | ExperimentSpec.model_json_schema()
