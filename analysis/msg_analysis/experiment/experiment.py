@@ -183,8 +183,7 @@ class Experiment(Variants):
     def to_document(self) -> dict[str, Any]:
         """The normalised, self-contained document, ready for JSON; parsed again it gives an equal experiment."""
         document: dict[str, Any] = self.spec.model_dump(mode="json", exclude_none=True)
-        if self.spec.protocol:
-            # None may differ from the default of a parameter, so it must not be left out.
+        if self.spec.protocol:  # None may differ from the default of a parameter, so it must not be left out
             document["protocol"] = self.spec.protocol.model_dump(mode="json")
         return document
 

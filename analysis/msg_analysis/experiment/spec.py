@@ -1,11 +1,9 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The keys of the experiment file: the whole document, leaders, protocols and the run.
+"""The keys of the experiment file beside graphs and noise: every key, its type, its default and what it means.
 
-The experiment file as data: every key, its type, its default and what it means.
-
-Only what one value can tell by itself is checked here; what needs several keys is checked in ``experiment.validation``.
+Only what one value can tell by itself is checked here; ``validation`` checks what needs several keys.
 """
 
 from __future__ import annotations
