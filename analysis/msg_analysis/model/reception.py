@@ -60,12 +60,11 @@ def loss_probabilities(experiment: Experiment) -> tuple[FloatArray, FloatArray]:
 
 
 class Losses:
-    """The lost messages of every link, block after block of steps, by one uniform number for each message.
+    """The lost messages of every link, block after block of steps, by one uniform number for each message."""
 
-    With bursts a link is a stationary Markov chain (Gilbert 1960). A number below both ``after_lost`` and
-    ``after_kept`` means lost, above both not lost, between them the same as before (or the opposite, if losses come more
-    evenly than independent ones): so the newest number that decides alone is all that has to be known of the past.
-    """
+    # With bursts a link is a stationary Markov chain (Gilbert 1960). A number below both ``after_lost`` and
+    # ``after_kept`` means lost, above both not lost, between them the same as before (or the opposite, if losses come
+    # more evenly than independent ones): the newest number that decides alone is all that must be known of the past.
 
     def __init__(self, experiment: Experiment) -> None:
         self._seed = experiment.run.seed
