@@ -19,8 +19,8 @@ from pathlib import Path
 
 import yaml
 
-from msg_agents import run_network
 from msg_agents.cli.main import main as agents
+from msg_agents.run.runner import run_network
 from msg_analysis.cli.main import main as analysis
 from msg_analysis.experiment.experiment import Experiment
 

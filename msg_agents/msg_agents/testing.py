@@ -20,6 +20,9 @@ Network = Callable[[str | Path | Experiment], Run]
 
 @pytest.fixture
 def network(tmp_path: Path) -> Iterator[Network]:
-    """A function that runs an experiment as a network, in a domain of its own; bags are in ``tmp_path``."""
+    """A function that runs an experiment as a network, in a domain of its own; bags are in ``tmp_path``.
+
+    See pytest for the parameters.
+    """
     with free_domain() as domain:
         yield lambda experiment: run_network(experiment, tmp_path / "runs", domain=domain)

@@ -1,4 +1,4 @@
-"""The example of docs/python.md that starts a network, runs that are prepared, and `play --json`."""
+"""The example of docs/python.md that starts a network, several runs in one program, and `play --json`."""
 
 from __future__ import annotations
 
@@ -18,23 +18,63 @@ from msg_analysis import Experiment
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
-LINE_RING = ROOT / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"
+
+
+def snippet(word: str) -> str:
+    """The code of the page that has this word in it."""
+    page = (ROOT / "docs/python.md").read_text(encoding="utf-8")
+    (code,) = [code for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if word in code]
+    return str(code)
+
+
+def in_python(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-P", *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=100)
 
 
 def test_what_the_page_says(tmp_path: Path) -> None:
-    """In a process of its own, as a reader's script is; the run agrees with probability 0.99, and its seed is fixed."""
-    page = (ROOT / "docs/python.md").read_text(encoding="utf-8")
-    _, code, *_ = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    text = LINE_RING.read_text()
-    (tmp_path / "line_ring.yaml").write_text(re.sub(r"duration: \S+", "duration: 20", text))
-    (tmp_path / "runs").mkdir()
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    process = subprocess.run(
-        [sys.executable, "-P", "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=100
-    )
+    """In a process of its own, as a reader's script is; the seed of the run is fixed."""
+    code = snippet("run_network(")
+    process = in_python("-c", code + "print(run, run.compare(), run.network.failures)", folder=tmp_path)
     assert process.returncode == 0, process.stderr
-    assert "<Comparison, run of 'line_ring': agrees;" in process.stdout
+    bag = Path(process.stdout.split()[0])
+    assert (tmp_path / bag).parent == tmp_path / "runs"
+    assert "complete> <Comparison, run of 'line_ring': agrees;" in process.stdout
     assert process.stdout.rstrip().endswith("[]")
+    assert (tmp_path / "report.html").read_text(encoding="utf-8").startswith("<!")
+
+
+def test_the_pytest_recipe_of_the_page(tmp_path: Path) -> None:
+    """It passes as it is; where the run does not follow its law, it fails with the reason."""
+    code = snippet("msg_agents.testing")
+    (tmp_path / "test_good.py").write_text(code)
+    wrong = code.replace("    assert_agrees", "    run.states[:] *= 2.0\n    assert_agrees")
+    (tmp_path / "test_wrong.py").write_text(wrong)
+    process = in_python("-m", "pytest", "-q", "-p", "no:cacheprovider", "--tb=short", str(tmp_path), folder=tmp_path)
+    assert "1 failed, 1 passed" in process.stdout, process.stdout + process.stderr
+    assert "disagrees" in process.stdout
+    assert "test_wrong.py" in process.stdout
+
+
+MISTAKES = """
+from msg_agents import run_network
+from msg_analysis import InputError
+for given in ("line_rin", "nowhere.yaml"):
+    try:
+        run_network(given, "runs")
+    except InputError as error:
+        print(type(error).__name__, error)
+"""
+
+
+def test_mistakes_start_nothing(tmp_path: Path) -> None:
+    process = in_python("-c", MISTAKES, folder=tmp_path)
+    assert process.returncode == 0, process.stderr
+    first, second = process.stdout.splitlines()
+    assert "line_rin: no such file, and no example of this name" in first
+    assert "nowhere.yaml: no such file" in second
+    assert not (tmp_path / "runs").exists()
 
 
 SEVERAL = """

@@ -308,7 +308,7 @@ def schema(what: str) -> None:
     if what == "sweep":
         from msg_analysis.sweeps.grid import json_schema
     else:
-        from msg_analysis.experiment.experiment import json_schema
+        from msg_analysis.experiment.spec import json_schema
 
     print_json(json_schema(), indent=2)
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.common.text import listed, markdown_table, number_text
-from msg_analysis.errors import InputError, NotAvailableError
-from msg_analysis.experiment import graph_sources, loading, protocols, validation
+from msg_analysis.common.text import markdown_table, number_text
+from msg_analysis.errors import NotAvailableError
+from msg_analysis.experiment import loading, protocols, validation
 from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.loading import Sections, other_kind, read_yaml
@@ -24,7 +24,8 @@ from msg_analysis.experiment.markov_chain import MarkovChain, Time
 from msg_analysis.experiment.network_spec import NoiseSpec, SwitchingSpec
 from msg_analysis.experiment.problems import ExperimentError, problem, show
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
-from msg_analysis.experiment.spec import ExperimentSpec, Purpose, RunSpec
+from msg_analysis.experiment.spec import ExperimentSpec, Purpose, RunSpec, json_schema
+from msg_analysis.experiment.variants import Variants
 from msg_analysis.protocol import Network
 
 if TYPE_CHECKING:
@@ -39,18 +40,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Experiment", "ExperimentError", "json_schema"]
 
-MOST_STATES = 512
-"""Of graph and links together, in a prediction with losses in bursts."""
-
-MOST_VALUES = 1500
-"""That agents keep from step to step, in a prediction: the last ones heard, and those that a delay makes older."""
-
-SHOWN_GRAPHS = 4
-"""Largest number of graphs named in a ``repr``."""
+SHOWN_GRAPHS = 4  # most graphs named in a ``repr``
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Experiment:
+class Experiment(Variants):
     """A valid experiment. Two are equal if their documents are, the order of the graphs included.
 
     Attributes
@@ -91,8 +85,8 @@ class Experiment:
     def __repr__(self) -> str:
         graphs = ", ".join(graph.name for graph in self.graph_list[:SHOWN_GRAPHS])
         more = ", ..." if len(self.graph_list) > SHOWN_GRAPHS else ""
-        kind = f"{self.problem} of {self.agents} agents in {self.time} time"
-        return f"<Experiment {self.name!r}: {kind}, graphs {graphs}{more}; {self.steps} steps of {self.step_length:g}>"
+        what = f"{self.name!r}: {self.problem} of {self.agents} agents in {self.time} time"
+        return f"<Experiment {what}, graphs {graphs}{more}; {self.steps} steps of {self.step_length:g}>"
 
     def _repr_markdown_(self) -> str:
         shares = self.chain.stationary
@@ -109,18 +103,18 @@ class Experiment:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read an experiment file (YAML, of which JSON is a part), or an example that is installed with this package.
+        """Read an experiment file (YAML, of which JSON is a part), or an installed example.
 
         Parameters
         ----------
         path
-            of the file, or the name of an example, such as ``line_ring``; a file of that name in the current
-            directory, with or without ``.yaml``, wins. Paths in a file are relative to its directory
+            of the file, or the name of an example, such as ``line_ring``; a file of that name, with or without
+            ``.yaml``, wins. Paths in a file are relative to its directory
 
         Raises
         ------
         InputError
-            there is neither a file nor an example, the file cannot be read, or it is not YAML
+            neither a file nor an example, or not YAML
         ExperimentError
             the experiment is not valid; names every mistake
         """
@@ -156,43 +150,21 @@ class Experiment:
             the document is not valid; names every mistake
         """
         if not isinstance(mapping, Mapping):
-            raise ExperimentError(
-                source,
-                [problem("experiment", show(mapping), "expected keys with values", "start with `name:`")],
-            )
+            line = problem("experiment", show(mapping), "expected keys with values", "start with `name:`")
+            raise ExperimentError(source, [line])
         if instead := other_kind(mapping, "experiment"):
             raise ExperimentError(source, [f"is {instead}"])
         sections = Sections(mapping, recorded)
         sections.resolve(directory or Path())
         if sections.problems:
             raise ExperimentError(source, sections.problems)
-        assert sections.chain is not None
-        assert sections.noise_gain is not None
-        assert sections.loss is not None
-        experiment = cls(
-            spec=sections.spec(),
-            graph_list=sections.graphs,
-            chain=sections.chain,
-            noise_gain=sections.noise_gain,
-            loss=sections.loss,
-            source=source,
-            protocol=sections.protocol,
-        )
-        return experiment._with_protocol(sections.protocol, recorded) if sections.protocol else experiment
+        experiment = cls(**sections.parts(), source=source)
+        return experiment._bound(recorded) if experiment.protocol else experiment
 
-    def _with_protocol(self, protocol: ChosenProtocol, recorded: ProtocolInfo | None) -> Self:
+    def _bound(self, recorded: ProtocolInfo | None) -> Self:
         """The same with a protocol that knows its network."""
-        bound, found = protocols.bind(protocol, self._network(), self.run, self.names, recorded)
-        experiment = replace(self, protocol=bound)
-        size = experiment.agents, len(self.graph_list), experiment.steps, experiment.width
-        found += loading.memory_problems(*size, 0, experiment.truth)
-        if found:
-            raise ExperimentError(self.source, found)
-        return experiment
-
-    def _network(self) -> Network:
-        """What a protocol is told of the network."""
-        return Network(
+        assert self.protocol is not None
+        network = Network(
             graphs=self.graph_list,
             dt=self.step_length,
             noise_gain=self.step_noise_gain,
@@ -200,170 +172,28 @@ class Experiment:
             leader_gains=self.leader_gains,
             reference=self.reference,
         )
+        bound, found = protocols.bind(self.protocol, network, self.run, self.names, recorded)
+        experiment = replace(self, protocol=bound)
+        graphs, numbers = len(self.graph_list), experiment.width
+        found += loading.memory_problems(self.agents, graphs, self.steps, numbers, 0, experiment.truth)
+        if found:
+            raise ExperimentError(self.source, found)
+        return experiment
 
     def to_document(self) -> dict[str, Any]:
         """The normalised, self-contained document, ready for JSON; parsed again it gives an equal experiment."""
         document: dict[str, Any] = self.spec.model_dump(mode="json", exclude_none=True)
-        if self.spec.protocol:
-            # None may differ from the default of a parameter, so it must not be left out.
+        if self.spec.protocol:  # None may differ from the default of a parameter, so it must not be left out
             document["protocol"] = self.spec.protocol.model_dump(mode="json")
         return document
 
-    def with_run(self, **changes: Any) -> Self:
-        """The same experiment with other values of ``run``, checked again.
-
-        Parameters
-        ----------
-        changes
-            keys of ``run`` (seed, duration, pace, ...) and their new values
-
-        Raises
-        ------
-        ExperimentError
-            the new document is not valid; names every mistake
-        """
-        return self._with("run", changes)
-
-    def with_noise(self, **changes: Any) -> Self:
-        """The same experiment with other values of ``noise``, checked again.
-
-        Parameters
-        ----------
-        changes
-            keys of ``noise`` (process, loss, delay, ...) and their new values
-
-        Raises
-        ------
-        ExperimentError
-            the new document is not valid; names every mistake
-        """
-        return self._with("noise", changes)
-
-    def with_leaders(self, *agents: int | str, **changes: Any) -> Self:
-        """The same experiment with other leaders, checked again; without any argument, consensus.
-
-        Parameters
-        ----------
-        agents
-            the leaders, by number from 1 or name; none: those that there are
-        changes
-            ``gain`` and ``reference``; those that are not given stay
-
-        Raises
-        ------
-        ExperimentError
-            the new document is not valid; names every mistake
-        """
-        if not agents and not changes:
-            document = self.to_document() | {"problem": "consensus"}
-            document.pop("leaders", None)
-            return self.parse(document, source=self.source)
-        given = {"agents": list(agents), **changes} if agents else changes
-        return self._with("leaders", given, problem="tracking")
-
-    def with_graphs(self, graphs: Mapping[str, Any], *, switching: Mapping[str, Any] | None = None) -> Self:
-        """The same experiment with other graphs of the same agents, checked again.
-
-        Parameters
-        ----------
-        graphs
-            by name: as in a document, arrays, matrices of scipy.sparse or graphs of networkx
-        switching
-            section ``switching``; None: that of this experiment; {}: of a single graph
-
-        Raises
-        ------
-        ExperimentError
-            the new document is not valid; names every mistake
-        """
-        document = self.to_document() | {"graphs": graphs}
-        return self.parse(document if switching is None else document | {"switching": switching}, source=self.source)
-
-    def with_switching(self, **changes: Any) -> Self:
-        """The same experiment with other values of ``switching``, checked again.
-
-        Parameters
-        ----------
-        changes
-            keys of ``switching`` and their new values; of ``generator``, ``rates`` and ``transition``, a new one
-            replaces the one that there is
-
-        Raises
-        ------
-        ExperimentError
-            the new document is not valid; names every mistake
-        """
-        kinds = dict.fromkeys(("generator", "rates", "transition"))
-        if "generator" in changes or "transition" in changes:
-            kinds["scale"] = 1.0
-        return self._with("switching", (kinds if kinds.keys() & changes.keys() else {}) | changes)
-
-    def with_values(self, values: Mapping[str, Any]) -> Self:
-        """The same experiment with other values at any keys, checked again.
-
-        Parameters
-        ----------
-        values
-            by dotted key, as in sweep files: ``{"noise.process": 2.0, "switching.scale": 0.5}``
-
-        Raises
-        ------
-        ExperimentError
-            a key leads nowhere, or the new document is not valid; names every mistake
-        """
-        from msg_analysis.sweeps.grid import KeyProblemError, put
-
-        document = self.to_document()
-        try:
-            for key, value in values.items():
-                document = put(document, key, value)
-        except KeyProblemError as error:
-            raise ExperimentError(self.source, [str(error).removeprefix("over.")]) from None
-        return self.parse(document, source=self.source)
-
-    def _with(self, section: str, changes: Mapping[str, Any], **more: Any) -> Self:
-        """The same with other keys in a section, and ``more`` of the document; None removes a key."""
-        document = self.to_document() | more
-        values = {**document.get(section, {}), **changes}
-        document[section] = {key: value for key, value in values.items() if value is not None}
-        return self.parse(document, source=self.source)
-
-    def indices(self, agents: Iterable[int | str]) -> list[int]:
-        """Where agents are in arrays: ``run.states[:, experiment.indices(["north"])]``.
-
-        Parameters
-        ----------
-        agents
-            by number from 1, or by name
-
-        Returns
-        -------
-        list
-            of indices from 0
-
-        Raises
-        ------
-        InputError
-            there is no such agent
-        """
-        found = []
-        for agent in agents:
-            number = (self.names or []).index(agent) + 1 if agent in (self.names or []) else agent
-            if isinstance(number, str) or number != int(number) or not 1 <= number <= self.agents:
-                names = f", or one of the names {listed(self.names)}" if self.names else ""
-                raise InputError(f"agents: {show(agent)}: expected numbers from 1 to {self.agents}{names}")
-            found.append(int(number) - 1)
-        return found
-
     def predict(self) -> Prediction:
-        """The exact steady second moments; see :func:`msg_analysis.theory.prediction.predict`.
+        """The exact steady second moments; each law has errors, certainty, covariance.
 
         Returns
         -------
         Prediction
-            ``emulated`` (the steps of the run), ``continuous`` (the paper's law) and ``static`` (each graph held
-            fixed); the last two are None where they do not exist. Each has ``system_error``, ``node_errors`` (m,),
-            ``node_certainty`` (m,) and ``covariance`` (m, m)
+            ``emulated`` (the steps of the run), ``continuous`` (the paper's law), ``static`` (each graph held fixed)
 
         Raises
         ------
@@ -437,7 +267,7 @@ class Experiment:
         """
         from msg_analysis.twin.simulate import simulate
 
-        changes = {key: value for key, value in {"seed": seed, "duration": duration}.items() if value is not None}
+        changes = {key: value for key, value in (("seed", seed), ("duration", duration)) if value is not None}
         experiment = self.with_run(**changes) if changes else self
         experiment.require_available()
         return simulate(experiment, record=record)
@@ -503,8 +333,7 @@ class Experiment:
         from msg_analysis.theory.spectrum import spectrum
 
         wanted = None if lags is None else np.asarray(lags, dtype=np.int64)
-        where = None if frequencies is None else np.asarray(frequencies, dtype=float)
-        return spectrum(self.predict(), wanted, where)
+        return spectrum(self.predict(), wanted, None if frequencies is None else np.asarray(frequencies, dtype=float))
 
     def leaders(
         self,
@@ -516,9 +345,7 @@ class Experiment:
         top: int = 10,
         watch: SearchProgress | None = None,
     ) -> Selection:
-        """The sets of leaders with the least system error, and that of the experiment's own leaders.
-
-        At infinite gain these are the sets of largest joint robustness centrality.
+        """The sets of leaders with the least system error (at infinite gain, the largest joint robustness centrality).
 
         Parameters
         ----------
@@ -564,45 +391,25 @@ class Experiment:
             "run" (simulate it or run a network) or "predict"
         """
         lines = self._unpredicted() if purpose == "predict" else []
-        if self.protocol:
-            lines += self.protocol.unavailable(purpose)
-        return lines
+        return lines + (self.protocol.unavailable(purpose) if self.protocol else [])
 
     def unpredictable(self) -> str | None:
         """Why there is no prediction, as a part of a sentence; None where there is one."""
         reason = self.protocol.unpredictable() if self.protocol else None
-        if not reason and (lines := self._unpredicted()):
-            reason = lines[0]
-        return reason
+        return reason or next(iter(self._unpredicted()), None)
 
     def _unpredicted(self) -> list[str]:
         """What has no prediction because it would be too large, apart from protocols that are not linear."""
-        noise, lines = self.noise, []
-        links = graph_sources.heard_links(self.graph_list, self.time) & np.isfinite(self.leader_gains)[:, None]
-        lossy = int((links & (self.loss > 0.0)).sum())
-        if noise.burst is not None and len(self.graph_list) * 2.0**lossy > MOST_STATES:
-            wanted = f"has no prediction: 2^{lossy} states of {lossy} links that lose messages, expected at most "
-            wanted += f"{MOST_STATES} with those of the graph"
-            lines.append(problem("noise.burst", noise.burst, wanted, "remove it, or give fewer links a loss"))
-        kept = self.agents * (noise.delay + 2) + lossy * (noise.delay + 1) * noise.holds
-        by_message = noise.holds or (self.run.pace == "realtime" and noise.steps_only)
-        if by_message and kept > MOST_VALUES:
-            wanted = f"has no prediction: {kept} values are kept from step to step, expected at most {MOST_VALUES}"
-            lines.append(problem("noise.on_loss", noise.on_loss, wanted, "use fewer agents or links, or own values"))
-        return lines
+        network = self.graph_list, self.loss, self.leader_gains
+        return validation.too_large_to_predict(self.noise, *network, self.run.pace, self.time)
 
     def require_available(self, purpose: Purpose = "run") -> None:
-        """Raise an error if the experiment asks for something that this version cannot do.
-
-        Parameters
-        ----------
-        purpose
-            "run" (simulate it or run a network) or "predict"
+        """Refuse an experiment with something ``unavailable``; see there for the parameters.
 
         Raises
         ------
         NotAvailableError
-            lists what is not available
+            lists it
         """
         lines = self.unavailable(purpose)
         if lines and self.protocol and lines == self.protocol.unavailable(purpose):
@@ -691,8 +498,3 @@ class Experiment:
     def step_noise_gain(self) -> FloatArray:
         """(n, m, m) sqrt(dt) F_i: the noise that a step of the built-in law adds is this times N(0, I)."""
         return np.asarray(np.sqrt(self.step_length) * self.noise_gain)
-
-
-def json_schema() -> dict[str, Any]:
-    """JSON Schema of the experiment file, for editors."""
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | ExperimentSpec.model_json_schema()

@@ -18,16 +18,47 @@ from xml.etree.ElementTree import ParseError
 
 import numpy as np
 
-from msg_analysis.common.arrays import BoolArray, FloatArray
 from msg_analysis.common.files import read_bytes
-from msg_analysis.common.text import agent_name, agent_text, listed
-from msg_analysis.experiment.graphs import Graph, hops
-from msg_analysis.experiment.markov_chain import Time
-from msg_analysis.experiment.network_spec import NAME_PATTERN, GraphSpec, Link, LossSpec, is_number
+from msg_analysis.common.text import agent_text
+from msg_analysis.experiment.graphs import Graph
+from msg_analysis.experiment.network_spec import NAME_PATTERN, GraphSpec, Link, WrittenLink, is_number
 from msg_analysis.experiment.problems import problem, show
 
 _COLUMNS = ("source", "target", "weight", "type")
 _NODE = f"expected a node's name of the form {NAME_PATTERN.strip('^$')}"
+
+
+_PLAIN = {str, int, float, bool, type(None)}
+
+
+def plain(value: Any) -> Any:
+    """A document with lists and numbers in place of arrays, matrices of scipy.sparse, numbers of numpy and tuples."""
+    if type(value) in _PLAIN:
+        return value
+    if isinstance(value, list | tuple | range):
+        return list(value) if all(type(each) in _PLAIN for each in value) else [plain(each) for each in value]
+    if isinstance(value, Mapping):
+        return {key: plain(each) for key, each in value.items()}
+    if isinstance(value, Path):
+        return str(value)
+    return _rows(value) if _is_array(value) else value
+
+
+def _is_array(value: object) -> bool:
+    return hasattr(value, "toarray") or hasattr(value, "__array__")
+
+
+def _rows(value: Any) -> Any:
+    return np.asarray(value.toarray() if hasattr(value, "toarray") else value).tolist()
+
+
+def plain_document(mapping: Mapping[Any, Any]) -> dict[Any, Any]:
+    """The document, in which a graph that is an array is one that has this ``adjacency``."""
+    graphs = mapping.get("graphs")
+    if isinstance(graphs, Mapping):
+        made = {name: {"adjacency": graph} if _is_array(graph) else graph for name, graph in graphs.items()}
+        mapping = {**mapping, "graphs": made}
+    return {key: plain(each) for key, each in mapping.items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +244,8 @@ def from_adjacency(key: str, rows: Sequence[Sequence[float]]) -> GraphSpec:
     return _spec(links, directed=directed)
 
 
-def _spec(links: list[Link], *, directed: bool) -> GraphSpec:
+def _spec(found: Iterable[Link], *, directed: bool) -> GraphSpec:
+    links: list[WrittenLink] = list(found)
     return GraphSpec.model_construct(arcs=links) if directed else GraphSpec.model_construct(edges=links)
 
 
@@ -330,57 +362,3 @@ def build_graph(name: str, spec: GraphSpec, agents: int) -> Graph:
         if spec.arcs is None:
             adjacency[i - 1, j - 1] = weight
     return Graph(name, adjacency)
-
-
-def numbered_losses(loss: LossSpec, names: Sequence[str] | None) -> tuple[LossSpec, list[str]]:
-    """The same with numbers instead of names of agents, and the names that are unknown."""
-    found: list[str] = []
-
-    def number(key: str, agent: int | str) -> int | str:
-        if not isinstance(agent, str):
-            return agent
-        if agent in (names or []):
-            return (names or []).index(agent) + 1
-        wanted = f"expected one of the names {listed(names)}" if names else "expected a number, since no agent is named"
-        found.append(problem(key, show(agent), wanted, "correct it"))
-        return agent
-
-    numbers = {
-        kind: [(number(f"noise.loss.{kind}", i), number(f"noise.loss.{kind}", j), p) for i, j, p in getattr(loss, kind)]
-        for kind in ("edges", "arcs")
-    }
-    return loss.model_copy(update=numbers), found
-
-
-def loss_matrix(
-    loss: LossSpec, graphs: Sequence[Graph], time: Time, names: Sequence[str] | None
-) -> tuple[FloatArray, list[str]]:
-    """(m, m) probability that a message from agent j (column) to agent i (row) is lost, 0 on the diagonal.
-
-    Also the links in ``loss``, which has numbers of agents, that are in no graph or are repeated.
-    """
-    agents, found = graphs[0].agents, []
-    heard = heard_links(graphs, time)
-    matrix = np.where(np.eye(agents, dtype=np.bool_), 0.0, loss.default)
-    seen: set[tuple[int, int]] = set()
-    directed = [("arcs", int(i), int(j), p) for i, j, p in loss.arcs]
-    directed += [("edges", *ends, p) for i, j, p in loss.edges for ends in ((int(i), int(j)), (int(j), int(i)))]
-    for kind, i, j, probability in directed:
-        key, ends = f"noise.loss.{kind}", show([i, j] if names is None else [agent_name(a, names) for a in (i, j)])
-        if max(i, j) > agents or not heard[j - 1, i - 1]:
-            wanted = f"expected agents of which {agent_name(j, names)} hears {agent_name(i, names)} in some graph"
-            found.append(problem(key, ends, wanted, "correct it"))
-        elif (i, j) in seen:
-            found.append(problem(key, ends, "expected every link once, in each direction", "remove one"))
-        else:
-            matrix[j - 1, i - 1] = probability
-        seen.add((i, j))
-    return matrix, found
-
-
-def heard_links(graphs: Sequence[Graph], time: Time) -> BoolArray:
-    """(m, m) whether agent i hears agent j in some graph: in discrete time, with exp(-Z), over many arcs, too."""
-    heard = np.any([graph.adjacency > 0 for graph in graphs], axis=0)
-    if time == "discrete":
-        heard = np.any([[hops(graph.adjacency > 0, [i]) > 0 for i in range(graph.agents)] for graph in graphs], axis=0)
-    return np.asarray(heard)

@@ -12,7 +12,6 @@ from collections.abc import Hashable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
@@ -219,38 +218,7 @@ def _section(key: str, mapping: Mapping[Any, Any]) -> Any:
     return ExperimentSpec.model_fields[key].get_default(call_default_factory=True, validated_data={})
 
 
-_PLAIN = {str, int, float, bool, type(None)}
 _OWN_WEIGHTS = ("path", "cycle", "star", "grid", "complete")  # kinds of graphs that a ``weight`` may stand beside
-
-
-def plain(value: Any) -> Any:
-    """A document with lists and numbers in place of arrays, matrices of scipy.sparse, numbers of numpy and tuples."""
-    if type(value) in _PLAIN:
-        return value
-    if isinstance(value, list | tuple | range):
-        return list(value) if all(type(each) in _PLAIN for each in value) else [plain(each) for each in value]
-    if isinstance(value, Mapping):
-        return {key: plain(each) for key, each in value.items()}
-    if isinstance(value, Path):
-        return str(value)
-    return _rows(value) if _is_array(value) else value
-
-
-def _is_array(value: object) -> bool:
-    return hasattr(value, "toarray") or hasattr(value, "__array__")
-
-
-def _rows(value: Any) -> Any:
-    return np.asarray(value.toarray() if hasattr(value, "toarray") else value).tolist()
-
-
-def _plain_document(mapping: Mapping[Any, Any]) -> dict[Any, Any]:
-    """The document, in which a graph that is an array is one that has this ``adjacency``."""
-    graphs = mapping.get("graphs")
-    if isinstance(graphs, Mapping):
-        made = {name: {"adjacency": graph} if _is_array(graph) else graph for name, graph in graphs.items()}
-        mapping = {**mapping, "graphs": made}
-    return {key: plain(each) for key, each in mapping.items()}
 
 
 def _graphs_of_networkx(mapping: Mapping[Any, Any]) -> tuple[dict[str, Any], Mapping[Any, Any]]:
@@ -272,7 +240,7 @@ class Sections:
 
     def __init__(self, mapping: Mapping[Any, Any], recorded: ProtocolInfo | None = None) -> None:
         self.problems: list[str] = []
-        self._networkx, mapping = _graphs_of_networkx(_plain_document(mapping))
+        self._networkx, mapping = _graphs_of_networkx(graph_sources.plain_document(mapping))
         self._foreign: dict[str, ForeignGraph] = {}  # read, but not numbered yet
         self._named_by_files = False
         self.keys: dict[str, str] = {}  # of the graphs, for messages
@@ -335,9 +303,16 @@ class Sections:
             gains = validation.leader_gains(leaders, self.agents)
             self.problems += validation.stability_problems(self.graphs, gains, run.dt)
 
-    def spec(self) -> ExperimentSpec:
-        """The whole document with everything resolved. Only valid once there are no problems."""
-        return ExperimentSpec.model_construct(**(self.values | {"agents": self.agents}))
+    def parts(self) -> dict[str, Any]:
+        """The fields of an ``Experiment``, once there are no problems."""
+        return {
+            "spec": ExperimentSpec.model_construct(**(self.values | {"agents": self.agents})),
+            "graph_list": self.graphs,
+            "chain": self.chain,
+            "noise_gain": self.noise_gain,
+            "loss": self.loss,
+            "protocol": self.protocol,
+        }
 
     def _find_protocol(self) -> None:
         """The protocol and its parameters, with their defaults written out."""
@@ -471,10 +446,10 @@ class Sections:
     def _resolve_losses(self, noise: NoiseSpec, time: Time) -> None:
         """Numbers instead of names in ``noise.loss``, and the probability of every link."""
         names: list[str] | None = self.values["names"]
-        loss, found = graph_sources.numbered_losses(noise.loss, names)
+        loss, found = validation.numbered_losses(noise.loss, names)
         if not found:
             self.values["noise"] = noise.model_copy(update={"loss": loss})
-            self.loss, found = graph_sources.loss_matrix(loss, self.graphs, time, names)
+            self.loss, found = validation.loss_matrix(loss, self.graphs, time, names)
         self.problems += found
         if noise.burst is not None and not found:
             self.problems += validation.burst_problems(noise.burst, loss)

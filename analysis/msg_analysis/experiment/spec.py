@@ -1,11 +1,9 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The keys of the experiment file: the whole document, leaders, protocols and the run.
+"""The keys of the experiment file beside graphs and noise: every key, its type, its default and what it means.
 
-The experiment file as data: every key, its type, its default and what it means.
-
-Only what one value can tell by itself is checked here; what needs several keys is checked in ``experiment.validation``.
+Only what one value can tell by itself is checked here; ``validation`` checks what needs several keys.
 """
 
 from __future__ import annotations
@@ -170,3 +168,8 @@ class ExperimentSpec(Section):
     )
     leaders: LeadersSpec | None = Field(None, examples=[{"agents": [3], "gain": 1.0, "reference": 0.0}])
     run: RunSpec = Field(default_factory=RunSpec, examples=[{"dt": 0.05, "duration": 400}])
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON Schema of the experiment file, for editors."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | ExperimentSpec.model_json_schema()

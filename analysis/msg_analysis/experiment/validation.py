@@ -10,14 +10,18 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from msg_analysis.common.arrays import FloatArray
-from msg_analysis.common.text import agent_name, agent_text
+from msg_analysis.common.arrays import BoolArray, FloatArray
+from msg_analysis.common.text import agent_name, agent_text, listed
 from msg_analysis.experiment.graphs import Graph, hops, widest_reaching
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
 from msg_analysis.experiment.network_spec import LossSpec, NoiseGain, NoiseSpec, SwitchingSpec
 from msg_analysis.experiment.problems import problem, show
 from msg_analysis.experiment.spec import LeadersSpec, RunSpec
 
+MOST_STATES = 512
+"""Of graph and links together, in a prediction with losses in bursts."""
+MOST_VALUES = 1500
+"""That agents keep from step to step, in a prediction: the last ones heard, and those that a delay makes older."""
 SUM_TOLERANCE = 1e-9
 STEP_TOLERANCE = 1e-9
 MOST_STEPS = 1e15
@@ -321,3 +325,76 @@ def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
     if leaders:
         gains[np.array(leaders.agents) - 1] = leaders.gain
     return gains
+
+
+def too_large_to_predict(
+    noise: NoiseSpec, graphs: Sequence[Graph], loss: FloatArray, gains: FloatArray, pace: str, time: Time
+) -> list[str]:
+    """What has no prediction because it would be too large; ``loss`` (m, m), ``gains`` (m,) kappa of the leaders."""
+    lines = []
+    links = heard_links(graphs, time) & np.isfinite(gains)[:, None]
+    lossy = int((links & (loss > 0.0)).sum())
+    if noise.burst is not None and len(graphs) * 2.0**lossy > MOST_STATES:
+        wanted = f"has no prediction: 2^{lossy} states of {lossy} links that lose messages, expected at most "
+        wanted += f"{MOST_STATES} with those of the graph"
+        lines.append(problem("noise.burst", noise.burst, wanted, "remove it, or give fewer links a loss"))
+    kept = len(gains) * (noise.delay + 2) + lossy * (noise.delay + 1) * noise.holds
+    by_message = noise.holds or (pace == "realtime" and noise.steps_only)
+    if by_message and kept > MOST_VALUES:
+        wanted = f"has no prediction: {kept} values are kept from step to step, expected at most {MOST_VALUES}"
+        lines.append(problem("noise.on_loss", noise.on_loss, wanted, "use fewer agents or links, or own values"))
+    return lines
+
+
+def heard_links(graphs: Sequence[Graph], time: Time) -> BoolArray:
+    """(m, m) whether agent i hears agent j in some graph: in discrete time, with exp(-Z), over many arcs, too."""
+    heard = np.any([graph.adjacency > 0 for graph in graphs], axis=0)
+    if time == "discrete":
+        heard = np.any([[hops(graph.adjacency > 0, [i]) > 0 for i in range(graph.agents)] for graph in graphs], axis=0)
+    return np.asarray(heard)
+
+
+def numbered_losses(loss: LossSpec, names: Sequence[str] | None) -> tuple[LossSpec, list[str]]:
+    """The same with numbers instead of names of agents, and the names that are unknown."""
+    found: list[str] = []
+
+    def number(key: str, agent: int | str) -> int | str:
+        if not isinstance(agent, str):
+            return agent
+        if agent in (names or []):
+            return (names or []).index(agent) + 1
+        wanted = f"expected one of the names {listed(names)}" if names else "expected a number, since no agent is named"
+        found.append(problem(key, show(agent), wanted, "correct it"))
+        return agent
+
+    numbers = {
+        kind: [(number(f"noise.loss.{kind}", i), number(f"noise.loss.{kind}", j), p) for i, j, p in getattr(loss, kind)]
+        for kind in ("edges", "arcs")
+    }
+    return loss.model_copy(update=numbers), found
+
+
+def loss_matrix(
+    loss: LossSpec, graphs: Sequence[Graph], time: Time, names: Sequence[str] | None
+) -> tuple[FloatArray, list[str]]:
+    """(m, m) probability that a message from agent j (column) to agent i (row) is lost, 0 on the diagonal.
+
+    Also the links in ``loss``, which has numbers of agents, that are in no graph or are repeated.
+    """
+    agents, found = graphs[0].agents, []
+    heard = heard_links(graphs, time)
+    matrix = np.where(np.eye(agents, dtype=np.bool_), 0.0, loss.default)
+    seen: set[tuple[int, int]] = set()
+    directed = [("arcs", int(i), int(j), p) for i, j, p in loss.arcs]
+    directed += [("edges", *ends, p) for i, j, p in loss.edges for ends in ((int(i), int(j)), (int(j), int(i)))]
+    for kind, i, j, probability in directed:
+        key, ends = f"noise.loss.{kind}", show([i, j] if names is None else [agent_name(a, names) for a in (i, j)])
+        if max(i, j) > agents or not heard[j - 1, i - 1]:
+            wanted = f"expected agents of which {agent_name(j, names)} hears {agent_name(i, names)} in some graph"
+            found.append(problem(key, ends, wanted, "correct it"))
+        elif (i, j) in seen:
+            found.append(problem(key, ends, "expected every link once, in each direction", "remove one"))
+        else:
+            matrix[j - 1, i - 1] = probability
+        seen.add((i, j))
+    return matrix, found

@@ -1,21 +1,12 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Which messages each agent receives, with what noise, and which value it uses.
-
-Which messages are lost: independently, or in bursts, by one uniform number for each message of a directed link.
-
-With bursts a link is a stationary Markov chain (Gilbert 1960): a message is lost with probability ``after_lost`` or
-``after_kept``, by the fate of the one before. A number below both means lost, above both not lost, between them the
-same as before (or the opposite, if losses come more evenly than independent ones). So the fate of a message follows
-from the newest number that decides alone, exactly, and without all that was before it.
-
-The air: what happens to a value between the agent that publishes it and an agent that uses it.
+"""Reception: which messages arrive, with what noise, and which value each agent uses.
 
 The message of step k of agent j says x_j(k) + b_j(k); agent i receives y_ij(k) = x_j(k) + b_j(k) + l_ij(k), or nothing
-where it is lost, with all its replicas. Noise and loss belong to the message: used twice, it has the same noise.
-With n the step of the newest message, i uses that of step s = max(0, n - delay). If it is lost, x_i(k) takes its place
-(own), or the newest one before that is not lost (hold; the first one never is).
+where it is lost, with all its replicas. Noise and loss belong to the message: used twice, it has the same noise. With n
+the step of the newest message, i uses that of step s = max(0, n - delay). If it is lost, x_i(k) takes its place (own),
+or the newest one before that is not lost (hold; the first one never is).
 """
 
 from __future__ import annotations
@@ -69,7 +60,11 @@ def loss_probabilities(experiment: Experiment) -> tuple[FloatArray, FloatArray]:
 
 
 class Losses:
-    """The lost messages of every link, block after block of steps."""
+    """The lost messages of every link, block after block of steps, by one uniform number for each message."""
+
+    # With bursts a link is a stationary Markov chain (Gilbert 1960). A number below both ``after_lost`` and
+    # ``after_kept`` means lost, above both not lost, between them the same as before (or the opposite, if losses come
+    # more evenly than independent ones): the newest number that decides alone is all that must be known of the past.
 
     def __init__(self, experiment: Experiment) -> None:
         self._seed = experiment.run.seed
@@ -322,7 +317,7 @@ class MessagesUsed:
 
 
 class AgentAir:
-    """What happens to the messages of an agent (index from 0) and to those for it; see ``model.step.air``."""
+    """What happens to the messages of an agent (index from 0) and to those for it; see the module."""
 
     def __init__(self, experiment: Experiment, model: Wiring, agent: int) -> None:
         self._agent = agent

@@ -1,12 +1,10 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The run record: experiment, start, versions; when a run may end early.
+"""The run record: everything that a run was started from, as one JSON document.
 
-The run record: everything that a run was started from, as one JSON document.
-
-It is what every node of a run is given, with a key that only they have, what the latched ``experiment`` topic carries,
-and so what any bag of the network holds, whoever recorded it.
+Every node of a run is given it, with a key that only they have; the latched topic ``experiment`` carries it, and so
+does any bag of the network, whoever recorded it.
 """
 
 from __future__ import annotations

@@ -293,15 +293,14 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
         raise ExperimentError(str(path), found) from error
     directory = path.parent
     base: Any = spec.experiment
-    lines = []
     if isinstance(base, str):
         file = find(base, directory)
         directory = file.parent
         base = read_yaml(file)
         if not isinstance(base, Mapping):
-            lines = [problem("experiment", show(base), "expected a file of keys", "correct it")]
-    if lines := lines or _spec_problems(spec):
-        raise ExperimentError(str(path), lines)
+            raise ExperimentError(
+                str(path), [problem("experiment", show(base), "expected a file of keys", "correct it")]
+            )
     return points_of(path, spec, base, directory, checked)
 
 
@@ -328,6 +327,8 @@ def _spec_problems(spec: SweepSpec) -> list[str]:
 
 def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
     """The sweep of a document; every point is checked. ExperimentError: all mistakes, with their points."""
+    if lines := _spec_problems(spec):
+        raise ExperimentError(str(path), lines)
     axes = spec.over.values()
     joined = itertools.product(*axes) if spec.combine == "grid" else zip(*axes, strict=True)
     combinations = [dict(zip(spec.over, values, strict=True)) for values in joined]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import ValidationError
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.experiment.loading import plain
+from msg_analysis.experiment.graph_sources import plain
 from msg_analysis.experiment.problems import ExperimentError, translate
 from msg_analysis.sweeps import grid
 from msg_analysis.sweeps.grid import SweepSpec

@@ -1,15 +1,11 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The coupled equations of second moments, matrix-free: the operator, and the "two-level" preconditioner for it.
+"""The coupled equations of second moments without their matrix: the operator, and two preconditioners for it.
 
-docs/accuracy.md, "How the equations are solved", says when which preconditioner is used.
-
-The "averaged" preconditioner of the coupled equations: every graph is replaced by the average of all graphs.
-
-For symmetric graphs that do not switch slowly. It needs more iterations than the two-level preconditioner of
-``equations``, but each costs a quarter as much or less, and it needs no eigenvectors of single graphs.
-docs/accuracy.md, "How the equations are solved", says when it is used.
+The "averaged" one replaces every graph by the average of all graphs: for symmetric graphs that do not switch slowly. It
+needs more iterations than the "two-level" one, but each costs a quarter as much or less, and no eigenvectors of single
+graphs. docs/accuracy.md, "How the equations are solved", says when which is used.
 """
 
 from __future__ import annotations

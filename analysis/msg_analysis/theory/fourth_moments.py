@@ -1,17 +1,16 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The random matrix of a step, as stages: in each, some messages may be lost, independently of each other.
-
-In a stage, z becomes (M + sum_e eta_e u_e v_e^T) z, with eta_e = 1 - p_e if message e arrives and -p_e if it is lost,
-which happens with probability p_e. M is the mean, u_e what the message acts on, v_e the difference between what it
-brings and what takes its place. The noise is left out. See docs/theory.md, "Messages one by one".
-
-Fourth moments of a jump linear system: whether they are finite.
+"""Fourth moments of a jump linear system: whether they are finite.
 
 S_i = E[y y y y; mode i] follow S_j(k+1) = sum_i P_ij E[A_i^(4)] S_i(k) + terms of lower moments, with A_i the random
-matrix of a step and A^(4) its Kronecker power. They stay finite if the spectral radius of this map is below 1, as
-second moments do (Costa, Fragoso and Marques, Discrete-Time Markov Jump Linear Systems, 2005, Section 3.4).
+matrix of a step and A^(4) its Kronecker power. They stay finite if the spectral radius of this map is below 1 (as for
+second moments: Costa, Fragoso and Marques, Discrete-Time Markov Jump Linear Systems, 2005, Section 3.4).
+
+The matrix of a step comes in stages, in each of which some messages may be lost: z becomes
+(M + sum_e eta_e u_e v_e^T) z, with eta_e = 1 - p_e if message e arrives and -p_e if it is lost, with probability p_e.
+M is the mean, u_e what the message acts on, v_e the difference between what it brings and what takes its place; see
+docs/theory.md, "Messages one by one".
 """
 
 from __future__ import annotations

@@ -1,17 +1,10 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reduced Markov jump linear systems: the coordinates in which second moments stay finite.
+"""Reduced Markov jump linear systems: the coordinates in which second moments stay finite, and their components.
 
 Sections 3.1 (consensus) and 3.2 (tracking) of the paper, its Appendix I in discrete time; for the steps of a run,
 docs/theory.md.
-
-The parts of a network of which none hears another in both directions: its strongly connected components.
-
-In their order the matrices of all graphs are block triangular at once, so the means decay as slowly as those of the
-slowest component, and so do the second moments: the covariance of two components decays no slower than the slower of
-the two (Cauchy and Schwarz). The eigenvalues of the whole say the same in exact arithmetic only: a chain of agents is
-a Jordan block, whose eigenvalues rounding scatters. See docs/theory.md, "Transients".
 """
 
 from __future__ import annotations
@@ -295,7 +288,12 @@ CHANGE = 1e-12  # relative size of the changes that show how sensitive a rate is
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Component:
-    """Some of the numbers of a system, and how they act on each other."""
+    """A strongly connected component: some of the numbers of a system, and how they act on each other."""
+
+    # In the order of the components the matrices of all graphs are block triangular at once, so the means decay as
+    # slowly as those of the slowest component, and so do the second moments: the covariance of two components decays no
+    # slower than the slower of the two (Cauchy and Schwarz). The eigenvalues of the whole say the same in exact
+    # arithmetic only: a chain of agents is a Jordan block, whose eigenvalues rounding scatters.
 
     matrices: FloatArray  # (n, q, q) of Z_i or W_i
     consensus: bool  # whether only their disagreement decays: they hear nobody else, and there are no leaders

@@ -254,31 +254,10 @@ def select_leaders(
     top: int = 10,
     watch: SearchProgress = ignore,
 ) -> Selection:
-    """The set of leaders with the least system error, or a good one (docs/leaders.md, "Search methods").
+    """The set of leaders with the least system error, or a good one; arguments as in ``Experiment.leaders``.
 
-    Parameters
-    ----------
-    experiment
-        consensus or tracking
-    count
-        number of leaders; None: as many as the experiment has
-    method
-        "exhaustive" evaluates every set; "greedy" adds the best agent beside those chosen before; "swap" exchanges
-        single leaders, from three starts, until that does not help; "auto" is exhaustive up to ``AUTO_SETS`` sets, else
-        swap
-    law
-        see ``system_error``
-    gain
-        kappa [1 / unit of time]; None: that of the experiment's leaders, inf in consensus
-    top
-        most sets in the result
-    watch
-        called with the progress
-
-    Raises
-    ------
-    InputError
-        no count in consensus; impossible count, gain or law; no set of this size reaches all agents; too many sets
+    docs/leaders.md, "Search methods". InputError: impossible count, gain or law; too many sets, or none that reaches
+    all agents.
     """
     _check(method in get_args(SearchMethod), f"method {method}: expected one of {', '.join(get_args(SearchMethod))}")
     own = experiment.spec.leaders

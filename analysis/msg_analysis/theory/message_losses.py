@@ -1,23 +1,17 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The effect of lost messages on second moments.
+"""What lost messages add to a step's map of second moments, and the adjoint of that, matrix-free.
 
-What lost messages add to a step's map of second moments, and the adjoint of that, matrix-free.
-
-A message from j to i that may be lost adds variance_ij E[(x_i - x_j)^2] to the second moment of agent i
-(docs/theory.md, "Beyond the paper").
-
-What lost messages add to a step's map of second moments, where values are kept or agents step one after the other.
-
-A message that may be lost changes the stack z by xi u v^T z, with xi of mean 0 and variance 1, independent of all
-others: u is what it acts on, v the difference between what it brings and what takes its place. One loss may act on the
-difference that a later one of the same step sees. With q_e = E[(v_e^T z)^2] at the moment of e,
+Without kept values, a message from j to i that may be lost adds variance_ij E[(x_i - x_j)^2] to the second moment of
+agent i. In general it changes the stack z by xi u v^T z, with xi of mean 0 and variance 1, independent of all others:
+u is what it acts on, v the difference between what it brings and what takes its place. One loss may act on the
+difference that a later one of the same step sees: with q_e = E[(v_e^T z)^2] at the moment of e,
 
     q_e = v_e^T C v_e + sum_(f before e) R_ef q_f,    L[C] = sum_e q_e u_e u_e^T
 
-is what is added to A C A^T; all v are written for the z at the beginning of the step, all u for that at its end
-(docs/theory.md, "Messages one by one").
+is added to A C A^T; all v are for the z at the beginning of the step, all u for that at its end (docs/theory.md,
+"Messages one by one").
 """
 
 from __future__ import annotations

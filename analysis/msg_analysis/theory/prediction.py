@@ -274,17 +274,7 @@ def _why_no_paper(experiment: Experiment) -> str:
 def predict(experiment: Experiment, step: StepModel | None = None) -> Prediction:
     """Steady-state prediction of an experiment (Propositions 2 and 3 of the paper, 7 and 8 in discrete time).
 
-    Parameters
-    ----------
-    experiment
-        whose law is linear
-    step
-        its step model, if it is known, such as that of a run record
-
-    Raises
-    ------
-    InputError
-        too large, or without finite steady errors
+    ``step``: its step model, if it is known. InputError: too large, or without finite steady errors.
     """
     step = step or build_step_model(experiment)
     continuous = paper = None

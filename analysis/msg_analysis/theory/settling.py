@@ -1,13 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How fast errors settle: decay rates of moments, and settling times.
-
-How fast the effect of the start dies out in the end.
-
-See docs/theory.md, "Transients".
-
-How fast the errors settle: the settling time from a given start, and asymptotic rates.
+"""How fast errors settle: asymptotic decay rates, and the settling time from a given start.
 
 See docs/theory.md, "Transients".
 """

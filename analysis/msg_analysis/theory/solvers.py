@@ -1,24 +1,16 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Solvers of the moment equations: direct, and without matrices.
+"""Solvers of the moment equations (Propositions 2 and 3 of the paper, 7 and 8 in discrete time).
 
-The operators of second moments as matrices on packed moments, mode by mode: for closed forms and transients.
+Small systems: one dense LU factorisation on the p = d (d + 1) / 2 free entries of every moment (``packed_symmetric``)
+serves the steady moments and every dual; the cost grows as (n p)^3. The same matrices, the paper's M and N (in discrete
+time A and H), propagate transients. Large systems: preconditioned Krylov iterations without the matrix, and refinement.
 
-Dense, so for small systems. Symmetric matrices are vectors of their p = d (d + 1) / 2 free entries
-(``packed_symmetric``).
-They are the paper's M and N (Proposition 1), in discrete time its A and H (Proposition 6).
-
-The coupled equations as one dense matrix on the half-vectorised unknowns: the reference for small systems.
-
-One LU factorisation serves the steady moments and every dual; the cost grows as (n d (d + 1) / 2)^3.
-The equations are those of Propositions 2 and 3 of the paper (7 and 8 in discrete time).
-
-The coupled equations solved matrix-free, by preconditioned Krylov iterations and refinement.
-
-Every cycle starts from the residual of the equations as given, in double precision: so neither the Krylov recurrences
-nor the eigenvectors limit the accuracy. A solution is accepted when the correction by one more preconditioned step is
-small in every graph: unlike the residual, this is not hidden by the rounding of large rates. See docs/accuracy.md.
+Every cycle of refinement starts from the residual of the equations as given, in double precision, so neither the Krylov
+recurrences nor the eigenvectors limit the accuracy. A solution is accepted when the correction by one more
+preconditioned step is small in every graph: unlike the residual, this is not hidden by the rounding of large rates. See
+docs/accuracy.md.
 """
 
 from __future__ import annotations

@@ -127,24 +127,9 @@ def spectrum(
     *,
     most_unknowns: int = MAX_SIZE,
 ) -> Spectrum:
-    """Autocovariance and spectral density of the errors, from the steady moments of a prediction.
+    """The spectrum of a prediction: arguments and errors as in ``Experiment.spectrum``.
 
-    Parameters
-    ----------
-    prediction
-        of the experiment
-    lags
-        (L,) ascending, >= 0 [steps]; None: up to 200, from 0 to where 1 % of lag 0 is left
-    frequencies
-        (F,) ascending, from 0 to 1 / (2 dt) [cycles per unit of simulated time]; None: 200, equally spaced on a
-        logarithmic axis
-    most_unknowns
-        graphs times coordinates of the resolvent, at most
-
-    Raises
-    ------
-    InputError
-        lags or frequencies that are not valid; too large
+    ``most_unknowns``: graphs times coordinates of the resolvent, at most.
     """
     system, dt = prediction.system, prediction.step.dt
     if lags is not None and (not len(lags) or lags[0] < 0 or (np.diff(lags) <= 0).any()):

@@ -3,16 +3,7 @@
 
 """The offline twin: a run without ROS, from its start, block by block.
 
-The offline twin in real time: ideal timers, so that the agents step one after the other.
-
-Every agent steps when it is due, and hears at once what others made.
-
-Where a run begins: x(0).
-
-The stationary start is the end of a run before the run. Its steps have negative numbers, the same law and streams of
-their own; its graphs are drawn backwards from g(0). It begins further and further back, until a beginning twice as far
-back no longer changes x(0) (coupling from the past, Propp and Wilson 1996). So x(0) has the stationary law, not only
-its second moments, and no linear algebra, whose last bits depend on the processor, takes part.
+In real time it has ideal timers: every agent steps when it is due, and hears at once what others made.
 """
 
 from __future__ import annotations
@@ -260,6 +251,10 @@ def draw_start(experiment: Experiment, model: Wiring, first_mode: int) -> FloatA
 
 def _from_the_past(experiment: Experiment, model: StepModel, first_mode: int) -> FloatArray | None:
     """x(0) at the end of a past that is long enough; None where that would take too long."""
+    # Coupling from the past (Propp and Wilson 1996): the steps of the past have negative numbers, the same law and
+    # streams of their own, and graphs drawn backwards from g(0). It is long enough when one twice as long does not
+    # change x(0), which so has the stationary law, not only its second moments; and no linear algebra, whose last bits
+    # depend on the processor, takes part.
     size = experiment.agents * experiment.run.replicas
     steps, before, law = STEPS_PER_BLOCK, None, law_of_all(experiment, model)
     noise = noise_of_all(experiment, model, kept=True)  # the past that is twice as long ends with the same steps

@@ -277,21 +277,9 @@ def _without_comparison(experiment: Experiment) -> dict[str, Any]:
 
 
 def conclude(result: RunResult, report: ReportWhen = "always") -> None:
-    """Compare the bag of a run with its prediction, and write report.html and result.json into the bag.
+    """Set the ``comparison`` of a run whose bag was read, and write report.html and result.json into the bag.
 
-    Does nothing if there is no bag, or it was not read.
-
-    Parameters
-    ----------
-    result
-        from ``run_network``; its ``comparison`` is set
-    report
-        when the report is written; "on-failure": if the verdict is not "agrees"
-
-    Raises
-    ------
-    InputError
-        there is no prediction (too large, unbounded), the bag lacks what is needed, or the report cannot be written
+    InputError: there is no prediction, the bag lacks what is needed, or the report cannot be written.
     """
     if result.trajectory is None or result.bag is None:
         return

@@ -25,7 +25,7 @@ from msg_agents.process_layout import SWITCHER, ProcessPlan
 from msg_agents.run.supervisor import Supervisor
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.experiment.graph_sources import heard_links
+from msg_analysis.experiment.validation import heard_links
 from msg_analysis.model.step_model import Wiring
 from msg_analysis.theory.prediction import predict
 
