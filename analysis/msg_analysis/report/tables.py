@@ -314,7 +314,7 @@ def print_salvage(document: dict[str, Any], console: Console) -> None:
 _STYLES = {"agrees": "green", "disagrees": "bold red", "incomplete": "yellow"}
 
 
-_OPTIONAL = ("predicted", "z", "± (95 %)")  # left out in this order where the terminal is too narrow
+_OPTIONAL = ("predicted", "z", "± (95 %)", "date", "experiment")  # of runs, as in ``that_fit``
 
 
 def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Console) -> None:

@@ -276,13 +276,9 @@ def _run_nodes(
     record: RunRecord,
     *,
     lifeline: int | None,
-    introduction: int | None,
     namespace: int | None,
-    discovery_timeout: float,
-    use_sim_time: bool,
-    account: Path | None,
     parameter_services: bool,  # noqa: ARG001  see LeanNode
-    patience: float | None = None,
+    **options: Any,  # of ``run_nodes``
 ) -> None:
     if namespace is not None:
         from msg_agents.channel.namespaces import enter
@@ -294,16 +290,7 @@ def _run_nodes(
 
     executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")
     throughput = record.experiment.run.pace == "lockstep"
-    if not run_nodes(
-        nodes,
-        executor=executor,
-        discovery_timeout=discovery_timeout,
-        throughput=throughput,
-        use_sim_time=use_sim_time,
-        account=account,
-        introduction=introduction,
-        patience=patience,
-    ):
+    if not run_nodes(nodes, executor=executor, throughput=throughput, **options):
         sys.exit(ExitCode.INCOMPLETE)
 
 
