@@ -18,6 +18,7 @@ from pages import EXPERIMENTS, PAGES, PRINTING, ROOT, Shown, blocks, console, ex
 from msg_agents.cli.main import main as agents
 from msg_analysis.api import Experiment
 from msg_analysis.cli.main import main as analysis
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import simulate
 
 PROGRAMS: dict[str, click.Group] = {"msg-agents": agents, "msg-analysis": analysis}
@@ -88,6 +89,14 @@ def test_files_and_targets_exist(page: Path) -> None:
         if script := re.search(r"(benchmarks/\w+\.py)(.*)", line):
             source = (ROOT / script[1]).read_text(encoding="utf-8")
             assert [option for option in re.findall(r"--[a-z-]+", script[2]) if f'"{option}"' not in source] == []
+
+
+def test_files_to_read_exist() -> None:
+    page = (ROOT / "docs/contributing.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`((?:msg_analysis|msg_agents)/[\w/]*)(\.py)?`", page))
+    places = {"msg_analysis": ROOT / "analysis", "msg_agents": ROOT / "msg_agents"}
+    assert len(named) > 30
+    assert [file + end for file, end in named if not (places[file.split("/")[0]] / (file + end)).exists()] == []
 
 
 @pytest.fixture
