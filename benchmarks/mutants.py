@@ -31,7 +31,8 @@ ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "build/mutants"))
 TESTS = {
     "msg_agents/msg_agents/stepping/synchronizer.py": "tests/agents/stepping",
-    "analysis/msg_analysis/theory/moments.py": "tests/analysis/theory -k 'moments or solvers or prediction'",
+    "analysis/msg_analysis/theory/moments.py": "tests/analysis/theory/test_moments.py "
+    "tests/analysis/theory/test_prediction.py",
     "analysis/msg_analysis/inference/verdict.py": "tests/analysis/inference/test_compare.py",
     "analysis/msg_analysis/bags/salvage.py": "tests/analysis/bags/test_trajectory_writer_and_salvage.py -k 'not 00'",
     "analysis/msg_analysis/messages/acceptance.py": "tests/analysis/wire/test_receiving.py",

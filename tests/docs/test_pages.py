@@ -90,6 +90,14 @@ def test_files_and_targets_exist(page: Path) -> None:
             assert [option for option in re.findall(r"--[a-z-]+", script[2]) if f'"{option}"' not in source] == []
 
 
+def test_files_to_read_exist() -> None:
+    page = (ROOT / "docs/contributing.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`((?:msg_analysis|msg_agents)/[\w/]*)(\.py)?`", page))
+    places = {"msg_analysis": ROOT / "analysis", "msg_agents": ROOT / "msg_agents"}
+    assert len(named) > 30
+    assert [file + end for file, end in named if not (places[file.split("/")[0]] / (file + end)).exists()] == []
+
+
 @pytest.fixture
 def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A directory with all example experiments, in a wide terminal without colours."""

@@ -123,3 +123,18 @@ def test_a_row_beyond_the_end() -> None:
     assert steps.take_row(0, marks_of(np.arange(6)))
     assert steps.row == 5
     assert not steps.take_row(6, marks_of(np.arange(1)))
+
+
+def test_rows_join_what_came_before_them() -> None:
+    """A row is taken up to the last step and not beyond, and reaches the steps that are already there behind it."""
+    steps = ReceivedSteps(10)
+    for k in (3, 4, 6):
+        assert steps.take(k, k) is None
+    assert steps.take_row(0, marks_of(np.arange(3)))
+    assert steps.row == 4
+    assert steps.take(5, 5) is None
+    assert steps.row == 6
+    assert not steps.take_row(7, marks_of(np.arange(7, 12)))
+    assert steps.row == 6
+    assert steps.take_row(7, marks_of(np.arange(7, 11)))
+    assert steps.row == 10
