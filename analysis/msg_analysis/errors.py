@@ -9,7 +9,7 @@ import signal
 from enum import IntEnum
 
 
-class InputError(Exception):
+class InputError(ValueError):
     """Bad input. The message names the key or file, the value, what was expected and what to do. Exit code 2."""
 
 
@@ -31,7 +31,7 @@ class ExitCode(IntEnum):
 
 
 def killed_by(number: int) -> int:
-    """Exit code of a process that a signal ended, as shells report it."""
+    """Exit code of a process that the signal with this ``number`` ended, as shells report it."""
     return 128 + number
 
 
