@@ -162,7 +162,7 @@ def summary(fault: str | None, replicas: int, seed: int) -> Kept:
     assert result.any_time is not None
     right = bool(first and fault and first.kind == FAULTS[fault][1])
     words = first.words if first else ""
-    return Kept(result.verdict == "disagrees", result.any_time.disagrees, right, rejected, words)
+    return Kept(result.verdict == "disagrees", result.any_time.exceeded, right, rejected, words)
 
 
 CORRECT = {"line/ring, 16 replicas": line_ring(replicas=16)} | {
@@ -184,7 +184,7 @@ def correct_run(law: str, seed: int) -> Correct:
     result = compare(simulate(Experiment.parse(CORRECT[law]).with_run(seed=seed)))
     assert result.any_time is not None
     p = {test.name: test.p for test in result.tests if " of agent" not in test.name}
-    return Correct(result.verdict == "disagrees", result.any_time.disagrees, p)
+    return Correct(result.verdict == "disagrees", result.any_time.exceeded, p)
 
 
 def print_faults(pool: ProcessPoolExecutor, faults: list[str], runs: int, replicas: int, words: bool) -> None:

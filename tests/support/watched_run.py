@@ -5,9 +5,9 @@ from __future__ import annotations
 import random
 
 from msg_analysis.bags import run_writer
+from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.online_errors import LiveEstimate, LiveReport
-from msg_analysis.inference.sequential_sums import EvidenceSums
 from msg_analysis.messages.acceptance import state_frame
 from msg_analysis.messages.messages import ActiveGraph
 from msg_analysis.model.run import Run

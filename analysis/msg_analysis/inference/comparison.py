@@ -28,14 +28,15 @@ from msg_analysis.errors import ExitCode
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, Ranking
+from msg_analysis.inference.evidence_sums import AnyTimeEvidence
 from msg_analysis.inference.given_path import GivenPath
-from msg_analysis.inference.messages import LossTest
+from msg_analysis.inference.losses import LossTest
+from msg_analysis.inference.question import Test
 from msg_analysis.inference.realtime_laws import Laws
 from msg_analysis.inference.residuals import InnovationTests
-from msg_analysis.inference.sequential_sums import AnyTimeEvidence
-from msg_analysis.inference.switching import SwitchingTest
 from msg_analysis.inference.time_means import TimeMeans
 from msg_analysis.inference.timing import Timing
+from msg_analysis.inference.transitions import SwitchingTest
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import step_law
@@ -166,16 +167,6 @@ EXIT_CODES: dict[Verdict, ExitCode] = {
     "incomplete": ExitCode.INCOMPLETE,
     "unpredicted": ExitCode.FINE,
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Test:
-    """One member of the family of tests that the verdict is about."""
-
-    name: str
-    p: float  # of this test alone
-    p_adjusted: float  # Holm's, over the family
-    rejected: bool  # whether ``p_adjusted`` is below the level
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -332,7 +323,7 @@ class Comparison:
         if not self.trajectory.completeness.complete:
             return "incomplete"
         until = self.trajectory.record.until
-        decided = until is not None and until.decided and self.any_time is not None and self.any_time.disagrees
+        decided = until is not None and until.decided and self.any_time is not None and self.any_time.exceeded
         if decided or any(test.rejected for test in self.tests):
             return "disagrees"
         return "unpredicted" if self.unpredicted else "agrees"
@@ -398,7 +389,7 @@ class Comparison:
             "blame": [cause.to_json() for cause in self.blame],
             "continuous": {"system_error": self.continuous_error},
             "batch_means": {"interval": self.batch or (None, None)},
-            "tests": [asdict(test) for test in self.tests],
+            "tests": [test.to_json() for test in self.tests],
             "any_time": self.any_time.to_json() if self.any_time else None,
             "trust": self.trust.to_json() if self.trust else None,
         }

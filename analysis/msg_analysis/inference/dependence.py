@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Diagnostics of dependence in time: long lags, constant states."""
+"""Questions about dependence: between agents and successive steps, at long lags, and states that do not change."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -13,9 +14,95 @@ import numpy as np
 import scipy.fft
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
-from msg_analysis.inference.diagnostics import Block, Departure, Finding, Law, Place, Question
+from msg_analysis.common.text import HALF_WIDTH_95, percent
+from msg_analysis.inference import candidates
+from msg_analysis.inference.candidates import Cause, numbers_text
 from msg_analysis.inference.e_values import EventEvidence, Looks, coefficient_evidence
-from msg_analysis.inference.statistics import log_normal_tail
+from msg_analysis.inference.question import (
+    Block,
+    Diagnostic,
+    Finding,
+    Law,
+    Place,
+    Question,
+    RunningSums,
+    Search,
+    Statistics,
+    Test,
+    one_test,
+)
+from msg_analysis.inference.statistics import binomial_interval, log_normal_tail
+
+
+class Whiteness(Question):
+    """Whether residuals of successive steps, of replicas, and of two agents are independent as they should be."""
+
+    name = "innovations: whiteness"
+    meaning = "the noise of successive steps, of replicas or of agents is correlated: random numbers are used twice"
+
+    @classmethod
+    def tests(cls, run: Statistics) -> list[Test]:
+        """Lags of 1 to 10 steps, and pairs of replicas."""
+        return one_test(cls.name, run.innovations.p_whiteness)
+
+    def evidence(self, sums: RunningSums) -> FloatArray:
+        """One row for each pair of agents."""
+        i, j = self.law.pairs.T
+        return coefficient_evidence(sums.pair_score[:, i, j], sums.pair_information[:, i, j])
+
+    def about(self, row: int) -> str:
+        """Two agents."""
+        first, second = (self.law.pairs[row] + 1).tolist()
+        return f"common noise of agents {first} and {second}"
+
+    @classmethod
+    def classes(cls, search: Search) -> int:
+        """The pairs."""
+        del search
+        return 1
+
+    @classmethod
+    def causes(cls, search: Search) -> list[Cause]:
+        """Correlations of pairs; where gains are wrong, these correlate the residuals, too."""
+        _, change = search.selected_gains
+        return [] if search.noise is None or change.any() else _correlations(search)
+
+
+MAX_NOISE_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
+
+
+def _correlations(search: Search) -> list[Cause]:
+    """Pairs of agents whose noise correlation differs from the expected one, by Fisher's z."""
+    sums, families, level = search.innovations, search.families, search.level
+    m = sums.still.shape[1]
+    agents = [i for i in range(m) if i not in search.excluded]
+    pairs = [(i, j) for place, i in enumerate(agents) for j in agents[:place]]
+    if not 0 < len(pairs) <= MAX_NOISE_PAIRS:
+        return []
+    samples = int(sums.samples.sum())
+    should = np.tensordot(sums.samples, sums.noises, axes=1)
+    scatter = sums.scatter.sum(axis=0)
+    found = []
+    for j, i in sorted((j, i) for i, j in pairs):
+        size, expected_size = scatter[i, i] * scatter[j, j], should[i, i] * should[j, j]
+        if size <= 0.0 or expected_size <= 0.0 or samples < candidates.MIN_SAMPLES:
+            continue
+        seen, expected = scatter[i, j] / math.sqrt(size), should[i, j] / math.sqrt(expected_size)
+        if 1.0 - expected**2 < 1e-6 or 1.0 - seen**2 < 1e-12:
+            continue
+        z = (math.atanh(seen) - math.atanh(expected)) * math.sqrt(samples - 3)
+        log_p = math.log(2.0 * len(pairs) * families) + float(log_normal_tail(abs(z)))
+        if log_p < math.log(level):
+            half = HALF_WIDTH_95 / math.sqrt(samples - 3)
+            interval = math.tanh(math.atanh(seen) - half), math.tanh(math.atanh(seen) + half)
+            words = (
+                f"the noise of agents {j + 1} and {i + 1} has correlation {numbers_text(seen, interval)}, "
+                f"not {expected:.3g}"
+            )
+            link = (j + 1, i + 1)
+            found.append(Cause("correlation", words, None, link, None, seen, interval, expected, math.exp(log_p)))
+    return found
+
 
 LAGS = 100
 MIN_SAMPLES = 100  # fewest products for the normal law of their sum
@@ -119,16 +206,18 @@ def lag_evidence(score: FloatArray, information: FloatArray) -> FloatArray:
     return coefficient_evidence(score.swapaxes(-1, -2), information.swapaxes(-1, -2))
 
 
-class LongLags(Departure):
+class LongLags(Diagnostic):
     """Regression of every innovation on that of the same agent 1 to 100 steps before.
 
     The test takes the clearest lag: of an agent, or of all together where they are independent, with half of the
     level each.
     """
 
-    test = "innovations: lags to 100"
+    name = "innovations: lags to 100"
+    meaning = "the noise of a step depends on that of up to 100 steps before"
 
     def __init__(self, law: Law) -> None:
+        super().__init__(law)
         self._agents, self._together = np.flatnonzero(law.noisy), bool(law.apart and law.noisy.sum() > 1)
         self.sums = LagSums(len(self._agents), law.replicas)
 
@@ -147,7 +236,6 @@ class LongLags(Departure):
             return None
         best = min((lag for lag in (each, whole) if lag), key=lambda lag: lag.log_p)
         return Finding(
-            self.test,
             min(0.0, best.log_p + math.log(1.0 + self._together)),
             agent=None if best is whole else int(self._agents[best.column]),
             span=(best.steps, best.steps),
@@ -156,7 +244,7 @@ class LongLags(Departure):
             expected=0.0,
         )
 
-    def evidence(self) -> FloatArray:
+    def logarithms(self) -> FloatArray:
         """(100 (agents + 1), K): lags of each agent, and of all together."""
         return self._evidence(self.sums.score, self.sums.information)
 
@@ -168,17 +256,31 @@ class LongLags(Departure):
         found = lag_evidence(score, information)
         return found.reshape(*found.shape[:-3], -1, found.shape[-1])
 
-    def questions(self) -> list[Question]:
+    def about(self, row: int) -> str:
         """A lag of an agent, or of all."""
-        whose = [f"agent {agent + 1}" for agent in self._agents.tolist()] + ["all agents"] * self._together
-        return [(f"noise of {who} and {lag} steps before", ()) for who in whose for lag in range(1, LAGS + 1)]
+        column, lag = divmod(row, LAGS)
+        who = f"agent {self._agents[column] + 1}" if column < len(self._agents) else "all agents"
+        return f"noise of {who} and {lag + 1} steps before"
+
+    @classmethod
+    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+        """A correlation."""
+        del names
+        assert found.span is not None
+        value, interval = found.estimate or 0.0, found.interval
+        words = (
+            f"the noise of {found.whose} has correlation {numbers_text(value, interval)} with its own {found.span[0]} "
+            "steps before, not 0"
+        )
+        agent = None if found.agent is None else found.agent + 1
+        return Cause("lag", words, agent, None, None, value, interval, found.expected, p)
 
 
 ROUNDINGS = 4.0  # of the largest state, in the computation of a state, at most
 EPSILON = float(np.finfo(np.float64).eps)
 
 
-class StandingStill(Departure):
+class ConstantState(Diagnostic):
     """Steps in which no replica of an agent moves.
 
     The density of a normal number is below 0.4 over its standard deviation, so the probability q of such a step is at
@@ -187,9 +289,11 @@ class StandingStill(Departure):
     p of the test (Markov).
     """
 
-    test = "innovations: standing still"
+    name = "innovations: standing still"
+    meaning = "the state of an agent with noise does not change for some steps"
 
     def __init__(self, law: Law) -> None:
+        super().__init__(law)
         self._agents = np.flatnonzero(law.noisy)
         self._evidence = EventEvidence(law.planned * len(self._agents))
         self._since = np.full(len(self._agents), -1)  # first step of what may go on, from 0; -1: moved
@@ -240,14 +344,41 @@ class StandingStill(Departure):
             return None
         log_p = min(0.0, -self._evidence.logarithm())
         if self._longest is None:
-            return Finding(self.test, log_p)
+            return Finding(log_p)
         length, agent, place = self._longest
-        return Finding(self.test, log_p, agent=agent, place=place, estimate=float(length), expected=0.0)
+        return Finding(log_p, agent=agent, place=place, estimate=float(length), expected=0.0)
 
-    def evidence(self) -> FloatArray:
+    def logarithms(self) -> FloatArray:
         """(1, 1)."""
         return np.array([[self._evidence.logarithm()]]) if len(self._agents) else np.empty((0, 1))
 
-    def questions(self) -> list[Question]:
+    def about(self, row: int) -> str:
         """One, about all agents."""
-        return [("agents that stand still", ())]
+        del row
+        return "agents that stand still"
+
+    @classmethod
+    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+        """An agent in some steps."""
+        assert found.place is not None
+        del names
+        words = f"{found.whose} stood still {found.place.words}, although it has noise"
+        agent = None if found.agent is None else found.agent + 1
+        return Cause("frozen", words, agent, None, None, None, None, found.expected, p, found.steps)
+
+    @classmethod
+    def causes(cls, search: Search) -> list[Cause]:
+        """Agents that cannot have been where they were by chance."""
+        return [_frozen_cause(*entry, search.findings.get(cls.name)) for entry in search.frozen]
+
+
+def _frozen_cause(agent: int, still: int, steps: int, found: Finding | None) -> Cause:
+    """An agent, from 0, that did not move in so many of its steps; with the stretch if that is all of them."""
+    share, interval = still / steps, binomial_interval(still, steps)
+    when = "does not move in any of its steps" if still == steps else f"does not move in {percent(share)} of its steps"
+    stretch = found.place if found and found.agent == agent else None
+    where = None
+    if stretch and still < steps and still == stretch.last - stretch.first + 1:
+        when, where = f"stood still {stretch.words}", (stretch.first, stretch.last)
+    words = f"agent {agent + 1} {when}, although it has noise"
+    return Cause("frozen", words, agent + 1, None, None, share, interval, 0.0, 0.0, where)

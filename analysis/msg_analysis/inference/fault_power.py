@@ -21,10 +21,13 @@ import scipy.linalg
 
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.markov_chain import MarkovChain
-from msg_analysis.inference.gains import MAX_REGRESSORS, regressors
+from msg_analysis.inference.evidence_sums import EvidenceSums
+from msg_analysis.inference.gains import CommonGain, Gains
+from msg_analysis.inference.graphs import Switching
+from msg_analysis.inference.noise import Noise
+from msg_analysis.inference.question import Diagnostic
 from msg_analysis.inference.received_values import NO_NOISE
-from msg_analysis.inference.sequential_questions import kind_weights
-from msg_analysis.inference.sequential_sums import EvidenceSums
+from msg_analysis.inference.regression import MAX_REGRESSORS, regressors
 from msg_analysis.inference.statistics import chi2_quantile, needed_noncentrality, noncentral_chi2_tail
 from msg_analysis.model.step_model import StepModel
 from msg_analysis.theory.prediction import Prediction
@@ -123,11 +126,11 @@ def fault_powers(
         each is one row of the result
     """
     step, sums = prediction.step, EvidenceSums(prediction, replicas, in_detail=True)
-    departures = sums.departures.families() if sums.departures else {}
-    # While a run goes on, departures are not looked for.
-    questions = {kind: logs.size for kind, logs in sums.families().items() if kind not in departures}
-    weights = dict(zip(questions, kind_weights(list(questions)).tolist(), strict=True))
-    share = level / (_family(prediction) + len(departures))
+    # While a run goes on, diagnostics are not asked.
+    families = {name: logs.size for name, logs in sums.families().items()}
+    questions = {name: size for name, size in families.items() if not isinstance(sums.questions[name], Diagnostic)}
+    weights = dict(zip(questions, sums.weights(questions).tolist(), strict=True))
+    share = level / sum(question.number_of_tests() for question in sums.questions.values())
     found = []
     for fault in faults:
         informations = {
@@ -143,19 +146,13 @@ def fault_powers(
         (agent, sender), tests = min(
             informations.items(), key=lambda entry: max(test.noncentrality for test in entry[1])
         )
-        asked = fault.kind in questions
-        price = math.log(questions[fault.kind] / (weights[fault.kind] * level)) if asked else math.inf
+        name = {"noise": Noise.name, "gain": Gains.name, "switching": Switching.name}[fault.kind]
+        price = math.log(questions[name] / (weights[name] * level)) if name in questions else math.inf
         found.append(FaultPower(fault, agent, sender, tests, share, price))
     return found
 
 
 _Informations = dict[tuple[int | None, int | None], list[StepInformation]]
-
-
-def _family(prediction: Prediction) -> int:
-    """Number of tests without departures: errors and covariance, innovations, and those of what the experiment has."""
-    step = prediction.step
-    return 1 + step.agents + 1 + 4 + (step.modes > 1) + (step.loss > 0.0) + (step.broadcast > 0.0)
 
 
 def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
@@ -173,7 +170,7 @@ def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
             values = np.linalg.eigvalsh(change)
             divergence += float(share * (values - np.log1p(values)).sum())
         if divergence > 0.0:
-            found[agent, None] = [StepInformation("innovations: covariance", dof, replicas * divergence)]
+            found[agent, None] = [StepInformation(Noise.name, dof, replicas * divergence)]
     return found
 
 
@@ -213,8 +210,8 @@ def _gain(prediction: Prediction, factor: float, replicas: int) -> _Informations
     change = (factor - 1.0) ** 2 * replicas
     return {
         link: [
-            StepInformation("innovations: gains", len(terms), change * own),
-            StepInformation("innovations: common gain", 1, change * with_all**2 / total),
+            StepInformation(Gains.name, len(terms), change * own),
+            StepInformation(CommonGain.name, 1, change * with_all**2 / total),
         ]
         for link, (own, with_all) in links.items()
         if own > 0.0
@@ -233,7 +230,7 @@ def _switching(step: StepModel, factor: float) -> _Informations:
         terms = np.where(wrong > 0.0, wrong * np.log(wrong / law), 0.0)
     divergence = 2.0 * float(step.stationary @ terms.sum(axis=1))
     dof = int((law > 0.0).sum()) - step.modes
-    return {(None, None): [StepInformation("switching", dof, divergence)]} if divergence > 0.0 else {}
+    return {(None, None): [StepInformation(Switching.name, dof, divergence)]} if divergence > 0.0 else {}
 
 
 def _faster(chain: MarkovChain, dt: float, factor: float) -> FloatArray | None:

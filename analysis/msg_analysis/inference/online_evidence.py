@@ -24,13 +24,11 @@ import numpy as np
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.e_values import log_mean
+from msg_analysis.inference.evidence_sums import LARGEST_LOGARITHM, EvidenceSums
 from msg_analysis.inference.observation import Observation, bounded
 from msg_analysis.inference.online_steps import LoggedStates
 from msg_analysis.inference.received_values import HeardValues
 from msg_analysis.inference.residuals import heard_innovations
-from msg_analysis.inference.sequential_questions import question_words
-from msg_analysis.inference.sequential_sums import LARGEST_LOGARITHM, EvidenceSums
 from msg_analysis.model.run import LoggedInputs
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.prediction import Prediction
@@ -86,7 +84,6 @@ class EvidenceWatch:
             raise ValueError("too many agents for the evidence of this run")
         self.sums = EvidenceSums(prediction, replicas)
         self.count = 0  # steps that have been added
-        self._names = [graph.name for graph in prediction.experiment.graph_list]
         self._crossed: int | None = None
 
     @property
@@ -104,9 +101,7 @@ class EvidenceWatch:
             self._crossed = self.count
         strongest = None
         if self._crossed is not None:
-            best = {kind: log_mean(logs, axis=1) for kind, logs in self.sums.families().items()}
-            kind = max(best, key=lambda kind: float(best[kind].max()))
-            strongest = question_words(self.sums.question(kind, int(best[kind].argmax())), self._names)
+            strongest = max(self.sums.strongest(self.sums.families()), key=lambda question: question[1])[0]
         return AnyTime(half_width, evidence, threshold, self._crossed, strongest)
 
 

@@ -64,7 +64,7 @@ def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> C
     if total is None:
         comparison = verdict.without_numbers(trajectory, level, prediction, 0)
     else:
-        comparison = verdict.judge(trajectory, prediction, total, level, [("runs alike", pool.p)])
+        comparison = verdict.judge(trajectory, prediction, total, level, pool.p)
     return dataclasses.replace(comparison, pool=pool)
 
 

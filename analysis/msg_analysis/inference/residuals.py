@@ -10,24 +10,20 @@ values that the agents heard (see ``heard_values``), for any timing. See docs/st
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 
 from msg_analysis.common.arrays import FloatArray, IntArray
-from msg_analysis.inference.diagnostics import Block, Departure, Finding, Law, Place, Question
-from msg_analysis.inference.e_values import EventEvidence, variance_evidence
-from msg_analysis.inference.gains import MAX_REGRESSORS, HeardRegression, StateRegression
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.received_values import NO_NOISE, Equalizer, HeardValues, RepeatedNoise, full_reception_noise
+from msg_analysis.inference.regression import MAX_REGRESSORS, HeardRegression, StateRegression
 from msg_analysis.inference.statistics import (
     chi2_tail,
     covariance_statistic,
     direction_p,
-    log_normal_tail,
     quadratic_form,
 )
 from msg_analysis.model.step_model import StepModel
@@ -345,65 +341,3 @@ class BroadcastSums:
         """p-value of published - state being N(0, s^2 I), s = ``noise.broadcast``."""
         statistic, dof = covariance_statistic(self.scatter, self.samples)
         return float(chi2_tail(statistic, dof))
-
-
-LARGE = 4.0  # standard deviations; smaller innovations have the evidence 0
-
-
-class LargestInnovation(Departure):
-    """Every innovation by itself, N(0, 1) after division by its standard deviation.
-
-    The test is that of the largest, with their number as a factor (Bonferroni). The evidence is the mean over all
-    innovations of a run of that of each one against a larger variance; those to come count 1. Half of the whole always
-    counts 1.
-    """
-
-    test = "innovations: largest"
-
-    def __init__(self, law: Law) -> None:
-        self._agents = np.flatnonzero(law.noisy)
-        self._evidence = EventEvidence(law.planned * law.replicas * len(self._agents))
-        self._samples = 0
-        self._largest, self._agent, self._place, self._runs = 0.0, 0, Place(0, 0), 1
-
-    def add(self, block: Block) -> FloatArray:
-        """Look at the innovations of a block."""
-        white, looks = block.white[:, self._agents], block.looks
-        if not white.size:
-            return np.empty((looks.count, 0, 1))
-        self._samples += white.size
-        sizes = np.abs(white)
-        large = sizes > LARGE
-        logarithms = variance_evidence(np.ones(int(large.sum())), sizes[large] ** 2)[:, 0]
-        seen, when = looks.lengths * white[0].size, looks.after(np.nonzero(large)[0])
-        at = int(np.argmax(sizes))
-        if not sizes.flat[at] <= abs(self._largest):  # also a NaN
-            step, place, _ = np.unravel_index(at, white.shape)
-            self._largest, self._agent = float(white.flat[at]), int(self._agents[place])
-            self._place = Place(block.first + int(step) + 1, block.first + int(step) + 1)
-        return self._evidence.add(seen, logarithms, when)[:, None, None]
-
-    def merge(self, other: Self) -> None:
-        """The larger one."""
-        self._evidence.merge(other._evidence)
-        self._samples += other._samples
-        if abs(other._largest) > abs(self._largest):
-            self._largest, self._agent, self._place = other._largest, other._agent, other._place.later(self._runs)
-        self._runs += other._runs
-
-    def finding(self) -> Finding | None:
-        """The largest."""
-        if not self._samples:
-            return None
-        log_p = math.log(2.0 * self._samples) + float(log_normal_tail(abs(self._largest)))
-        return Finding(
-            self.test, min(0.0, log_p), agent=self._agent, place=self._place, estimate=self._largest, expected=0.0
-        )
-
-    def evidence(self) -> FloatArray:
-        """(1, 1)."""
-        return np.array([[self._evidence.logarithm()]]) if self._evidence.planned else np.empty((0, 1))
-
-    def questions(self) -> list[Question]:
-        """One, about all agents."""
-        return [("largest innovation", ())]

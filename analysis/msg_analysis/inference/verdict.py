@@ -5,26 +5,27 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.inference.candidates import Cause
-from msg_analysis.inference.causes import Accused, find_causes
-from msg_analysis.inference.comparison import Comparison, Test, trusted
+from msg_analysis.inference.comparison import Comparison, trusted
+from msg_analysis.inference.e_values import log_mean
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates, rank_agents
 from msg_analysis.inference.evidence import Evidence
+from msg_analysis.inference.evidence_sums import AnyTimeEvidence, any_time_evidence
 from msg_analysis.inference.given_path import GivenPath
-from msg_analysis.inference.messages import loss_test
+from msg_analysis.inference.losses import loss_test
 from msg_analysis.inference.observation import Measurement, Observation, spaced_steps
+from msg_analysis.inference.question import Finding, Search, Statistics
+from msg_analysis.inference.questions import causes_of, decide
 from msg_analysis.inference.residuals import InnovationTests
-from msg_analysis.inference.sequential_sums import AnyTimeEvidence, any_time_evidence
-from msg_analysis.inference.statistics import batch_interval, holm, steps_to_half_width
-from msg_analysis.inference.switching import switching_test
+from msg_analysis.inference.statistics import batch_interval, steps_to_half_width
 from msg_analysis.inference.time_means import TimeMeans
+from msg_analysis.inference.transitions import switching_test
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.jump_system import JumpSystem
@@ -72,37 +73,34 @@ def judge(
     prediction: Prediction,
     evidence: Evidence,
     level: float,
-    more: Sequence[tuple[str, float | None]] = (),
+    p_alike: float | None = None,
 ) -> Comparison:
-    """The verdict on the evidence of one run, or of several; ``more`` has names and p-values of further tests.
+    """The verdict on the evidence of one run, or of several, of which ``p_alike`` is the p-value of their being alike.
 
     Of several runs, ``trajectory`` is one with the completeness of all.
     """
     means, lockstep = evidence.means, prediction.experiment.run.pace == "lockstep"
     system_error, node_errors = _over_all_paths(means, prediction.system)
     covariance = _covariance(evidence, prediction.system)
-    innovations = evidence.innovations.tests()
-    switching = evidence.transitions.test(prediction.step.transition)
-    loss = evidence.loss.test() if evidence.loss else None
-    p_broadcast = evidence.broadcast.p_value() if evidence.broadcast else None
-    family = [
-        *_error_tests(evidence.exact, prediction.system),
-        ("covariance", covariance.p if evidence.decisive else None),
-        ("innovations: covariance", innovations.p_covariance),
-        ("innovations: whiteness", innovations.p_whiteness),
-        ("innovations: gains", innovations.p_gain),
-        ("innovations: common gain", innovations.p_common_gain),
-        ("switching", switching.p),
-        *((finding.test, math.exp(finding.log_p)) for finding in evidence.watched.findings()),
-        ("loss", loss.p if loss else None),
-        ("broadcast", p_broadcast),
-        *more,
-    ]
-    tests = _judge(family, level)
+    tested_error, tested_nodes = _tested_errors(evidence.exact, prediction.system)
+    run = Statistics(
+        system_error=tested_error,
+        node_errors=tested_nodes,
+        covariance=covariance if evidence.decisive else None,
+        innovations=evidence.innovations.tests(),
+        switching=evidence.transitions.test(prediction.step.transition),
+        loss=evidence.loss.test() if evidence.loss else None,
+        p_broadcast=evidence.broadcast.p_value() if evidence.broadcast else None,
+        findings=evidence.watched.sums.findings(),
+        p_alike=p_alike,
+    )
+    families = evidence.watched.sums.families()
+    logarithms = {name: float(log_mean(logs.reshape(-1))) for name, logs in families.items()}
+    tests = decide(run, level, logarithms)
     rejected = [test.name for test in tests if test.rejected]
     blame: list[Cause] = []
     if rejected and trajectory.completeness.complete:
-        blame = find_causes(_accused(prediction, evidence), level, rejected)
+        blame = causes_of(_search(prediction, evidence, run.findings, level), rejected)
     return Comparison(
         trajectory=trajectory,
         level=level,
@@ -110,33 +108,35 @@ def judge(
         system_error=system_error,
         node_errors=node_errors,
         covariance=covariance,
-        innovations=innovations,
-        switching=switching,
+        innovations=run.innovations,
+        switching=run.switching,
         continuous_error=prediction.continuous.system_error if prediction.continuous_moments else None,
         batch=batch_interval(means.system_series),
         tests=tests,
         running=_running(means, prediction.step.dt),
-        loss=loss,
-        p_broadcast=p_broadcast,
+        loss=run.loss,
+        p_broadcast=run.p_broadcast,
         timing=evidence.timing,
         laws=evidence.laws,
         given=GivenPath(means, evidence.given) if evidence.given else None,
         order=rank_agents(means, level) if means.long_enough else None,
         blame=blame,
-        any_time=_any_time(trajectory.record, prediction, evidence, level),
+        any_time=_any_time(trajectory.record, prediction, evidence, level, families),
         trust=trusted(prediction, means, given=evidence.given is not None) if lockstep else None,
     )
 
 
-def _any_time(record: RunRecord, prediction: Prediction, evidence: Evidence, level: float) -> AnyTimeEvidence:
+def _any_time(
+    record: RunRecord, prediction: Prediction, evidence: Evidence, level: float, families: dict[str, FloatArray]
+) -> AnyTimeEvidence:
     """The interval is tuned by what was known before the run, whatever step it ended at."""
-    means, names = evidence.means, [graph.name for graph in record.experiment.graph_list]
+    means = evidence.means
     variance = float(means.system_variances.sum()) if means.long_enough else None
     planned, error = float(record.planned_steps), evidence.watched.sums.error
     if record.until and error is not None:
         wanted = record.until.precision * prediction.emulated.system_error
         planned = min(planned, steps_to_half_width(error.variance, wanted))
-    return any_time_evidence(evidence.watched, level, names, variance, evidence.steps, planned)
+    return any_time_evidence(evidence.watched, level, families, variance, evidence.steps, planned)
 
 
 def _over_all_paths(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Estimate]]:
@@ -147,13 +147,11 @@ def _over_all_paths(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, lis
     return error.without_error(), [node.without_error() for node in nodes]
 
 
-def _error_tests(laws: Sequence[TimeMeans], system: JumpSystem) -> list[tuple[str, float | None]]:
-    """Names and p-values of the tests of the errors; ``laws`` in the order of preference."""
+def _tested_errors(laws: Sequence[TimeMeans], system: JumpSystem) -> tuple[Estimate | None, list[Estimate]]:
+    """The errors as they are tested; ``laws`` in the order of preference."""
     if not laws:
-        return []
-    system_error, nodes = estimates(next((law for law in laws if len(law.nodes)), laws[0]), system)
-    named = [(f"error of agent {i}", node.p) for i, node in enumerate(nodes, start=1)]
-    return [("system error", system_error.p), *named]
+        return None, []
+    return estimates(next((law for law in laws if len(law.nodes)), laws[0]), system)
 
 
 def _covariance(evidence: Evidence, system: JumpSystem) -> CovarianceTest:
@@ -163,9 +161,9 @@ def _covariance(evidence: Evidence, system: JumpSystem) -> CovarianceTest:
     return replace(tested, measured=shown.measured, predicted=shown.predicted)
 
 
-def _accused(prediction: Prediction, evidence: Evidence) -> Accused:
+def _search(prediction: Prediction, evidence: Evidence, findings: Mapping[str, Finding], level: float) -> Search:
     experiment = prediction.experiment
-    return Accused(
+    return Search(
         names=[graph.name for graph in experiment.graph_list],
         chain=experiment.chain,
         dt=experiment.step_length,
@@ -174,7 +172,8 @@ def _accused(prediction: Prediction, evidence: Evidence) -> Accused:
         transitions=evidence.transitions,
         loss=evidence.loss,
         broadcast=evidence.broadcast,
-        departures=evidence.watched.findings(),
+        findings=findings,
+        level=level,
     )
 
 
@@ -185,9 +184,15 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
     if measurement.steps < MIN_STEPS and not trajectory.completeness.complete:
         enough = False
     series, covariance = measurement.system_series, measurement.covariance if enough else None
-    switching = switching_test(measurement.modes, measurement.step.transition) if enough else None
-    loss = loss_test(measurement) if enough else None
-    family = [("switching", switching.p if switching else None), ("loss", loss.p if loss else None)]
+    run = Statistics(
+        system_error=None,
+        node_errors=(),
+        covariance=None,
+        innovations=InnovationTests(None, None, None),
+        switching=switching_test(measurement.modes, measurement.step.transition) if enough else None,
+        loss=loss_test(measurement) if enough else None,
+        p_broadcast=None,
+    )
     nodes = [Estimate()] * agents if covariance is None else [Estimate(float(error)) for error in np.diag(covariance)]
     counts = spaced_steps(len(series)) if enough else np.empty(0, np.int64)
     return Comparison(
@@ -197,17 +202,17 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
         system_error=Estimate() if covariance is None else Estimate(float(np.trace(covariance))),
         node_errors=nodes,
         covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
-        innovations=InnovationTests(None, None, None),
-        switching=switching,
+        innovations=run.innovations,
+        switching=run.switching,
         continuous_error=None,
         batch=batch_interval(series) if enough else None,
-        tests=_judge(family, level),
+        tests=decide(run, level),
         running={
             "time": np.asarray((measurement.first + counts) * measurement.step.dt, dtype=float),
             "system_error": np.cumsum(series)[counts - 1] / counts if enough else np.empty(0),
             "standard_error": np.zeros(len(counts)),
         },
-        loss=loss,
+        loss=run.loss,
         unpredicted=unpredicted,
         transient=measurement.first if enough else None,
     )
@@ -230,13 +235,6 @@ def without_numbers(trajectory: Run, level: float, prediction: Prediction, steps
         tests=[],
         running={key: np.empty(0) for key in ("time", "system_error", "standard_error")},
     )
-
-
-def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:
-    # A NaN statistic (a log with numbers too large to compute with) counts as p = 0: the law never gives one.
-    tested = [(name, 0.0 if math.isnan(p) else p) for name, p in family if p is not None]
-    adjusted = holm(np.array([p for _, p in tested], dtype=float))
-    return [Test(name, p, float(a), bool(a < level)) for (name, p), a in zip(tested, adjusted, strict=True)]
 
 
 def _running(means: TimeMeans, dt: float) -> dict[str, FloatArray]:

@@ -25,7 +25,7 @@ from msg_analysis.common.arrays import BoolArray
 from msg_analysis.common.text import counted, percent
 
 if TYPE_CHECKING:
-    from msg_analysis.inference.messages import UnheardMessages
+    from msg_analysis.inference.timing import UnheardMessages
 
 
 MOST_Z = 5.0  # of the packets that a pair lost; by chance, any of 1000 pairs is beyond it in 0.06 % of all runs

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from msg_agents.channel.process import channel_findings
-from msg_analysis.inference.messages import UnheardMessages
+from msg_analysis.inference.timing import UnheardMessages
 
 
 def pair(sender: str, receiver: str, **changes: Any) -> dict[str, Any]:

@@ -15,20 +15,20 @@ from scipy import stats
 from tests.support.switching_systems import LINE_RING
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.dependence import LongLags, StandingStill
-from msg_analysis.inference.diagnostics import Departure, Law
+from msg_analysis.inference.dependence import ConstantState, LongLags
 from msg_analysis.inference.e_values import Looks, WindowEvidence, Windows, variance_evidence
+from msg_analysis.inference.evidence_sums import EvidenceSums
+from msg_analysis.inference.graphs import PARTS, HoldingTimes, SwappedGraphs
 from msg_analysis.inference.messages import StaleValues
-from msg_analysis.inference.noise_diagnostics import NoiseByGraph, NoiseOverTime
+from msg_analysis.inference.noise import LargestResidual, NoiseByGraph, NoiseOverTime
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.residuals import LargestInnovation
-from msg_analysis.inference.sequential_sums import EvidenceSums
-from msg_analysis.inference.switching import PARTS, Sojourns, SwappedGraphs
+from msg_analysis.inference.question import Diagnostic, Law
 from msg_analysis.inference.verdict import compare
+from msg_analysis.model.step_model import StepModel
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
 
-Kind = TypeVar("Kind", bound=Departure)
+Kind = TypeVar("Kind", bound=Diagnostic)
 AIR = {"process": 1.0, "loss": 0.3, "link": 0.2, "broadcast": 0.1}
 
 
@@ -43,8 +43,7 @@ def summed(observation: Observation, kind: type[Kind], size: int = 37) -> Kind:
     sums = EvidenceSums(observation.prediction, observation.replicas, in_detail=True)
     for first in range(0, observation.steps, size):
         sums.add(observation, first, min(first + size, observation.steps))
-    assert sums.departures is not None
-    return next(each for each in sums.departures.kinds if isinstance(each, kind))
+    return next(each for each in sums.diagnostics if isinstance(each, kind))
 
 
 def whitened(observation: Observation) -> np.ndarray:
@@ -124,9 +123,15 @@ THREE = [[0.8, 0.1, 0.1], [0.3, 0.5, 0.2], [0.2, 0.2, 0.6]]
 SLOW = [[0.95, 0.05], [0.05, 0.95]]
 
 
-def sojourns(transition: list[list[float]], steps: int) -> Sojourns:
+def sojourns(transition: list[list[float]], steps: int) -> HoldingTimes:
     """Sums of the law of an experiment in discrete time."""
-    return Sojourns(law_of(json.dumps(transition), steps))
+    return HoldingTimes(law_of(json.dumps(transition), steps))
+
+
+def made(step: StepModel, steps: int, replicas: int, noisy: np.ndarray) -> Law:
+    """Of a run without links that are asked about."""
+    none = np.empty((0, 2), np.int64)
+    return Law(step, ["a", "b"], steps, replicas, noisy, True, none, True, none, none, none)
 
 
 @functools.cache
@@ -145,7 +150,7 @@ def law_of(transition: str, steps: int) -> Law:
     )
     prediction = predict(law)
     noisy = np.ones(3, dtype=np.bool_)
-    return Law(prediction.step, steps, 1, noisy, True, np.empty((0, 2), np.int64), True)
+    return made(prediction.step, steps, 1, noisy)
 
 
 def test_sojourns_are_counted_as_by_a_loop() -> None:
@@ -210,10 +215,10 @@ def test_noise_by_graph() -> None:
     finding = sums.finding()
     assert finding is not None
     assert np.exp(finding.log_p) == pytest.approx(min(1.0, 12 * min(p)))
-    words = [text.format(*("ab"[g] for g in graphs)) for text, graphs in sums.questions()]
-    assert words[0] == "noise of agent 1 in graph a"
-    assert words[11] == "noise of all agents in graph b"
-    assert len(sums.evidence()) == 12
+    names = sums.law.graphs
+    assert sums.about(0) == f"noise of agent 1 in graph {names[0]}"
+    assert sums.about(11) == f"noise of all agents in graph {names[1]}"
+    assert len(sums.logarithms()) == 12
 
 
 def test_noise_over_time_by_windows() -> None:
@@ -239,7 +244,7 @@ def test_noise_over_time_by_windows() -> None:
     assert np.exp(finding.log_p) == pytest.approx(p, rel=1e-6)  # of 100 steps no lag has enough products
     assert (finding.place.first, finding.place.last) == (first + 1, first + 2**level)
     assert finding.agent == agent
-    assert np.exp(sums.evidence()[:6, 0]) == pytest.approx(evidence)
+    assert np.exp(sums.logarithms()[:6, 0]) == pytest.approx(evidence)
 
 
 @pytest.mark.parametrize("agent", [2, None])
@@ -249,7 +254,7 @@ def test_noise_over_time_by_lags(agent: int | None) -> None:
     white, size = whitened(observation), 0.3 if agent is None else 0.8
     which = slice(None) if agent is None else slice(agent, agent + 1)
     white[:, which] *= np.sqrt(1.0 + size * np.sin(2.0 * np.pi * np.arange(1200) / 10.0))[:, None, None]
-    sums = NoiseOverTime(Law(observation.step, 1200, 2, np.ones(5, dtype=bool), True, np.empty((0, 2), int), True))
+    sums = NoiseOverTime(made(observation.step, 1200, 2, np.ones(5, dtype=bool)))
     for first in range(0, 1200, 37):
         part = SimpleNamespace(
             first=first, white=white[first : first + 37], looks=Looks.at_the_end(min(37, 1200 - first))
@@ -274,17 +279,16 @@ def test_noise_over_time_by_lags(agent: int | None) -> None:
     assert np.exp(finding.log_p) == pytest.approx(min(p))
     assert (finding.agent, finding.span) == (agent, (lag, lag))
     assert column == (5 if agent is None else agent)
-    assert np.exp(sums.evidence()[6:, 0]) == pytest.approx(evidence.sum(axis=0))
-    words = [text for text, _ in sums.questions()]
-    assert words[8] == "size of the noise of agent 3 and of its own earlier noise"
-    assert len(words) == len(sums.evidence())
+    assert np.exp(sums.logarithms()[6:, 0]) == pytest.approx(evidence.sum(axis=0))
+    assert sums.about(8) == "size of the noise of agent 3 and of its own earlier noise"
+    assert len(sums.logarithms()) == 12
 
 
 def test_standing_still() -> None:
     observation = observed()
     for k in (*range(30, 45), 70, 80):
         observation.states[k + 1, 3] = observation.states[k, 3]
-    sums = summed(observation, StandingStill)
+    sums = summed(observation, ConstantState)
     finding = sums.finding()
     assert finding is not None
     assert finding.place is not None
@@ -294,15 +298,15 @@ def test_standing_still() -> None:
         for k in (*range(30, 45), 70, 80)
     ]
     expected = np.log(0.5 * (1.0 + np.sum(1.0 / np.array(q)) / (5 * 400)))
-    assert sums.evidence()[0, 0] == pytest.approx(expected)
+    assert sums.logarithms()[0, 0] == pytest.approx(expected)
     assert finding.log_p == pytest.approx(-expected)
-    assert summed(observed(), StandingStill).finding().log_p == 0.0  # type: ignore[union-attr]
+    assert summed(observed(), ConstantState).finding().log_p == 0.0  # type: ignore[union-attr]
 
 
 def test_the_largest_innovation() -> None:
     observation = observed()
     observation.states[120, 1, 1] += 8.0 * np.sqrt(0.05)
-    sums, white = summed(observation, LargestInnovation), whitened(observation)
+    sums, white = summed(observation, LargestResidual), whitened(observation)
     finding = sums.finding()
     assert finding is not None
     assert finding.place is not None
@@ -311,7 +315,7 @@ def test_the_largest_innovation() -> None:
     assert np.exp(finding.log_p) == pytest.approx(4000 * 2 * stats.norm.sf(np.abs(white).max()))
     large = white[np.abs(white) > 4.0] ** 2
     mean = np.exp(variance_evidence(np.ones(len(large)), large)[:, 0]).sum() / 4000
-    assert np.exp(sums.evidence()[0, 0]) == pytest.approx(0.5 * (1.0 + mean))
+    assert np.exp(sums.logarithms()[0, 0]) == pytest.approx(0.5 * (1.0 + mean))
 
 
 def test_a_network_that_never_moves() -> None:
@@ -391,13 +395,13 @@ def test_swapped_graphs() -> None:
     ratios = density[1 - observation.modes, every] - density[observation.modes, every]
     counts = [sum(level == each for level, _ in windows_of(100)) for each in range(7)]
     mean = sum(np.exp(ratios[f : f + 2**level].sum()) / (7 * counts[level]) for level, f in windows_of(100))
-    assert np.exp(sums.evidence()[0, 0]) == pytest.approx(mean)
+    assert np.exp(sums.logarithms()[0, 0]) == pytest.approx(mean)
     finding = sums.finding()
     assert finding is not None
     assert np.exp(finding.log_p) == pytest.approx(min(1.0, 1.0 / mean))
     with_losses = summed(observed(noise=AIR), SwappedGraphs)
     assert with_losses.finding() is None
-    assert not with_losses.evidence().size
+    assert not with_losses.logarithms().size
 
 
 def test_runs_are_merged() -> None:
@@ -406,13 +410,13 @@ def test_runs_are_merged() -> None:
     second.states[121, 1, 1] += 2.5
     pairs = [
         (summed(first, kind), summed(second, kind))
-        for kind in (NoiseOverTime, StandingStill, LargestInnovation, SwappedGraphs)
+        for kind in (NoiseOverTime, ConstantState, LargestResidual, SwappedGraphs)
     ]
     for one, other in pairs:
         windows = 6 if isinstance(one, NoiseOverTime) else None  # the others are lags
-        expected = (one.evidence() + other.evidence())[:windows]
+        expected = (one.logarithms() + other.logarithms())[:windows]
         one.merge(other)  # type: ignore[arg-type]
-        assert one.evidence()[:windows] == pytest.approx(expected)
+        assert one.logarithms()[:windows] == pytest.approx(expected)
     largest = pairs[2][0].finding()
     assert largest is not None
     assert largest.place is not None

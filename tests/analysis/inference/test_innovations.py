@@ -6,8 +6,8 @@ from scipy import stats
 
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import residuals as module
-from msg_analysis.inference.gains import regressors
 from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.regression import regressors
 from msg_analysis.inference.residuals import InnovationSums, innovations
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate

@@ -9,10 +9,10 @@ from scipy import stats
 from tests.support.p_values import kolmogorov_smirnov
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.gains import HeardRegression
-from msg_analysis.inference.messages import loss_test
+from msg_analysis.inference.losses import loss_test
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.received_values import HeardValues
+from msg_analysis.inference.regression import HeardRegression
 from msg_analysis.inference.residuals import BroadcastSums, InnovationSums, innovations
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.run_record import RunRecord

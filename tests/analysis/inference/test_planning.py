@@ -11,10 +11,10 @@ import pytest
 import scipy.stats
 
 from msg_analysis import Experiment, InputError, NotAvailableError
+from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.fault_power import Fault, FaultPower, StepInformation, fault_powers
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.sample_size import REPLICAS
-from msg_analysis.inference.sequential_sums import EvidenceSums
 from msg_analysis.inference.statistics import needed_noncentrality, noncentral_chi2_tail, simultaneous_half_width
 from msg_analysis.inference.time_means import time_means
 from msg_analysis.inference.verdict import compare

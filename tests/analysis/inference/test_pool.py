@@ -15,7 +15,7 @@ from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.inference.residuals import innovations
 from msg_analysis.inference.statistics import quadratic_form
-from msg_analysis.inference.switching import Transitions
+from msg_analysis.inference.transitions import Transitions
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.run import Completeness
 from msg_analysis.theory.prediction import predict

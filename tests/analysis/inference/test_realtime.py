@@ -13,9 +13,9 @@ from msg_analysis.common.text import percent
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.event_order import order_events
-from msg_analysis.inference.gains import HeardRegression
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.received_values import HeardValues, process_noise
+from msg_analysis.inference.regression import HeardRegression
 from msg_analysis.inference.residuals import InnovationSums, innovations
 from msg_analysis.inference.timing import measure_timing
 from msg_analysis.inference.verdict import compare

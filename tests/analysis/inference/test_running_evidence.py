@@ -12,10 +12,10 @@ from tests.support import line_and_ring
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import online_errors, online_evidence
 from msg_analysis.inference.estimates import Estimate
+from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.online_errors import LiveEstimate, LiveReport, precision_words, reached
 from msg_analysis.inference.online_evidence import AnyTime, HeardEvidence, RunningEvidence, supports
-from msg_analysis.inference.sequential_sums import EvidenceSums
 from msg_analysis.inference.statistics import RunningBatches, simultaneous_half_width, steps_to_half_width
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.run_record import RunRecord, Until

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.messages import unheard_messages
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.timing import measure_timing
+from msg_analysis.inference.timing import measure_timing, unheard_messages
 from msg_analysis.model.reception import Losses
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate

@@ -6,28 +6,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
-from msg_analysis.inference.all_diagnostics import Departures
 from msg_analysis.inference.dependence import LAGS
-from msg_analysis.inference.diagnostics import Block, Finding, Law
-from msg_analysis.inference.e_values import Looks, log_mean
+from msg_analysis.inference.e_values import Looks, log_mean, log_means, log_sum
 from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.question import Block, Diagnostic, Finding, Law, RunningSums
+from msg_analysis.inference.questions import QUESTIONS, evidence_weights
 from msg_analysis.inference.received_values import NO_NOISE, HeardValues, process_noise
 from msg_analysis.inference.residuals import QUIET_ROUNDING, innovations
-from msg_analysis.inference.sequential_questions import (
-    ErrorMartingale,
-    LawQuestions,
-    Question,
-    RunningSums,
-    question_words,
-)
 from msg_analysis.inference.statistics import simultaneous_half_width
+from msg_analysis.inference.system_error import ErrorMartingale
 from msg_analysis.inference.time_means import moments
 from msg_analysis.model.reception import neighbour_tables
 from msg_analysis.theory.prediction import Prediction
@@ -38,12 +32,11 @@ FARTHEST = 1e4
 
 
 class EvidenceSums:
-    """Sums for the families of questions, each of which counts the same in the evidence on the whole law:
+    """Sums for the evidence of all questions.
 
-    "noise" of an agent, "gain" of a link or of a leader's pull, "gains" of all at once, "pair" of noises, "switching"
-    away from a graph, "loss" of a link, "broadcast" noise of an agent, "system error". Given its past and, on the air
-    and in real time, what was heard, each is exact; the system error only in lockstep without noise or loss on the air.
-    With ``in_detail``, the kinds of ``departures`` are added, which take as much time as all others together.
+    Given its past and, on the air and in real time, what was heard, each is exact; the system error only in lockstep
+    without noise or loss on the air. With ``in_detail``, the diagnostics are asked, too, which take as much time as all
+    others together.
     """
 
     def __init__(self, prediction: Prediction, replicas: int, *, in_detail: bool = False) -> None:
@@ -68,28 +61,29 @@ class EvidenceSums:
         paired = usable[first] & usable[second] & (len(first) <= MOST_PAIRS) & (not correlated)
         independent_losses = step.burst is None and not real_time
         self.error = ErrorMartingale.of(prediction, replicas) if self.plain else None
-        self._asked = LawQuestions(
-            transition=step.transition,
-            losses=step.losses,
-            noisy=np.flatnonzero(noisy),
-            links=np.argwhere((step.listens() | np.diag(pull)) & usable[:, None]),
+        self._law = law = Law(
+            step=step,
+            graphs=[graph.name for graph in experiment.graph_list],
+            planned=experiment.steps,
+            replicas=replicas,
+            noisy=noisy,
+            apart=bool(usable.any()) and not correlated,
+            links=np.argwhere(step.listens() & usable[:, None]),
+            plain=self.plain,
+            gains=np.argwhere((step.listens() | np.diag(pull)) & usable[:, None]),
             pairs=np.column_stack([first[paired], second[paired]]),
-            common=bool(usable.any()) and not correlated,
             lossy=np.argwhere(step.listens() & (step.losses > 0.0) & independent_losses),
-            error=self.error is not None and len(self.error.rates) > 0,
         )
+        asked = [kind for kind in QUESTIONS if in_detail or not issubclass(kind, Diagnostic)]
+        self.questions = {kind.name: kind(law) for kind in asked}
+        self.diagnostics = [each for each in self.questions.values() if isinstance(each, Diagnostic)]
         self.total = self._zeros(1)
-        self.departures: Departures | None = None
-        if in_detail:
-            heard = np.argwhere(step.listens() & usable[:, None])
-            law = Law(step, experiment.steps, replicas, noisy, self._asked.common, heard, self.plain)
-            self.departures = Departures(law)
 
     @property
     def numbers_per_look(self) -> int:
         """Of temporary arrays, when a run is looked at."""
         m, n = self._step.agents, self._step.modes
-        lags = 10 * LAGS * (m + 1) if self.departures else 0
+        lags = 10 * LAGS * (m + 1) if self.diagnostics else 0
         return 8 * m**2 + n**2 + lags
 
     def add(
@@ -110,8 +104,8 @@ class EvidenceSums:
         heard: tuple[HeardValues, FloatArray] | None = None,
     ) -> FloatArray:
         """Add steps as ``add`` does: (T,) logs of the evidence against the whole law after each look."""
-        running, departures = self._add(observation, first, last, looks, heard)
-        return self._asked.log_evidence(running, self._asked.families(running) | departures)
+        running, known = self._add(observation, first, last, looks, heard)
+        return self._log_evidence(running, self._families(running, known))
 
     def _add(
         self,
@@ -121,20 +115,19 @@ class EvidenceSums:
         looks: Looks,
         heard: tuple[HeardValues, FloatArray] | None,
     ) -> tuple[RunningSums, dict[str, FloatArray]]:
-        """The sums and the evidence of departures after each look."""
+        """The sums and the evidence of the diagnostics after each look."""
         # One look needs no copies of what may be large.
         parts = self.total if looks.count == 1 else self._zeros(looks.count)
-        departures: dict[str, FloatArray] = {}
+        found: dict[str, FloatArray] = {}
         quadratic = self._quadratic and self._near(observation.states[first : last + 1])
         if quadratic:
             self._add_quadratic(parts, looks, observation, first, last)
-        if self.departures or not quadratic:
+        if self.diagnostics or not quadratic:
             block = self._block(parts, looks, observation, first, last, heard)
             if not quadratic:
                 lost = None if observation.lost is None else observation.lost[first:last]
                 self._add_heard(parts, looks, block.reception, block.white, block.scale, lost)
-            if self.departures:
-                departures = self.departures.add(block)
+            found = {each.name: each.add(block) for each in self.diagnostics}
         graphs = observation.modes[first : last + 1]
         now, following = graphs[:-1], graphs[1:]
         look = looks.after(np.arange(len(now)))
@@ -147,11 +140,11 @@ class EvidenceSums:
             steps = np.zeros((last - first, len(self.error.rates)))
             steps[: len(now)] = self.error.steps(now, following, a[:-1], a[1:])
             parts.error += looks.sums(steps)
-        if looks.count == 1:
-            return self.total, departures
-        running = self.total.then(parts)
-        self.total = running.last()
-        return running, departures
+        running = self.total
+        if looks.count > 1:
+            running = self.total.then(parts)
+            self.total = running.last()
+        return running, found
 
     def _zeros(self, looks: int) -> RunningSums:
         rates = 0 if self.error is None else len(self.error.rates)
@@ -229,10 +222,10 @@ class EvidenceSums:
             information[:, diagonal, diagonal] += own**2 * size
             parts.link_score[there] += score
             parts.link_information[there] += information
-            if len(self._asked.pairs):
+            if len(self._law.pairs):
                 parts.pair_score[there] += products
                 parts.pair_information[there] += squares[:, None, :]
-            if self._asked.common:
+            if self._law.apart:
                 common = weights + np.diag(own - weights.sum(axis=1))
                 parts.common_score[there] += (common * seen).sum(axis=(1, 2))
                 parts.common_information[there] += ((common @ now_now) * common).sum(axis=(1, 2))
@@ -277,7 +270,7 @@ class EvidenceSums:
         """Noise, pairs, and of gains and losses the regressors, over the standard deviation of the noise."""
         parts.samples += looks.counts(np.where(np.isinf(scale), 0, white.shape[2]))
         parts.squares += looks.sums((white**2).sum(axis=2))
-        if len(self._asked.pairs):
+        if len(self._law.pairs):
             for look, (begin, end) in enumerate(zip(looks.begins.tolist(), looks.ends.tolist(), strict=True)):
                 flat = white[begin:end].transpose(1, 0, 2).reshape(len(white[0]), -1)
                 products = flat @ flat.T
@@ -301,35 +294,60 @@ class EvidenceSums:
             place = (receivers + reception.senders[:, :, d])[there]  # in one dimension: many times as fast
             np.add.at(parts.link_score.reshape(-1), place, (part * white).sum(axis=2)[there])
             np.add.at(parts.link_information.reshape(-1), place, (part**2).sum(axis=2)[there])
-            if lost is not None and len(self._asked.lossy):
+            if lost is not None and len(self._law.lossy):
                 np.add.at(parts.messages.reshape(-1), place, 1)
                 np.add.at(parts.lost.reshape(-1), place, lost[:, :, d][there])
-        if self._asked.common:
+        if self._law.apart:
             parts.common_score += looks.sums((common * white).sum(axis=(1, 2)))
             parts.common_information += looks.sums((common**2).sum(axis=(1, 2)))
 
     def merge(self, other: EvidenceSums) -> None:
         """Add the sums of another run of the same experiment, with another seed."""
         self.total.merge(other.total)
-        if self.departures and other.departures:
-            self.departures.merge(other.departures)
+        for mine, its in zip(self.diagnostics, other.diagnostics, strict=True):
+            mine.merge(its)
 
     def families(self) -> dict[str, FloatArray]:
-        """For each kind the evidence on its questions, logarithms (questions, alternatives)."""
-        found = {kind: logarithms[0] for kind, logarithms in self._asked.families(self.total).items()}
-        return found | self.departures.families() if self.departures else found
+        """By name of the question, the evidence so far, logarithms (rows, alternatives)."""
+        return {name: logarithms[0] for name, logarithms in self._families(self.total, {}).items()}
 
-    def question(self, kind: str, row: int) -> Question:
-        """What a row of ``families`` is about."""
-        return self._asked.question(kind, row)
+    def _families(self, sums: RunningSums, known: dict[str, FloatArray]) -> dict[str, FloatArray]:
+        """By name of the question, where it has evidence, logarithms (T, rows, alternatives); some are ``known``."""
+        each = {
+            name: known[name] if name in known else question.evidence(sums) for name, question in self.questions.items()
+        }
+        return {name: logarithms for name, logarithms in each.items() if logarithms.size}
+
+    def weights(self, names: Iterable[str]) -> FloatArray:
+        """Of questions with these names in the evidence."""
+        return evidence_weights([self.questions[name].main for name in names])
+
+    def strongest(self, families: dict[str, FloatArray]) -> list[tuple[str, float]]:
+        """For each question its row with the most evidence, in words, and its logarithm."""
+        found = []
+        for name, logarithms in families.items():
+            each = log_mean(logarithms, axis=1)
+            best = int(np.argmax(each))
+            found.append((self.questions[name].about(best), float(each[best])))
+        return found
+
+    def findings(self) -> dict[str, Finding]:
+        """By name of the diagnostic, its clearest deviation, of those with something to test."""
+        return {each.name: found for each in self.diagnostics if (found := each.finding())}
 
     def evidence(self, families: dict[str, FloatArray] | None = None) -> float:
-        """Log of the evidence against the whole law: the weighted mean over the kinds of the mean over questions.
+        """Log of the evidence against the whole law; ``families``: where they are known."""
+        families = self.families() if families is None else families
+        return float(self._log_evidence(self.total, {name: found[None] for name, found in families.items()})[0])
 
-        ``families``: where they are known.
-        """
-        families = {kind: logarithms[None] for kind, logarithms in (families or self.families()).items()}
-        return float(self._asked.log_evidence(self.total, families)[0])
+    def _log_evidence(self, sums: RunningSums, families: dict[str, FloatArray]) -> FloatArray:
+        """(T,): the weighted mean over the questions of the mean over their rows, after each look."""
+        total = np.zeros(len(sums.impossible))
+        if families:
+            total = log_sum(log_means(list(families.values())) + np.log(self.weights(families)), axis=1)
+        never = sums.lost[:, self._step.losses == 0.0].any(axis=1)
+        total[never | (sums.impossible > 0)] = np.inf
+        return total
 
 
 LARGEST_LOGARITHM = 700.0  # evidence beyond is not shown as a number: floating point ends there
@@ -351,10 +369,6 @@ class WatchedEvidence:
         for first, last in observation.blocks(watch.numbers_per_step, "evidence"):
             watch.add(first, last)
         return watch.result()
-
-    def findings(self) -> list[Finding]:
-        """The clearest departure of each kind that is tested."""
-        return self.sums.departures.findings() if self.sums.departures else []
 
     def merged(self, other: WatchedEvidence) -> WatchedEvidence:
         """Of these and other runs of the same experiment; the sums of ``self`` are changed in place."""
@@ -415,8 +429,8 @@ class AnyTimeEvidence:
     half_width: float | None  # of the 95 % interval of the system error that holds at all times at once
 
     @property
-    def disagrees(self) -> bool:
-        """Whether the threshold is passed, or was."""
+    def exceeded(self) -> bool:
+        """Whether the threshold is exceeded, or was."""
         return self.crossed is not None or self.log_evidence >= math.log(self.threshold)
 
     def to_json(self) -> dict[str, Any]:
@@ -426,7 +440,7 @@ class AnyTimeEvidence:
             "evidence": math.exp(self.log_evidence) if small else None,
             "log_evidence": self.log_evidence,
             "threshold": self.threshold,
-            "disagrees": self.disagrees,
+            "disagrees": self.exceeded,
             "crossed_at": self.crossed,
             "questions": [{"about": words, "log_evidence": log} for words, log in self.questions],
             "half_width": self.half_width,
@@ -436,7 +450,7 @@ class AnyTimeEvidence:
 def any_time_evidence(
     watched: WatchedEvidence,
     level: float,
-    graphs: Sequence[str],
+    families: dict[str, FloatArray] | None = None,
     variance: float | None = None,
     steps: int | None = None,
     planned: float | None = None,
@@ -449,8 +463,8 @@ def any_time_evidence(
         of one run or several
     level
         probability that the threshold 1 / level is ever passed by a run that follows its law, at most
-    graphs
-        their names
+    families
+        of the sums, where they are known
     variance, steps, planned
         sum of Var(D_k) of the system error over so many steps, and the number of steps at which its interval is to be
         narrowest, chosen before the run; None where it is not known
@@ -461,13 +475,7 @@ def any_time_evidence(
         time = np.asarray(watched.steps * watched.dt, dtype=float)
         over = np.flatnonzero(watched.logarithms >= math.log(threshold))
         crossed = float(time[over[0]]) if len(over) else None
-    questions, families = [], sums.families()
-    for kind, logarithms in families.items():
-        each = log_mean(logarithms, axis=1)
-        best = int(np.argmax(each))
-        words = sums.departures.question(kind, best, graphs) if sums.departures else None
-        words = words or question_words(sums.question(kind, best), graphs)
-        questions.append((words, float(each[best])))
+    families = sums.families() if families is None else families
     half_width = None
     if variance and steps and planned and sums.error is not None:
         half_width = float(simultaneous_half_width(variance, sums.error.variance * planned)) / steps
@@ -477,6 +485,6 @@ def any_time_evidence(
         crossed=crossed,
         time=time,
         log_curve=watched.logarithms,
-        questions=sorted(questions, key=lambda entry: -entry[1]),
+        questions=sorted(sums.strongest(families), key=lambda entry: -entry[1]),
         half_width=half_width,
     )

@@ -1,0 +1,269 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Regression of the gains of links on the values that were used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.received_values import HeardValues, mode_links, process_noise
+from msg_analysis.model.reception import neighbour_tables
+from msg_analysis.model.step_model import StepModel
+
+MAX_REGRESSORS = 400
+WEIGHT_ROUNDING = 1e-12  # relative to the sum of an agent's weights
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One regressor of the innovations of an agent."""
+
+    # "link": x_j - x_i; "lead": x_i - reference; "pull": the whole pull on the agent
+    kind: Literal["constant", "link", "lead", "pull"]
+    agent: int  # i
+    graph: int | None = None  # the graph in whose steps it is not 0; None: all
+    sender: int | None = None  # j of a link
+    weight: float = 1.0  # its factor in the law; a gain wrong by a share s has the coefficient s * weight
+
+
+class StateRegression:
+    """Score test: the innovations of row i do not depend on what row i of W_g uses; at most ``most`` terms K.
+
+    The scores U_a = sum_k e_i(a)(k) phi_a(k) are martingales, and Cov(U_a, U_b) = sum_k (N_g)_i(a)i(b) phi_a phi_b
+    given the inputs; so U^T Cov^+ U is chi-square with rank(Cov) degrees of freedom, for correlated noise too. All
+    regressors are linear in z, the deviations of the agents and a constant 1.
+    """
+
+    def __init__(self, observation: Observation, most: int = MAX_REGRESSORS) -> None:
+        self._step = step = observation.step
+        self._rows, self._regressors, self.terms = regressors(step, most)
+        self._centred = observation.prediction.experiment.problem == "consensus"
+        size = step.agents + 1
+        self._scores = np.zeros((step.modes, step.agents, size))  # sum of e z^T
+        self._inputs = np.zeros((step.modes, size, size))  # sum of z z^T
+
+    @property
+    def numbers_per_step(self) -> int:
+        """Size of the largest temporary array, per step; 0: not limiting."""
+        return 0
+
+    def add(self, modes: IntArray, states: FloatArray, innovations: FloatArray) -> None:
+        """Add a block of steps: graphs (b,) from 0, states x(k) and innovations (b, m, R)."""
+        m = self._step.agents
+        z = np.ones((len(modes), m + 1, states.shape[2]))
+        z[:, :m] = states - (states.mean(axis=1, keepdims=True) if self._centred else self._step.reference)
+        for mode in range(self._step.modes):
+            at = np.flatnonzero(modes == mode)
+            flat_e = innovations[at].transpose(1, 0, 2).reshape(m, -1)
+            flat_z = z[at].transpose(1, 0, 2).reshape(m + 1, -1)
+            self._scores[mode] += flat_e @ flat_z.T
+            self._inputs[mode] += flat_z @ flat_z.T
+
+    def statistic(self) -> tuple[FloatArray, FloatArray]:
+        """U (K,) and Cov (K, K)."""
+        rows = self._rows
+        score = np.einsum("gac,gac->a", self._scores[:, rows], self._regressors)
+        return score, self._sum(self._step.noise[:, rows[:, None], rows])
+
+    def gram(self) -> FloatArray:
+        """(K, K): sum of phi_a phi_b of regressors of the same agent; E[U] is that times the coefficients."""
+        same = self._rows[:, None] == self._rows
+        return self._sum(np.broadcast_to(same, (self._step.modes, *same.shape)))
+
+    def _sum(self, factors: FloatArray | BoolArray) -> FloatArray:
+        """(K, K): sum over the steps of phi_a phi_b times a factor (n, K, K) that depends on the graph."""
+        total = np.zeros((len(self._rows),) * 2)
+        for factor, inputs, products in zip(factors, self._regressors, self._inputs, strict=True):
+            total += factor * (inputs @ products @ inputs.T)
+        return total
+
+
+def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[Term]]:
+    """Regressors of the innovations: phi_a(k) = inputs[g, a] . z(k) for row rows[a].
+
+    One for every graph and difference x_j - x_i that row i uses, for every graph and leader (x_i - reference), and for
+    every agent (1, which finds a wrong reference or offset). Where these are more than ``most``: the whole pull (W_g x
+    - x)_i of a row instead of each of its terms; where that is still too many, without distinguishing graphs.
+
+    Parameters
+    ----------
+    step
+        step model of the run
+    most
+        largest number K
+
+    Returns
+    -------
+    tuple[IntArray, FloatArray, list[Term]]
+        rows (K,), inputs (n, K, m + 1), and the terms (K)
+    """
+    n, m = step.modes, step.agents
+    terms = [Term("constant", i) for i in range(m)]
+    sums = step.weights.sum(axis=2)
+    heard = int(step.links.sum(where=~np.eye(m, dtype=np.bool_)))
+    if m + heard + int((np.abs(1.0 - sums) > WEIGHT_ROUNDING).sum()) <= most:
+        for mode in range(n):
+            for i in range(m):
+                for j in step.neighbours(mode, i).tolist():
+                    terms.append(Term("link", i, mode, j, float(step.weights[mode, i, j])))
+                if abs(1.0 - sums[mode, i]) > WEIGHT_ROUNDING:
+                    terms.append(Term("lead", i, mode, None, float(sums[mode, i] - 1.0)))
+    elif m + n * m <= most:
+        terms += [Term("pull", i, mode) for mode in range(n) for i in range(m)]
+    else:
+        terms += [Term("pull", i) for i in range(m)]
+    unit = np.eye(m + 1)
+    pulls = np.zeros((n, m, m + 1))
+    pulls[:, :, :m] = step.weights - np.eye(m)
+    inputs = np.zeros((n, len(terms), m + 1))
+    for a, term in enumerate(terms):
+        modes = slice(None) if term.graph is None else term.graph
+        if term.kind == "pull":
+            inputs[modes, a] = pulls[modes, term.agent]
+        elif term.kind == "link":
+            inputs[modes, a] = unit[term.sender] - unit[term.agent]
+        else:
+            inputs[modes, a] = unit[m if term.kind == "constant" else term.agent]
+    return np.array([term.agent for term in terms]), inputs, terms
+
+
+class HeardRegression:
+    """Score test: innovations do not depend on what the agents heard, with the weights it was used with.
+
+    As ``gain_regression.StateRegression``, but row i uses the differences y_j - x_i of the received values, y_j as
+    published, and the covariance of the innovations is that of each step. In real time the agents make a step one after
+    the other. With correlated noise, a value that is used may contain a part of the noise of the same step; so each
+    innovation is first freed of what those made earlier in the step say about it (``position``, needed only then).
+
+    Parameters
+    ----------
+    observation
+        of a run with noise or loss on the air, or in real time
+    most
+        largest number of regressors K; beyond it, fewer kinds of them are tested
+    position
+        (N, m) order in which the states were made
+    """
+
+    def __init__(self, observation: Observation, most: int, position: IntArray | None = None) -> None:
+        self._step = step = observation.step
+        self._replicas = observation.replicas
+        self._position = position
+        n, m = step.modes, step.agents
+        # Weight of a state's own deviation from the reference: the leaders' pull.
+        self._pull = step.nominal.sum(axis=2) - 1.0
+        leads = np.abs(self._pull) > 1e-12
+        self._links = [mode_links(step, mode) for mode in range(n)]
+        count = m + sum(len(receiver) for receiver, _, _ in self._links) + int(leads.sum())
+        self._each = count <= most
+        if not self._each:
+            count = n * m + m if n * m + m <= most else 2 * m
+        # Index of the regressor of a link, of a leader, or of the whole pull on an agent; by the agent's graph.
+        self._link_place = np.zeros((n, m, step.most_neighbours), dtype=np.int64)
+        self._lead_place = np.full((n, m), -1)
+        self._pull_place = np.zeros((n, m), dtype=np.int64)
+        place = m
+        for mode, (receiver, _, which) in enumerate(self._links):
+            self._pull_place[mode] = np.arange(m) + (m + mode * m if count == n * m + m else m)
+            self._link_place[mode, receiver, which] = np.arange(place, place + len(receiver))
+            place += len(receiver)
+            leaders = np.flatnonzero(leads[mode])
+            self._lead_place[mode, leaders] = np.arange(place, place + len(leaders))
+            place += len(leaders)
+        self._score, self._covariance = np.zeros(count), np.zeros((count, count))
+        self._gram = np.zeros((count, count))
+
+    @property
+    def numbers_per_step(self) -> int:
+        """Size of the largest temporary array, per step."""
+        m, d = self._step.agents, self._step.most_neighbours
+        return max((2 + d) * m * self._replicas, m * d)
+
+    def statistic(self) -> tuple[FloatArray, FloatArray]:
+        """Scores U (K,) and their covariance (K, K)."""
+        return self._score, self._covariance
+
+    def gram(self) -> FloatArray | None:
+        """See ``StateRegression.gram``; None where innovations are freed of earlier ones."""
+        return None if self._position is not None else self._gram
+
+    @property
+    def terms(self) -> list[Term]:
+        """The regressors (K); the weights are the nominal ones."""
+        step = self._step
+        found = [Term("constant", i) for i in range(step.agents)]
+        if not self._each:
+            graphs = range(step.modes) if len(self._score) > 2 * step.agents else [None]
+            return found + [Term("pull", i, graph) for graph in graphs for i in range(step.agents)]
+        for mode, (receiver, sender, _) in enumerate(self._links):
+            links = zip(receiver.tolist(), sender.tolist(), strict=True)
+            found += [Term("link", i, mode, j, float(step.nominal[mode, i, j])) for i, j in links]
+            leaders = np.flatnonzero(self._lead_place[mode] >= 0).tolist()
+            found += [Term("lead", i, mode, None, float(self._pull[mode, i])) for i in leaders]
+        return found
+
+    def add(self, reception: HeardValues, innovations: FloatArray, first: int = 0) -> None:
+        """Add a block of steps, beginning with step ``first``, and their innovations (b, m, R)."""
+        order = None
+        if self._position is not None:
+            order = np.argsort(self._position[first : first + len(innovations)], axis=1)
+        for graphs, agents, at in reception.patterns(order):
+            e, process = innovations[at], process_noise(self._step, graphs)
+            if agents is not None:
+                e, process = _freed(e, process, agents)
+            places, rows, phi = self._regressors(reception, at, graphs)
+            self._score[places] += np.einsum("kar,kar->a", e[:, rows], phi)
+            block = np.ix_(places, places)
+            flat = phi.transpose(1, 0, 2).reshape(len(rows), -1)
+            products = flat @ flat.T
+            self._covariance[block] += process[np.ix_(rows, rows)] * products
+            self._gram[block] += (rows[:, None] == rows) * products
+            if reception.link_variance.any():
+                phi = phi * np.sqrt(reception.link_variance[at])[:, rows, None]
+                flat = phi.transpose(1, 0, 2).reshape(len(rows), -1)
+                self._covariance[block] += (rows[:, None] == rows) * (flat @ flat.T)
+
+    def _regressors(
+        self, reception: HeardValues, at: IntArray, graphs: IntArray
+    ) -> tuple[IntArray, IntArray, FloatArray]:
+        """Places (a,), rows (a,) and values (len(at), a, R): constants of all agents, then what their rows use."""
+        m = self._step.agents
+        agents = np.arange(m)
+        x = reception.states[at]
+        deviation = x - self._step.reference
+        ones = np.ones((len(at), m, x.shape[2]))
+        receivers, which = np.nonzero(np.arange(self._step.most_neighbours) < self._count(graphs)[:, None])
+        differences = reception.heard(at, receivers, which) - x[:, receivers]
+        weights = reception.weights[at[:, None], receivers, which][:, :, None]
+        if self._each:
+            leaders = np.flatnonzero(self._lead_place[graphs, agents] >= 0)
+            places = [agents, self._link_place[graphs[receivers], receivers, which], self._lead_place[graphs, agents]]
+            places[2] = places[2][leaders]
+            rows = np.concatenate([agents, receivers, leaders])
+            parts = [ones, differences * (weights != 0.0), deviation[:, leaders]]
+            return np.concatenate(places), rows, np.concatenate(parts, axis=1)
+        pulled = self._pull[graphs, agents][:, None] * deviation
+        for i in range(m):
+            mine = receivers == i
+            pulled[:, i] += (weights[:, mine] * differences[:, mine]).sum(axis=1)
+        places = [agents, self._pull_place[graphs, agents]]
+        return np.concatenate(places), np.tile(agents, 2), np.concatenate([ones, pulled], axis=1)
+
+    def _count(self, graphs: IntArray) -> IntArray:
+        """(m,): neighbours of the agents."""
+        return np.asarray(neighbour_tables(self._step).count[graphs, np.arange(self._step.agents)])
+
+
+def _freed(e: FloatArray, process: FloatArray, agents: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Innovations less what those of agents earlier in the order say about them; and their covariance (m, m)."""
+    free = np.eye(len(agents))
+    for number, i in enumerate(agents.tolist()):
+        before = agents[:number]
+        free[i, before] = -process[i, before] @ np.linalg.pinv(process[np.ix_(before, before)], hermitian=True)
+    return free @ e, np.diag(np.diag(free @ process @ free.T).clip(0.0))
