@@ -66,7 +66,7 @@ class GivenPath:
 
     @property
     def node_errors(self) -> list[Estimate]:
-        """Corrected for the path, without ``p_holm``; empty where only the system error is estimated."""
+        """Corrected for the path, without ``p_adjusted``; empty where only the system error is estimated."""
         return [self._corrected(one, other) for one, other in zip(self.given.nodes, self.means.nodes, strict=False)]
 
     def _corrected(self, given: FloatArray, means: FloatArray) -> Estimate:

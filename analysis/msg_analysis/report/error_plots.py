@@ -110,7 +110,7 @@ def node_errors(
     """Node errors with 95 % intervals next to the predicted ones; marked if p < ``level``; agents can be chosen."""
     agents = np.arange(1, len(nodes) + 1)
     measured, predicted, error = (_column(nodes, key) for key in ("measured", "predicted", "standard_error"))
-    apart = np.nan_to_num(_column(nodes, "p_holm"), nan=1.0) < level
+    apart = np.nan_to_num(_column(nodes, "p_adjusted"), nan=1.0) < level
     half = HALF_WIDTH_95 * error
     data = {
         "agent": agents,
@@ -122,7 +122,7 @@ def node_errors(
         "low": measured - half,
         "high": measured + half,
         "z": _column(nodes, "z"),
-        "p": _column(nodes, "p_holm"),
+        "p": _column(nodes, "p_adjusted"),
         "colour": np.where(apart, VERMILLION, BLUE),
         "marker": np.where(apart, "square", "circle"),
     }

@@ -249,7 +249,7 @@ def comparison_figure(comparison: Comparison) -> NotebookFigure:
         above.legend(loc="upper right", ncols=3, fontsize=8)
         numbers = np.arange(1, len(nodes) + 1)
         measured, wanted, spread = (_column(nodes, key) for key in ("measured", "predicted", "standard_error"))
-        apart = np.nan_to_num(_column(nodes, "p_holm"), nan=1.0) < comparison.level
+        apart = np.nan_to_num(_column(nodes, "p_adjusted"), nan=1.0) < comparison.level
         below.hlines(wanted, numbers - 0.32, numbers + 0.32, color=BLACK, lw=1.5, label="predicted")
         for which, colour, label in ((~apart, BLUE, "measured, 95 % interval"), (apart, VERMILLION, "rejected")):
             if which.any():

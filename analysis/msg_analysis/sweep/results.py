@@ -245,7 +245,7 @@ def _verdict(outcome: Outcome, p_holm: float | None, level: float) -> str | None
 
 Row = dict[str, Any]
 _LEFT_OUT = {"agents", "stationary", "failure", "bag", "verdict"}
-_ESTIMATE = ("measured", "predicted", "standard_error", "z", "p", "p_holm")
+_ESTIMATE = ("measured", "predicted", "standard_error", "z", "p", "p_adjusted")
 
 
 def rows_of(sweep: Sweep, outcomes: Sequence[Outcome], judgement: Judgement) -> list[Row]:
@@ -287,6 +287,8 @@ def _columns(name: str, value: Any) -> Row:
             column: entry for key, part in value.items() for column, entry in _columns(f"{name}.{key}", part).items()
         }
     low, high = value["interval"]
+    if "p_holm" in value:  # results of older versions
+        value = {**value, "p_adjusted": value["p_holm"]}
     numbers = {key: value[key] for key in _ESTIMATE if value.get(key) is not None}
     return {f"{name}.{key}": entry for key, entry in (numbers | {"low": low, "high": high}).items()}
 

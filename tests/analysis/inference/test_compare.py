@@ -234,7 +234,7 @@ def test_power_of_the_time_means():
     experiment = golden("line_ring", duration=100, replicas=8)
     result = compare(claimed(simulate(changed(experiment, noise={"process": 1.4})), experiment))
     assert result.system_error.z > 5
-    assert all(node.p_holm < 0.01 for node in result.node_errors)
+    assert all(node.p_adjusted < 0.01 for node in result.node_errors)
     assert result.covariance.p < 1e-6
 
 
@@ -254,7 +254,7 @@ def test_document(short_run):
     assert error["interval"][1] - error["measured"] == pytest.approx(1.959964 * error["standard_error"])
     nodes = document["node_errors"]
     assert sum(node["measured"] for node in nodes) == pytest.approx(error["measured"])
-    assert all(node["p_holm"] >= node["p"] for node in nodes)
+    assert all(node["p_adjusted"] >= node["p"] for node in nodes)
     y = short_run.states[:-1] - short_run.states[:-1].mean(axis=1, keepdims=True)
     np.testing.assert_allclose(
         document["covariance"]["measured"], np.einsum("kir,kjr->ij", y, y) / (500 * 2), atol=1e-12
