@@ -23,7 +23,7 @@ from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.inference.losses import LossTally
 from msg_analysis.inference.received_values import NO_NOISE
 from msg_analysis.inference.regression import Term
-from msg_analysis.inference.residuals import InnovationSums
+from msg_analysis.inference.residuals import ResidualSums
 from msg_analysis.inference.statistics import chi2_quantile, log_normal_tail, pseudo_inverse
 
 MOST = 6  # causes searched for in one group
@@ -200,7 +200,7 @@ def numbers_text(value: float, interval: tuple[float, float]) -> str:
     return f"{value:#.3g} ({interval[0]:#.3g} to {interval[1]:#.3g})"
 
 
-MIN_SAMPLES = 30  # fewest innovations for a variance
+MIN_SAMPLES = 30  # fewest residuals for a variance
 MAX_PARAMETERS = 600  # most parameters whose information is inverted
 
 
@@ -213,16 +213,16 @@ class Parameters:
     classes: list[list[Candidate]]  # candidates, class by class; the more specific of equal ones first
 
 
-def frozen(sums: InnovationSums) -> list[tuple[int, int, int]]:
-    """(agent, steps in which it did not move, steps) of agents that cannot have stood still with their noise."""
+def frozen(sums: ResidualSums) -> list[tuple[int, int, int]]:
+    """(agent, steps in which it did not move, steps) of agents that cannot have did not move with their noise."""
     noisy = np.sqrt(np.diagonal(sums.noises, axis1=1, axis2=2)) > 1e-12 * sums.largest
     still, steps = (sums.still * noisy).sum(axis=0), (sums.steps[:, None] * noisy).sum(axis=0)
     # One or two unmoved steps may be a coincidence of rounding.
     return [(i, int(still[i]), int(steps[i])) for i in np.flatnonzero(still >= 3).tolist()]
 
 
-def gains(sums: InnovationSums, excluded: Iterable[int]) -> Parameters | None:
-    """Parameters of the regression on what the agents heard, without the ``excluded``; None where it is not available.
+def gains(sums: ResidualSums, excluded: Iterable[int]) -> Parameters | None:
+    """Parameters of the regression on received values, without the ``excluded``; None where it is not available.
 
     Changes of gains are relative, those of the reference and of offsets (per step) absolute. The score G C^-1 U and the
     information G C^-1 G follow from the regression's score U, covariance C and gram G.
@@ -287,7 +287,7 @@ def _reference(terms: Sequence[Term]) -> FloatArray:
     )
 
 
-def noise(sums: InnovationSums, excluded: Iterable[int], change: FloatArray) -> Parameters | None:
+def noise(sums: ResidualSums, excluded: Iterable[int], change: FloatArray) -> Parameters | None:
     """Logarithms of the noise variances over their nominal values, by graph and agent; None without usable ones.
 
     Left out are the ``excluded`` agents, and what the coefficients ``change`` (K,) of the regression explain.
@@ -348,7 +348,7 @@ def losses(tally: LossTally) -> Parameters:
     return Parameters(np.asarray(score), np.diag(information), classes)
 
 
-def _explained(sums: InnovationSums, change: FloatArray) -> FloatArray:
+def _explained(sums: ResidualSums, change: FloatArray) -> FloatArray:
     """(n, m): how much smaller the sums of squares are with this change of the law."""
     n, m = sums.still.shape
     explained = np.zeros((n, m))

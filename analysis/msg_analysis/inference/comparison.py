@@ -33,7 +33,7 @@ from msg_analysis.inference.given_path import GivenPath
 from msg_analysis.inference.losses import LossTest
 from msg_analysis.inference.question import Test
 from msg_analysis.inference.realtime_laws import Laws
-from msg_analysis.inference.residuals import InnovationTests
+from msg_analysis.inference.residuals import ResidualTests
 from msg_analysis.inference.time_means import TimeMeans
 from msg_analysis.inference.timing import Timing
 from msg_analysis.inference.transitions import SwitchingTest
@@ -114,7 +114,7 @@ def trusted(prediction: Prediction, means: TimeMeans, *, given: bool) -> Trust:
     reason = _reason(prediction, means)
     if reason is None:
         return Trust("all_paths")
-    instead = "Trust the tests of innovations and switching, which do not depend on this."
+    instead = "Trust the tests of residuals and switching, which do not depend on this."
     if given:
         instead = "Trust the errors given the path, and the tests, which do not depend on this."
     return Trust("given_path" if given else None, reason, f"{_why(reason, prediction, means)} {instead}")
@@ -145,7 +145,7 @@ def _why(reason: Reason, prediction: Prediction, means: TimeMeans) -> str:
     if reason == "short_run":
         return "The run is too short for intervals of the errors over all paths of the graphs."
     return (
-        f"This run sees few sojourns of the graphs (some graph is left {number_text(means.switches, 3)} times on "
+        f"This run has few switches (some graph is left {number_text(means.switches, 3)} times on "
         "average), so the errors over all paths of the graphs depend on a few random lengths: they are far from "
         "normal, and their intervals are too wide."
     )
@@ -256,7 +256,7 @@ class Comparison:
     pool
         the runs, where there are several
     any_time
-        evidence that may be looked at any time; None where too few steps arrived, or without a prediction
+        evidence that holds at any time; None where too few steps arrived, or without a prediction
     trust
         in lockstep: which errors have valid intervals, and why; None where too few steps arrived, or without a
         prediction
@@ -268,7 +268,7 @@ class Comparison:
     system_error: Estimate
     node_errors: list[Estimate]
     covariance: CovarianceTest
-    innovations: InnovationTests
+    innovations: ResidualTests
     switching: SwitchingTest | None
     continuous_error: float | None
     batch: tuple[float, float] | None

@@ -17,7 +17,7 @@ from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import HALF_WIDTH_95, percent
 from msg_analysis.inference import candidates
 from msg_analysis.inference.candidates import Cause, numbers_text
-from msg_analysis.inference.e_values import EventEvidence, Looks, coefficient_evidence
+from msg_analysis.inference.e_values import Analyses, EventEvidence, coefficient_evidence
 from msg_analysis.inference.question import (
     Block,
     Diagnostic,
@@ -37,13 +37,13 @@ from msg_analysis.inference.statistics import binomial_interval, log_normal_tail
 class Whiteness(Question):
     """Whether residuals of successive steps, of replicas, and of two agents are independent as they should be."""
 
-    name = "innovations: whiteness"
+    name = "residuals: whiteness"
     meaning = "the noise of successive steps, of replicas or of agents is correlated: random numbers are used twice"
 
     @classmethod
     def tests(cls, run: Statistics) -> list[Test]:
         """Lags of 1 to 10 steps, and pairs of replicas."""
-        return one_test(cls.name, run.innovations.p_whiteness)
+        return one_test(cls.name, run.residuals.p_whiteness)
 
     def evidence(self, sums: RunningSums) -> FloatArray:
         """One row for each pair of agents."""
@@ -73,7 +73,7 @@ MAX_NOISE_PAIRS = 1225  # pairs of agents whose noise is tested for correlation,
 
 def _correlations(search: Search) -> list[Cause]:
     """Pairs of agents whose noise correlation differs from the expected one, by Fisher's z."""
-    sums, families, level = search.innovations, search.families, search.level
+    sums, families, level = search.residuals, search.families, search.level
     m = sums.still.shape[1]
     agents = [i for i in range(m) if i not in search.excluded]
     pairs = [(i, j) for place, i in enumerate(agents) for j in agents[:place]]
@@ -131,20 +131,20 @@ class LagSums:
         shape = (LAGS, columns)
         self.score, self.information, self.products = np.zeros(shape), np.zeros(shape), np.zeros(LAGS, np.int64)
 
-    def add(self, numbers: FloatArray, looks: Looks) -> tuple[FloatArray, FloatArray]:
+    def add(self, numbers: FloatArray, analyses: Analyses) -> tuple[FloatArray, FloatArray]:
         """Add the products of numbers (b, columns, samples) with the earlier ones.
 
-        (T, 100, columns) each: ``score`` and ``information`` after each look.
+        (T, 100, columns) each: ``score`` and ``information`` after each analysis.
         """
         joined = np.concatenate([self._tail, numbers])
         old, lags = len(self._tail), np.arange(1, LAGS + 1)
-        # (T, lags): between the looks, the numbers that have one so many steps before them, in ``joined``.
-        ends = np.repeat(old + looks.ends[:, None], LAGS, axis=1)
-        begins = np.minimum(np.maximum(old + looks.begins[:, None], lags), ends)
+        # (T, lags): between the analyses, the numbers that have one so many steps before them, in ``joined``.
+        ends = np.repeat(old + analyses.ends[:, None], LAGS, axis=1)
+        begins = np.minimum(np.maximum(old + analyses.begins[:, None], lags), ends)
         sums = np.vstack([np.zeros(joined.shape[1]), (joined**2).sum(axis=2).cumsum(axis=0)])
         information = sums[np.maximum(ends - lags, 0)] - sums[np.maximum(begins - lags, 0)]
         information = self.information + information.cumsum(axis=0)
-        score = self.score + _products(joined, old, looks).cumsum(axis=0)
+        score = self.score + _products(joined, old, analyses).cumsum(axis=0)
         self.score, self.information = score[-1], information[-1]
         self.products += (ends - begins).sum(axis=0) * numbers.shape[2]
         self._tail = joined[-LAGS:].copy()
@@ -179,19 +179,19 @@ class LagSums:
         )
 
 
-def _products(joined: FloatArray, old: int, looks: Looks) -> FloatArray:
-    """(T, LAGS, columns): sums of numbers between the looks times those 1 to 100 steps before.
+def _products(joined: FloatArray, old: int, analyses: Analyses) -> FloatArray:
+    """(T, LAGS, columns): sums of numbers between the analyses times those 1 to 100 steps before.
 
     ``joined`` (old + b, columns, samples): the numbers, after ``old`` earlier ones.
     """
-    found, columns = np.empty((looks.count, LAGS, joined.shape[1])), joined.transpose(1, 2, 0)
+    found, columns = np.empty((analyses.count, LAGS, joined.shape[1])), joined.transpose(1, 2, 0)
     # By Fourier transforms so long that no two products overlap; stretches of about the same length together.
-    classes = np.frexp(looks.lengths + LAGS)[1]
+    classes = np.frexp(analyses.lengths + LAGS)[1]
     for each in np.unique(classes):
         rows = np.flatnonzero(classes == each)
-        length = scipy.fft.next_fast_len(int(looks.lengths[rows].max()) + LAGS, real=True)
+        length = scipy.fft.next_fast_len(int(analyses.lengths[rows].max()) + LAGS, real=True)
         every = np.zeros((len(rows), *joined.shape[1:], length))
-        for part, begin, end in zip(every, old + looks.begins[rows], old + looks.ends[rows], strict=True):
+        for part, begin, end in zip(every, old + analyses.begins[rows], old + analyses.ends[rows], strict=True):
             before = min(begin, LAGS)
             part[:, :, LAGS - before : LAGS + end - begin] = columns[:, :, begin - before : end]
         late = every.copy()
@@ -207,13 +207,13 @@ def lag_evidence(score: FloatArray, information: FloatArray) -> FloatArray:
 
 
 class LongLags(Diagnostic):
-    """Regression of every innovation on that of the same agent 1 to 100 steps before.
+    """Regression of every residual on that of the same agent 1 to 100 steps before.
 
     The test takes the clearest lag: of an agent, or of all together where they are independent, with half of the
     level each.
     """
 
-    name = "innovations: lags to 100"
+    name = "residuals: lags to 100"
     meaning = "the noise of a step depends on that of up to 100 steps before"
 
     def __init__(self, law: Law) -> None:
@@ -222,8 +222,8 @@ class LongLags(Diagnostic):
         self.sums = LagSums(len(self._agents), law.replicas)
 
     def add(self, block: Block) -> FloatArray:
-        """Add the innovations of a block."""
-        return self._evidence(*self.sums.add(block.white[:, self._agents], block.looks))
+        """Add the residuals of a block."""
+        return self._evidence(*self.sums.add(block.white[:, self._agents], block.analyses))
 
     def merge(self, other: Self) -> None:
         """Add the sums of other runs."""
@@ -289,7 +289,7 @@ class ConstantState(Diagnostic):
     p of the test (Markov).
     """
 
-    name = "innovations: standing still"
+    name = "residuals: constant state"
     meaning = "the state of an agent with noise does not change for some steps"
 
     def __init__(self, law: Law) -> None:
@@ -301,24 +301,24 @@ class ConstantState(Diagnostic):
         self._runs = 1
 
     def add(self, block: Block) -> FloatArray:
-        """Look at the steps of a block."""
-        looks = block.looks
+        """Add the steps of a block."""
+        analyses = block.analyses
         if not len(self._agents):
-            return np.empty((looks.count, 0, 1))
+            return np.empty((analyses.count, 0, 1))
         before, after = block.reception.states, block.after
         still: BoolArray = (after[:, self._agents] == before[:, self._agents]).all(axis=2)
         at, which = np.nonzero(still)
         size = np.spacing(np.abs(before[at]).max(axis=1))  # (s, R)
         chance = ROUNDINGS * (size / block.scale[at, self._agents[which]][:, None] + EPSILON)
-        seen, logarithms = looks.lengths * len(self._agents), -np.log(np.minimum(chance, 1.0)).sum(axis=1)
+        seen, logarithms = analyses.lengths * len(self._agents), -np.log(np.minimum(chance, 1.0)).sum(axis=1)
         for place in np.unique(which).tolist():
             self._stretches(place, block.first, block.first + at[which == place])
         moved = ~still[-1]
         self._since[moved] = -1
-        return self._evidence.add(seen, logarithms, looks.after(at))[:, None, None]
+        return self._evidence.add(seen, logarithms, analyses.after(at))[:, None, None]
 
     def _stretches(self, place: int, first: int, steps: IntArray) -> None:
-        """The longest stretch of an agent that stood still in ``steps`` from ``first`` on, ascending."""
+        """The longest stretch of an agent that did not move in ``steps`` from ``first`` on, ascending."""
         begins = steps[np.append(True, np.diff(steps) > 1)]
         ends = steps[np.append(np.diff(steps) > 1, True)]
         if self._since[place] >= 0 and begins[0] == first:
@@ -355,14 +355,14 @@ class ConstantState(Diagnostic):
     def about(self, row: int) -> str:
         """One, about all agents."""
         del row
-        return "agents that stand still"
+        return "agents whose state is constant"
 
     @classmethod
     def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
         """An agent in some steps."""
         assert found.place is not None
         del names
-        words = f"{found.whose} stood still {found.place.words}, although it has noise"
+        words = f"{found.whose} did not move {found.place.words}, although it has noise"
         agent = None if found.agent is None else found.agent + 1
         return Cause("frozen", words, agent, None, None, None, None, found.expected, p, found.steps)
 
@@ -379,6 +379,6 @@ def _frozen_cause(agent: int, still: int, steps: int, found: Finding | None) -> 
     stretch = found.place if found and found.agent == agent else None
     where = None
     if stretch and still < steps and still == stretch.last - stretch.first + 1:
-        when, where = f"stood still {stretch.words}", (stretch.first, stretch.last)
+        when, where = f"did not move {stretch.words}", (stretch.first, stretch.last)
     words = f"agent {agent + 1} {when}, although it has noise"
     return Cause("frozen", words, agent + 1, None, None, share, interval, 0.0, 0.0, where)

@@ -95,19 +95,19 @@ def _early_and_equal(observation: Observation, timers: Timers) -> tuple[str | No
         senders = tables.senders[timers.graphs[first:last], agents]
         used, made = timers.used[first:last], timers.made[first : last + 1]
         after = made[1:]
-        heard = np.where(used >= 0, timers.made[used, senders], np.int64(-1))
-        wrong = np.argwhere(heard > after[:, :, None])
+        received = np.where(used >= 0, timers.made[used, senders], np.int64(-1))
+        wrong = np.argwhere(received > after[:, :, None])
         if len(wrong) and not early:
             k, i, d = wrong[0].tolist()
             text = (
                 f"in step {first + k} agent {i + 1} used a value that agent {senders[k, i, d] + 1} computed "
-                f"{(heard[k, i, d] - after[k, i]) / 1e9:.3g} units of time later"
+                f"{(received[k, i, d] - after[k, i]) / 1e9:.3g} units of time later"
             )
         early += len(wrong)
         decreasing = decreasing or bool((np.diff(made, axis=0) < 0).any() or (after <= 0).any())
         k, i = np.nonzero(after == made[:-1])
         ties.append(np.column_stack([first + k, i, first + k + 1, i])[first + k > 0])
-        k, i, d = np.nonzero((heard == after[:, :, None]) & (used > 0))
+        k, i, d = np.nonzero((received == after[:, :, None]) & (used > 0))
         ties.append(np.column_stack([used[k, i, d], senders[k, i, d], first + k + 1, i]))
     if early:
         return f"{text} ({early} such cases): their clocks disagree", np.concatenate(ties)

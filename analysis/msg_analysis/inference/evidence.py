@@ -17,14 +17,14 @@ from msg_analysis.inference.given_path import means_given_path
 from msg_analysis.inference.losses import LossTally
 from msg_analysis.inference.observation import Observation, spaced_steps
 from msg_analysis.inference.realtime_laws import Laws, means_in_lockstep, measure_laws
-from msg_analysis.inference.residuals import BroadcastSums, InnovationSums
+from msg_analysis.inference.residuals import BroadcastSums, ResidualSums
 from msg_analysis.inference.time_means import TimeMeans, time_means
 from msg_analysis.inference.timing import Timing, measure_timing
 from msg_analysis.inference.transitions import Transitions
 
-LOOKS = 20, 80  # at the evidence over time, in short and in long runs: each takes as long as some hundred steps
-STEPS_PER_LOOK = 100  # between these
-DECIDED_LOOKS = 400  # where the evidence has decided when the run ended, and so decides the verdict
+ANALYSES = 20, 80  # at the evidence over time, in short and in long runs: each takes as long as some hundred steps
+STEPS_PER_ANALYSIS = 100  # between these
+DECIDED_ANALYSES = 400  # where the evidence has decided when the run ended, and so decides the verdict
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,11 +35,11 @@ class Evidence:
     means: TimeMeans  # time means, and their expectation over all paths of the graphs; in real time: given the log
     decisive: bool  # whether the law that the means are compared with is exact
     given: TimeMeans | None  # with their expectation given the path; None where it is not computed
-    innovations: InnovationSums
+    residuals: ResidualSums
     transitions: Transitions
     loss: LossTally | None  # None without loss
     broadcast: BroadcastSums | None  # None without broadcast noise
-    watched: WatchedEvidence  # what may be looked at any time
+    watched: WatchedEvidence  # what holds at any time
     timing: Timing | None = None  # of one run in real time
     laws: Laws | None = None  # of one run in real time
 
@@ -55,12 +55,12 @@ class Evidence:
     @classmethod
     def of(cls, observation: Observation, level: float, *, decided: bool = False) -> Evidence:
         """Of one run, which ended when its evidence ``decided``; in real time, laws are tested at ``level``."""
-        looks = spaced_steps(observation.steps, DECIDED_LOOKS if decided else usual_looks(observation.steps))
+        analyses = spaced_steps(observation.steps, DECIDED_ANALYSES if decided else usual_analyses(observation.steps))
         with blas_threads(observation.step.agents):
-            return cls._of(observation, level, looks)
+            return cls._of(observation, level, analyses)
 
     @classmethod
-    def _of(cls, observation: Observation, level: float, looks: IntArray) -> Evidence:
+    def _of(cls, observation: Observation, level: float, analyses: IntArray) -> Evidence:
         laws, timing, position, given = None, None, None, None
         if observation.timers:
             timing, order = measure_timing(observation), order_events(observation)
@@ -70,14 +70,14 @@ class Evidence:
             means = time_means(observation)
             kept = observation.prediction.system.readout is not None
             given = means_in_lockstep(observation) if kept else means_given_path(observation)
-        watch = Watch(observation, looks)
-        innovations = InnovationSums(observation, position, watch)
+        watch = Watch(observation, analyses)
+        residuals = ResidualSums(observation, position, watch)
         return cls(
             steps=observation.steps,
             means=means,
             decisive=laws is None or laws.measured_against == "pattern",
             given=given,
-            innovations=innovations,
+            residuals=residuals,
             transitions=Transitions.of(observation.modes, observation.step.modes),
             loss=LossTally.of(observation),
             broadcast=BroadcastSums.of(observation),
@@ -92,7 +92,7 @@ class Evidence:
         Time means are weighted with the numbers of steps, so that every step, and every martingale increment, counts
         the same.
         """
-        self.innovations.merge(other.innovations)
+        self.residuals.merge(other.residuals)
         if self.loss and other.loss:
             self.loss.merge(other.loss)
         if self.broadcast and other.broadcast:
@@ -113,10 +113,10 @@ class Evidence:
         )
 
 
-def usual_looks(steps: int) -> int:
+def usual_analyses(steps: int) -> int:
     """At the evidence over time of a run with so many steps, at most."""
-    few, most = LOOKS
-    return min(max(steps // STEPS_PER_LOOK, few), most)
+    few, most = ANALYSES
+    return min(max(steps // STEPS_PER_ANALYSIS, few), most)
 
 
 def _merged_means(one: TimeMeans, steps: int, other: TimeMeans, more: int) -> TimeMeans:

@@ -14,12 +14,12 @@ import numpy as np
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
 from msg_analysis.inference.dependence import LAGS
-from msg_analysis.inference.e_values import Looks, log_mean, log_means, log_sum
+from msg_analysis.inference.e_values import Analyses, log_mean, log_means, log_sum
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.question import Block, Diagnostic, Finding, Law, RunningSums
 from msg_analysis.inference.questions import QUESTIONS, evidence_weights
-from msg_analysis.inference.received_values import NO_NOISE, HeardValues, process_noise
-from msg_analysis.inference.residuals import QUIET_ROUNDING, innovations
+from msg_analysis.inference.received_values import NO_NOISE, ReceivedValues, process_noise
+from msg_analysis.inference.residuals import QUIET_ROUNDING, residuals
 from msg_analysis.inference.statistics import simultaneous_half_width
 from msg_analysis.inference.system_error import ErrorMartingale
 from msg_analysis.inference.time_means import moments
@@ -34,9 +34,9 @@ FARTHEST = 1e4
 class EvidenceSums:
     """Sums for the evidence of all questions.
 
-    Given its past and, on the air and in real time, what was heard, each is exact; the system error only in lockstep
-    without noise or loss on the air. With ``in_detail``, the diagnostics are asked, too, which take as much time as all
-    others together.
+    Given its past and, with reception noise and in real time, what was received, each is exact; the system error only
+    in lockstep without noise or loss of messages. With ``in_detail``, the diagnostics are asked, too, which take as
+    much time as all others together.
     """
 
     def __init__(self, prediction: Prediction, replicas: int, *, in_detail: bool = False) -> None:
@@ -44,7 +44,7 @@ class EvidenceSums:
         noise, m = experiment.noise, step.agents
         self._step, self._noise = step, noise
         real_time = experiment.run.pace == "realtime"
-        self.plain = not (noise.on_air or noise.delay or real_time)  # all agents hear the states themselves
+        self.plain = not (noise.on_air or noise.delay or real_time)  # all agents receive the states themselves
         # A message that is used twice has the same noise both times.
         self._independent = independent = not (noise.link and (step.holds or real_time))
         self._process = np.array([process_noise(step, np.full(m, g)) for g in range(step.modes)])  # (n, m, m)
@@ -80,31 +80,31 @@ class EvidenceSums:
         self.total = self._zeros(1)
 
     @property
-    def numbers_per_look(self) -> int:
-        """Of temporary arrays, when a run is looked at."""
+    def numbers_per_analysis(self) -> int:
+        """Of temporary arrays, of one interim analysis."""
         m, n = self._step.agents, self._step.modes
         lags = 10 * LAGS * (m + 1) if self.diagnostics else 0
         return 8 * m**2 + n**2 + lags
 
     def add(
-        self, observation: Observation, first: int, last: int, heard: tuple[HeardValues, FloatArray] | None = None
+        self, observation: Observation, first: int, last: int, received: tuple[ReceivedValues, FloatArray] | None = None
     ) -> None:
         """Add the steps first..last-1 of a run, which follow those that were added before.
 
-        ``heard``: what was heard in them, and their innovations (b, m, R), where these are known.
+        ``received``: what was received in them, and their residuals (b, m, R), where these are known.
         """
-        self._add(observation, first, last, Looks.at_the_end(last - first), heard)
+        self._add(observation, first, last, Analyses.at_the_end(last - first), received)
 
-    def look(
+    def analyse(
         self,
         observation: Observation,
         first: int,
         last: int,
-        looks: Looks,
-        heard: tuple[HeardValues, FloatArray] | None = None,
+        analyses: Analyses,
+        received: tuple[ReceivedValues, FloatArray] | None = None,
     ) -> FloatArray:
-        """Add steps as ``add`` does: (T,) logs of the evidence against the whole law after each look."""
-        running, known = self._add(observation, first, last, looks, heard)
+        """Add steps as ``add`` does: (T,) logs of the evidence against the whole law after each analysis."""
+        running, known = self._add(observation, first, last, analyses, received)
         return self._log_evidence(running, self._families(running, known))
 
     def _add(
@@ -112,70 +112,70 @@ class EvidenceSums:
         observation: Observation,
         first: int,
         last: int,
-        looks: Looks,
-        heard: tuple[HeardValues, FloatArray] | None,
+        analyses: Analyses,
+        received: tuple[ReceivedValues, FloatArray] | None,
     ) -> tuple[RunningSums, dict[str, FloatArray]]:
-        """The sums and the evidence of the diagnostics after each look."""
-        # One look needs no copies of what may be large.
-        parts = self.total if looks.count == 1 else self._zeros(looks.count)
+        """The sums and the evidence of the diagnostics after each analysis."""
+        # One analysis needs no copies of what may be large.
+        parts = self.total if analyses.count == 1 else self._zeros(analyses.count)
         found: dict[str, FloatArray] = {}
         quadratic = self._quadratic and self._near(observation.states[first : last + 1])
         if quadratic:
-            self._add_quadratic(parts, looks, observation, first, last)
+            self._add_quadratic(parts, analyses, observation, first, last)
         if self.diagnostics or not quadratic:
-            block = self._block(parts, looks, observation, first, last, heard)
+            block = self._block(parts, analyses, observation, first, last, received)
             if not quadratic:
                 lost = None if observation.lost is None else observation.lost[first:last]
-                self._add_heard(parts, looks, block.reception, block.white, block.scale, lost)
+                self._add_received(parts, analyses, block.reception, block.white, block.scale, lost)
             found = {each.name: each.add(block) for each in self.diagnostics}
         graphs = observation.modes[first : last + 1]
         now, following = graphs[:-1], graphs[1:]
-        look = looks.after(np.arange(len(now)))
-        self._add_transitions(parts, look, now, following)
+        analysis = analyses.after(np.arange(len(now)))
+        self._add_transitions(parts, analysis, now, following)
         if observation.published is not None:
-            self._add_broadcast(parts, looks, observation.published[first:last] - observation.states[first:last])
+            self._add_broadcast(parts, analyses, observation.published[first:last] - observation.states[first:last])
         if self.error is not None and len(now):
             a = np.ones((len(graphs), self.error.numbers))
             a[:, :-1] = moments(observation, first, first + len(graphs), observation.states)
             steps = np.zeros((last - first, len(self.error.rates)))
             steps[: len(now)] = self.error.steps(now, following, a[:-1], a[1:])
-            parts.error += looks.sums(steps)
+            parts.error += analyses.sums(steps)
         running = self.total
-        if looks.count > 1:
+        if analyses.count > 1:
             running = self.total.then(parts)
             self.total = running.last()
         return running, found
 
-    def _zeros(self, looks: int) -> RunningSums:
+    def _zeros(self, analyses: int) -> RunningSums:
         rates = 0 if self.error is None else len(self.error.rates)
-        return RunningSums.zeros(looks, self._step.agents, self._step.modes, rates)
+        return RunningSums.zeros(analyses, self._step.agents, self._step.modes, rates)
 
     def add_transitions(self, graphs: IntArray, following: IntArray) -> None:
         """Add steps of the switching: graphs (k,) and those of the next step (k,)."""
         self._add_transitions(self.total, np.zeros_like(graphs), graphs, following)
 
-    def _add_transitions(self, parts: RunningSums, look: IntArray, graphs: IntArray, following: IntArray) -> None:
+    def _add_transitions(self, parts: RunningSums, analysis: IntArray, graphs: IntArray, following: IntArray) -> None:
         modes, shape = self._step.modes, parts.counts.shape
-        place = (look * modes + graphs) * modes + following
+        place = (analysis * modes + graphs) * modes + following
         parts.counts += np.bincount(place, minlength=parts.counts.size).reshape(shape)
 
     def add_broadcast(self, added: FloatArray) -> None:
         """Add what was published minus the states (b, m, R)."""
-        self._add_broadcast(self.total, Looks.at_the_end(len(added)), added)
+        self._add_broadcast(self.total, Analyses.at_the_end(len(added)), added)
 
-    def _add_broadcast(self, parts: RunningSums, looks: Looks, added: FloatArray) -> None:
+    def _add_broadcast(self, parts: RunningSums, analyses: Analyses, added: FloatArray) -> None:
         if self._noise.broadcast:
-            parts.broadcast_samples += looks.lengths * added.shape[2]
-            parts.broadcast_squares += looks.sums((added**2).sum(axis=2)) / self._noise.broadcast**2
+            parts.broadcast_samples += analyses.lengths * added.shape[2]
+            parts.broadcast_squares += analyses.sums((added**2).sum(axis=2)) / self._noise.broadcast**2
 
-    def add_heard(self, reception: HeardValues, e: FloatArray, lost: BoolArray | None, largest: float) -> None:
-        """Add steps by what was heard, in any order: their innovations (b, m, R), the lost messages (b, m, D), if any.
+    def add_received(self, reception: ReceivedValues, e: FloatArray, lost: BoolArray | None, largest: float) -> None:
+        """Add steps by what was received, in any order: their residuals (b, m, R), the lost messages (b, m, D), if any.
 
         Of a step with an infinite ``link_variance``, the agent is left out. ``largest``: size of the largest state.
         """
-        looks = Looks.at_the_end(len(e))
-        scale = self._scales(self.total, looks, reception, e, largest)
-        self._add_heard(self.total, looks, reception, e / scale[:, :, None], scale, lost)
+        analyses = Analyses.at_the_end(len(e))
+        scale = self._scales(self.total, analyses, reception, e, largest)
+        self._add_received(self.total, analyses, reception, e / scale[:, :, None], scale, lost)
 
     def _near(self, states: FloatArray) -> bool:
         """Whether states are so near to each other, or to the reference, that squares lose nothing that counts."""
@@ -183,8 +183,10 @@ class EvidenceSums:
         smallest = math.sqrt(float(np.diagonal(self._process, axis1=1, axis2=2).min()))
         return float(np.abs(states - centre).max()) <= FARTHEST * smallest
 
-    def _add_quadratic(self, parts: RunningSums, looks: Looks, observation: Observation, first: int, last: int) -> None:
-        """Noise, gains and pairs where all agents hear the states themselves, and all have noise.
+    def _add_quadratic(
+        self, parts: RunningSums, analyses: Analyses, observation: Observation, first: int, last: int
+    ) -> None:
+        """Noise, gains and pairs where all agents receive the states themselves, and all have noise.
 
         Every sum is then a quadratic form in z = (x(k) - c, x(k+1) - c, 1), so that for each graph the sum of z z^T is
         enough; c, the reference or the mean of x(k), keeps the numbers small.
@@ -193,7 +195,7 @@ class EvidenceSums:
         states, modes = observation.states[first : last + 1], observation.modes[first:last]
         pull = step.nominal.sum(axis=2) - 1.0  # (n, m)
         pulled = bool(self._pulled.any())
-        parts.samples += observation.replicas * looks.lengths[:, None]
+        parts.samples += observation.replicas * analyses.lengths[:, None]
         diagonal = np.arange(m)
         for mode in np.unique(modes).tolist():
             at = np.flatnonzero(modes == mode)
@@ -202,12 +204,12 @@ class EvidenceSums:
             z = np.ones((2 * m + 1, len(at), observation.replicas))
             z[:m], z[m:-1] = (now - centre).transpose(1, 0, 2), (after - centre).transpose(1, 0, 2)
             flat = z.reshape(2 * m + 1, -1)
-            bounds = np.searchsorted(at, np.append(0, looks.ends)) * observation.replicas
-            there = np.flatnonzero(np.diff(bounds))  # looks before which steps have this graph
-            between = [flat[:, bounds[look] : bounds[look + 1]] for look in there.tolist()]
+            bounds = np.searchsorted(at, np.append(0, analyses.ends)) * observation.replicas
+            there = np.flatnonzero(np.diff(bounds))  # analyses before which steps have this graph
+            between = [flat[:, bounds[analysis] : bounds[analysis + 1]] for analysis in there.tolist()]
             gram = np.array([each @ each.T for each in between])
             deviation = np.sqrt(np.diagonal(self._process[mode]))[:, None]
-            # White innovations and the effects of links, as rows that are multiplied with z.
+            # White residuals and the effects of links, as rows that are multiplied with z.
             offset = step.offsets[mode] + (pull[mode] * step.reference if pulled else 0.0)
             white = np.column_stack([-step.nominal[mode], np.eye(m), -offset]) / deviation
             weights = step.nominal[mode] * ~np.eye(m, dtype=bool) / deviation
@@ -233,62 +235,62 @@ class EvidenceSums:
     def _block(
         self,
         parts: RunningSums,
-        looks: Looks,
+        analyses: Analyses,
         observation: Observation,
         first: int,
         last: int,
-        heard: tuple[HeardValues, FloatArray] | None,
+        received: tuple[ReceivedValues, FloatArray] | None,
     ) -> Block:
-        """The steps, with their innovations over the standard deviations, by what was heard."""
-        reception = heard[0] if heard else HeardValues.of(observation, first, last)
-        e = heard[1] if heard else innovations(observation, first, last, reception)
-        scale = self._scales(parts, looks, reception, e, observation.largest)
+        """The steps, with their residuals over the standard deviations, by what was received."""
+        reception = received[0] if received else ReceivedValues.of(observation, first, last)
+        e = received[1] if received else residuals(observation, first, last, reception)
+        scale = self._scales(parts, analyses, reception, e, observation.largest)
         graphs, after = observation.modes[first : last + 1], observation.states[first + 1 : last + 1]
-        return Block(first, graphs, e / scale[:, :, None], scale, after, reception, looks)
+        return Block(first, graphs, e / scale[:, :, None], scale, after, reception, analyses)
 
     def _scales(
-        self, parts: RunningSums, looks: Looks, reception: HeardValues, e: FloatArray, largest: float
+        self, parts: RunningSums, analyses: Analyses, reception: ReceivedValues, e: FloatArray, largest: float
     ) -> FloatArray:
-        """(b, m): standard deviations of innovations; infinite without noise, where nothing may move."""
+        """(b, m): standard deviations of residuals; infinite without noise, where nothing may move."""
         agents = np.arange(self._step.agents)
         variances = np.diagonal(self._process, axis1=1, axis2=2)[reception.graphs, agents] + reception.link_variance
         still = variances <= self._floor
         if self._independent and still.any():
             moved = (np.abs(e) > QUIET_ROUNDING * largest).any(axis=2) & still
-            parts.impossible += looks.counts(np.asarray(moved.any(axis=1)))
+            parts.impossible += analyses.counts(np.asarray(moved.any(axis=1)))
         return np.asarray(np.sqrt(np.where(still, np.inf, variances)))
 
-    def _add_heard(
+    def _add_received(
         self,
         parts: RunningSums,
-        looks: Looks,
-        reception: HeardValues,
+        analyses: Analyses,
+        reception: ReceivedValues,
         white: FloatArray,
         scale: FloatArray,
         lost: BoolArray | None,
     ) -> None:
         """Noise, pairs, and of gains and losses the regressors, over the standard deviation of the noise."""
-        parts.samples += looks.counts(np.where(np.isinf(scale), 0, white.shape[2]))
-        parts.squares += looks.sums((white**2).sum(axis=2))
+        parts.samples += analyses.counts(np.where(np.isinf(scale), 0, white.shape[2]))
+        parts.squares += analyses.sums((white**2).sum(axis=2))
         if len(self._law.pairs):
-            for look, (begin, end) in enumerate(zip(looks.begins.tolist(), looks.ends.tolist(), strict=True)):
+            for analysis, (begin, end) in enumerate(zip(analyses.begins.tolist(), analyses.ends.tolist(), strict=True)):
                 flat = white[begin:end].transpose(1, 0, 2).reshape(len(white[0]), -1)
                 products = flat @ flat.T
-                parts.pair_score[look] += products
-                parts.pair_information[look] += np.diag(products)[None, :]
+                parts.pair_score[analysis] += products
+                parts.pair_information[analysis] += np.diag(products)[None, :]
         step, scale = self._step, scale[:, :, None]
         agents, every = np.arange(step.agents), np.arange(len(white))
         count = neighbour_tables(step).count[reception.graphs, agents]  # (b, m)
         pull = (step.nominal.sum(axis=2) - 1.0)[reception.graphs, agents]
         common = pull[:, :, None] * (reception.states - step.reference) / scale
-        parts.link_score[:, agents, agents] += looks.sums((common * white).sum(axis=2))
-        parts.link_information[:, agents, agents] += looks.sums((common**2).sum(axis=2))
+        parts.link_score[:, agents, agents] += analyses.sums((common * white).sum(axis=2))
+        parts.link_information[:, agents, agents] += analyses.sums((common**2).sum(axis=2))
         m = step.agents
-        receivers = (looks.after(every)[:, None] * m + agents) * m  # places of rows of (T, m, m) in one dimension
+        receivers = (analyses.after(every)[:, None] * m + agents) * m  # places of rows of (T, m, m) in one dimension
         for d in range(step.most_neighbours):
             there = count > d
             weights = reception.weights[:, :, d]
-            difference = reception.heard(every, agents, np.full(m, d)) - reception.states
+            difference = reception.received(every, agents, np.full(m, d)) - reception.states
             part = np.where(weights != 0.0, weights, 0.0)[:, :, None] * difference / scale
             common += part
             place = (receivers + reception.senders[:, :, d])[there]  # in one dimension: many times as fast
@@ -298,8 +300,8 @@ class EvidenceSums:
                 np.add.at(parts.messages.reshape(-1), place, 1)
                 np.add.at(parts.lost.reshape(-1), place, lost[:, :, d][there])
         if self._law.apart:
-            parts.common_score += looks.sums((common * white).sum(axis=(1, 2)))
-            parts.common_information += looks.sums((common**2).sum(axis=(1, 2)))
+            parts.common_score += analyses.sums((common * white).sum(axis=(1, 2)))
+            parts.common_information += analyses.sums((common**2).sum(axis=(1, 2)))
 
     def merge(self, other: EvidenceSums) -> None:
         """Add the sums of another run of the same experiment, with another seed."""
@@ -341,7 +343,7 @@ class EvidenceSums:
         return float(self._log_evidence(self.total, {name: found[None] for name, found in families.items()})[0])
 
     def _log_evidence(self, sums: RunningSums, families: dict[str, FloatArray]) -> FloatArray:
-        """(T,): the weighted mean over the questions of the mean over their rows, after each look."""
+        """(T,): the weighted mean over the questions of the mean over their rows, after each analysis."""
         total = np.zeros(len(sums.impossible))
         if families:
             total = log_sum(log_means(list(families.values())) + np.log(self.weights(families)), axis=1)
@@ -363,9 +365,9 @@ class WatchedEvidence:
     logarithms: FloatArray | None  # (T,) of the evidence after them
 
     @classmethod
-    def of(cls, observation: Observation, looks: IntArray) -> WatchedEvidence:
-        """Of a run, at the numbers of steps ``looks`` (T,), ascending, the last of which is all steps."""
-        watch = Watch(observation, looks)
+    def of(cls, observation: Observation, analyses: IntArray) -> WatchedEvidence:
+        """Of a run, at the numbers of steps ``analyses`` (T,), ascending, the last of which is all steps."""
+        watch = Watch(observation, analyses)
         for first, last in observation.blocks(watch.numbers_per_step, "evidence"):
             watch.add(first, last)
         return watch.result()
@@ -377,14 +379,14 @@ class WatchedEvidence:
 
 
 class Watch:
-    """Adds the steps of a run in order, and looks at the evidence after the numbers of steps ``looks`` (T,)."""
+    """Adds the steps of a run in order, and takes the evidence after the numbers of steps ``analyses`` (T,)."""
 
-    def __init__(self, observation: Observation, looks: IntArray) -> None:
-        self._observation, self._looks = observation, looks
+    def __init__(self, observation: Observation, analyses: IntArray) -> None:
+        self._observation, self._analyses = observation, analyses
         self._sums = EvidenceSums(observation.prediction, observation.replicas, in_detail=True)
-        self._logarithms = np.empty(len(looks))
-        self._looked = 0
-        self._most = max(1, BLOCK_NUMBERS // self._sums.numbers_per_look)  # looks in one pass
+        self._logarithms = np.empty(len(analyses))
+        self._done = 0
+        self._most = max(1, BLOCK_NUMBERS // self._sums.numbers_per_analysis)  # analyses in one pass
 
     @property
     def numbers_per_step(self) -> int:
@@ -393,29 +395,32 @@ class Watch:
         numbers = (4 + step.most_neighbours) * self._observation.states[0].size + step.agents**2
         return int(numbers if error is None else max(numbers, error.numbers * (1 + len(error.rates))))
 
-    def add(self, first: int, last: int, heard: tuple[HeardValues, FloatArray] | None = None) -> None:
-        """Add the steps first..last-1; ``heard`` as of ``EvidenceSums.add``."""
+    def add(self, first: int, last: int, received: tuple[ReceivedValues, FloatArray] | None = None) -> None:
+        """Add the steps first..last-1; ``received`` as of ``EvidenceSums.add``."""
         begin = first
         while first < last:
-            ends = self._looks[self._looked : self._looked + self._most]
+            ends = self._analyses[self._done : self._done + self._most]
             ends = ends[ends <= last]
-            looked = self._looked + len(ends)
+            done = self._done + len(ends)
             if len(ends) < self._most and (not len(ends) or ends[-1] < last):
                 ends = np.append(ends, last)
             until = int(ends[-1])
-            known = heard and (heard[0].part(first - begin, until - begin), heard[1][first - begin : until - begin])
-            found = self._sums.look(self._observation, first, until, Looks(ends - first), known)
-            self._logarithms[self._looked : looked] = found[: looked - self._looked]
-            first, self._looked = until, looked
+            known = received and (
+                received[0].part(first - begin, until - begin),
+                received[1][first - begin : until - begin],
+            )
+            found = self._sums.analyse(self._observation, first, until, Analyses(ends - first), known)
+            self._logarithms[self._done : done] = found[: done - self._done]
+            first, self._done = until, done
 
     def result(self) -> WatchedEvidence:
         """After all steps."""
-        return WatchedEvidence(self._sums, self._observation.step.dt, self._looks, self._logarithms)
+        return WatchedEvidence(self._sums, self._observation.step.dt, self._analyses, self._logarithms)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnyTimeEvidence:
-    """What may be said at any time, however often one looks.
+    """What may be said at any time.
 
     While the run follows the law, the evidence ever passes ``threshold`` with probability at most 1 / threshold.
     """

@@ -43,7 +43,7 @@ class Fault:
 
     kind: Kind  # noise variance of an agent, gain of a link in all graphs, all rates of switching
     factor: float
-    agent: int | None = None  # from 0: whose noise, or who hears; None: where the fault is hardest to find
+    agent: int | None = None  # from 0: whose noise, or who receives; None: where the fault is hardest to find
     sender: int | None = None
 
 
@@ -68,7 +68,7 @@ class FaultPower:
     """How surely a fault is found, at one agent or link."""
 
     fault: Fault
-    agent: int | None  # from 0: whose noise, or who hears with this gain
+    agent: int | None  # from 0: whose noise, or who receives with this gain
     sender: int | None
     tests: Sequence[StepInformation]  # those of the fault
     level: float  # of each test
@@ -156,7 +156,7 @@ _Informations = dict[tuple[int | None, int | None], list[StepInformation]]
 
 
 def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
-    """Per agent with noise: the likelihood ratio of the covariance of the innovations."""
+    """Per agent with noise: the likelihood ratio of the covariance of the residuals."""
     same = bool((step.noise == step.noise[0]).all())
     found: _Informations = {}
     bases = [_noisy(noise) for noise in step.noise]
@@ -182,10 +182,10 @@ def _noisy(noise: FloatArray) -> FloatArray:
 
 
 def _gain(prediction: Prediction, factor: float, replicas: int) -> _Informations:
-    """Per link: the regression of the innovations on all that is heard, and on their sum."""
+    """Per link: the regression of the residuals on all that is received, and on their sum."""
     step, system = prediction.step, prediction.system
     covariances = system.lifted(system.by_graph(prediction.steady))  # (n, m, m), times pi
-    air = step.link**2 + step.broadcast**2
+    reception = step.link**2 + step.broadcast**2
     _, _, terms = regressors(step, MAX_REGRESSORS)
     links: dict[tuple[int, int], tuple[float, float]] = {}
     total = 0.0
@@ -202,11 +202,11 @@ def _gain(prediction: Prediction, factor: float, replicas: int) -> _Informations
                 received, weight = 1.0 - float(step.losses[i, j]), float(step.nominal[mode, i, j])
                 difference = np.zeros(step.agents)
                 difference[i], difference[j] = -weight, weight
-                own = float(difference @ covariance @ difference) + law * weight**2 * air
-                with_all = float(difference @ covariance @ row) + law * weight**2 * air
+                own = float(difference @ covariance @ difference) + law * weight**2 * reception
+                with_all = float(difference @ covariance @ row) + law * weight**2 * reception
                 before = links.get((i, j), (0.0, 0.0))
                 links[i, j] = before[0] + received * own / variance, before[1] + received * with_all / variance
-                total += law * weight**2 * air * received / variance
+                total += law * weight**2 * reception * received / variance
     change = (factor - 1.0) ** 2 * replicas
     return {
         link: [

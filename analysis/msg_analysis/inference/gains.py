@@ -18,14 +18,14 @@ from msg_analysis.inference.question import Question, RunningSums, Search, Stati
 class Gains(Question):
     """Whether residuals depend on the values that the agents used."""
 
-    name = "innovations: gains"
+    name = "residuals: gains"
     meaning = "a gain, a reference or an offset is not that of the file, or received values are not used as they should"
     main = True
 
     @classmethod
     def tests(cls, run: Statistics) -> list[Test]:
         """Of all coefficients together."""
-        return one_test(cls.name, run.innovations.p_gain)
+        return one_test(cls.name, run.residuals.p_gain)
 
     def evidence(self, sums: RunningSums) -> FloatArray:
         """One row for each link and each leader."""
@@ -51,13 +51,13 @@ class Gains(Question):
 class CommonGain(Question):
     """Whether all gains are wrong by one factor, as where messages are ignored; its causes are those of the gains."""
 
-    name = "innovations: common gain"
+    name = "residuals: common gain"
     meaning = "all gains are too small or too large by one factor, or messages have no effect"
 
     @classmethod
     def tests(cls, run: Statistics) -> list[Test]:
         """Of one direction of the regression."""
-        return one_test(cls.name, run.innovations.p_common_gain)
+        return one_test(cls.name, run.residuals.p_common_gain)
 
     def evidence(self, sums: RunningSums) -> FloatArray:
         """One row, where the agents' residuals are independent."""
@@ -108,9 +108,9 @@ def _whose_gain(part: str, what: Any) -> tuple[str, int | None, tuple[int, int] 
         first, second = sorted(pair)
         return f"the gain of edge {first + 1}-{second + 1} in both directions", None, (first + 1, second + 1), graph
     if part == "receiver in graph":
-        return f"agent {what[0] + 1}'s gain on all that it hears", what[0] + 1, None, what[1]
+        return f"agent {what[0] + 1}'s gain on all that it receives", what[0] + 1, None, what[1]
     if part == "receiver":
-        return f"agent {what + 1}'s gain on all that it hears", what + 1, None, None
+        return f"agent {what + 1}'s gain on all that it receives", what + 1, None, None
     if part == "leader":
         return f"agent {what + 1}'s gain as a leader", what + 1, None, None
     if part == "sender":

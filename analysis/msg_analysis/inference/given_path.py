@@ -12,8 +12,8 @@ y(k)], with martingale increments D. The covariance of their sum is estimated by
 
     Cov(D_a, D_b | y(k)) = tr( Y_a N Y_b (2 N + 4 W y y^T W^T) ) / R,
 
-an exact function of the states. Where a few sojourns decide the errors (far starts, short runs, rare jumps), the law
-over all paths is far from normal; this ratio is not.
+an exact function of the states. Where a few holding times decide the errors (far starts, short runs, rare jumps),
+the law over all paths is far from normal; this ratio is not.
 """
 
 from __future__ import annotations
@@ -236,7 +236,7 @@ def _with_losses(
     observation: Observation, step: StepModel, mode: int, lost: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """W and N (m, m) of a step under a graph in which these messages (m, D) are lost."""
-    tables, air = neighbour_tables(step), observation.prediction.experiment.noise
+    tables, reception = neighbour_tables(step), observation.prediction.experiment.noise
     weights = step.nominal[mode].copy()
     for i, missing in enumerate(lost):
         count = tables.count[mode, i]
@@ -244,5 +244,5 @@ def _with_losses(
             weights[i, i] += weights[i, j]
             weights[i, j] = 0.0
     coupling = weights - np.diag(np.diag(weights))
-    noise = step.noise_gain[mode] @ step.noise_gain[mode].T + air.broadcast**2 * coupling @ coupling.T
-    return weights, noise + air.link**2 * np.diag((coupling**2).sum(axis=1))
+    noise = step.noise_gain[mode] @ step.noise_gain[mode].T + reception.broadcast**2 * coupling @ coupling.T
+    return weights, noise + reception.link**2 * np.diag((coupling**2).sum(axis=1))

@@ -17,7 +17,7 @@ from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.experiment.markov_chain import stationary_law
 from msg_analysis.inference.candidates import Cause, find_rates, numbers_text
 from msg_analysis.inference.e_values import (
-    Looks,
+    Analyses,
     WindowEvidence,
     Windows,
     log_mean,
@@ -118,21 +118,23 @@ def _rates(search: Search) -> list[Cause]:
     return found
 
 
-PARTS = 8  # of the ages of a sojourn, each with the same share of the ends of sojourns, as nearly as steps allow
+PARTS = (
+    8  # of the ages of a holding time, each with the same share of the ends of holding times, as nearly as steps allow
+)
 JOINED = (1, 2, 4)  # parts that are one in the evidence: many parts cost evidence, few hide a departure
 MIN_EXPECTED = 15.0  # fewest steps with, and fewest without, a switch in a part, for the chi-square law
 
 
 class HoldingTimes(Diagnostic):
-    """Switches counted by graph and by the age of the sojourn, in parts.
+    """Switches counted by graph and by the age of the holding time, in parts.
 
-    Given the past, a step ends its sojourn with the probability 1 - P_gg. So every part is a binomial question of its
-    own, and the product of their evidence is evidence. The test is the likelihood ratio of one probability for each
+    Given the past, a step ends its holding time with the probability 1 - P_gg. So every part is a binomial question of
+    its own, and the product of their evidence is evidence. The test is the likelihood ratio of one probability for each
     part against a common one, whatever that is (rates have their own test): chi-square with parts - 1 degrees of
     freedom for each graph. Parts with few expected switches are joined.
     """
 
-    name = "sojourns"
+    name = "holding times"
     meaning = "the time for which a graph stays depends on how long it has stayed: the chain is not Markov"
     about_chain = True
 
@@ -144,29 +146,29 @@ class HoldingTimes(Diagnostic):
         self._edges = [_edges(float(p)) for p in self._leaving]  # ages at which the parts 1, 2, ... begin
         self.steps, self.left = np.zeros((n, PARTS), np.int64), np.zeros((n, PARTS), np.int64)
         self._known = proportion_constant(self._leaving[self._tested, None])  # (G, 1, K)
-        self._age = 0  # of the sojourn at the step that comes next
+        self._age = 0  # of the holding time at the step that comes next
 
     def add(self, block: Block) -> FloatArray:
         """Count the steps of a block."""
-        return self.count(block.graphs, block.looks)
+        return self.count(block.graphs, block.analyses)
 
-    def count(self, graphs: IntArray, looks: Looks) -> FloatArray:
+    def count(self, graphs: IntArray, analyses: Analyses) -> FloatArray:
         """Count the steps to the second, third, ... of these graphs; the first one was the last of those before."""
-        shape = looks.count, *self.steps.shape
-        steps, left = self._parts(graphs, looks) if len(graphs) > 1 else np.zeros((2, *shape), np.int64)
+        shape = analyses.count, *self.steps.shape
+        steps, left = self._parts(graphs, analyses) if len(graphs) > 1 else np.zeros((2, *shape), np.int64)
         steps, left = self.steps + steps.cumsum(axis=0), self.left + left.cumsum(axis=0)
         self.steps, self.left = steps[-1], left[-1]
         return self._evidence(steps, left)
 
-    def _parts(self, graphs: IntArray, looks: Looks) -> IntArray:
-        """(2, T, n, PARTS): steps, and those that left their graph, between the looks."""
+    def _parts(self, graphs: IntArray, analyses: Analyses) -> IntArray:
+        """(2, T, n, PARTS): steps, and those that left their graph, between the analyses."""
         now, left = graphs[:-1], graphs[1:] != graphs[:-1]
         index = np.arange(len(now))
         begin = np.maximum.accumulate(np.where(np.append(True, left[:-1]), index, 0))
         age = index - begin + np.where(begin == 0, self._age, 0)
         self._age = 0 if left[-1] else int(age[-1]) + 1
-        shape = looks.count, *self.steps.shape
-        place = (looks.after(index) * shape[1] + now) * PARTS
+        shape = analyses.count, *self.steps.shape
+        place = (analyses.after(index) * shape[1] + now) * PARTS
         for graph in np.unique(now).tolist():
             at = now == graph
             place[at] += np.searchsorted(self._edges[graph], age[at], side="right")
@@ -174,7 +176,7 @@ class HoldingTimes(Diagnostic):
         return np.array(counts)
 
     def merge(self, other: Self) -> None:
-        """No sojourn goes on from one run to another."""
+        """No holding time goes on from one run to another."""
         self.steps += other.steps
         self.left += other.left
 
@@ -224,7 +226,7 @@ class HoldingTimes(Diagnostic):
 
     def about(self, row: int) -> str:
         """Holding times of a graph, or all."""
-        return f"sojourns in {self.law.graphs[self._tested[row]]}" if row < len(self._tested) else "sojourns"
+        return f"holding times of {self.law.graphs[self._tested[row]]}" if row < len(self._tested) else "holding times"
 
     @property
     def _tested(self) -> IntArray:
@@ -240,7 +242,7 @@ class HoldingTimes(Diagnostic):
         part = f"in step {first:,} of it" if first == last else part
         graph, value = names[found.graph], found.estimate or 0.0
         words = (
-            f"the probability of leaving graph {graph} depends on the length of the sojourn: it is "
+            f"the probability of leaving graph {graph} depends on how long it has lasted: it is "
             f"{numbers_text(value, found.interval)} {part}, not {found.expected:.3g}"
         )
         return Cause("sojourns", words, None, None, graph, value, found.interval, found.expected, p)
@@ -252,7 +254,7 @@ def _in_parts(counts: IntArray) -> IntArray:
 
 
 def _edges(leaving: float) -> IntArray:
-    """(PARTS - 1,) ages at which 1/8, 2/8, ... of the sojourns have ended."""
+    """(PARTS - 1,) ages at which 1/8, 2/8, ... of the holding times have ended."""
     if not 0.0 < leaving < 1.0:
         return np.full(PARTS - 1, np.iinfo(np.int64).max)
     shares = np.arange(1, PARTS) / PARTS
@@ -264,7 +266,7 @@ def _joined(visits: float, leaving: float, edges: IntArray) -> IntArray:
     if not 0.0 < leaving < 1.0:
         return np.zeros(1, np.int64)
     survive = (1.0 - leaving) ** np.append(0.0, edges.astype(float))
-    ends = visits * leaving * -np.diff(np.append(survive, 0.0))  # expected ends of sojourns
+    ends = visits * leaving * -np.diff(np.append(survive, 0.0))  # expected ends of holding times
     rare = ends * min(1.0, (1.0 - leaving) / leaving)
     groups, gathered = [0], 0.0
     for part, expected in enumerate(rare.tolist()):
@@ -288,11 +290,11 @@ class SwappedGraphs(Diagnostic):
     """Likelihood ratios of two graphs whose names are swapped, in windows of 1, 2, 4, ... steps, for every pair.
 
     The product over the steps of a window is evidence against the law, and so is the mean over all windows of a run and
-    over the pairs; its inverse is the p of the test (Markov). Only in lockstep where all agents hear the states
+    over the pairs; its inverse is the p of the test (Markov). Only in lockstep where all agents receive the states
     themselves and have noise, independent of each other.
     """
 
-    name = "innovations: swapped graphs"
+    name = "residuals: swapped graphs"
     meaning = "two graphs have each other's name in the log"
 
     def __init__(self, law: Law) -> None:
@@ -308,7 +310,7 @@ class SwappedGraphs(Diagnostic):
     def add(self, block: Block) -> FloatArray:
         """The windows that end in the block."""
         if not len(self._pairs):
-            return np.empty((block.looks.count, 0, 1))
+            return np.empty((block.analyses.count, 0, 1))
         logged, modes = _log_density(block.white, block.scale), block.reception.modes
         density = np.empty((len(logged), self._step.modes))
         for graph, deviation in enumerate(self._deviation):
@@ -319,7 +321,7 @@ class SwappedGraphs(Diagnostic):
         swapped = np.where(modes[:, None] == second, density[:, first], swapped)
         ended = self._windows.add(swapped - logged[:, None])
         level = ended.level
-        evidence = self._evidence.add(ended, ended.sums, block.looks)
+        evidence = self._evidence.add(ended, ended.sums, block.analyses)
         values = ended.sums - np.log(self._windows.planned[level])[:, None]
         at, pair = np.unravel_index(int(np.argmax(values)), values.shape)
         if values[at, pair] > self._best:
@@ -362,5 +364,5 @@ class SwappedGraphs(Diagnostic):
 
 
 def _log_density(white: FloatArray, deviation: FloatArray) -> FloatArray:
-    """(b,) log density of all innovations of a step but for a constant; standardised ones (b, m, R)."""
+    """(b,) log density of all residuals of a step but for a constant; standardised ones (b, m, R)."""
     return np.asarray(-0.5 * (white**2).sum(axis=(1, 2)) - white.shape[2] * np.log(deviation).sum(axis=-1))

@@ -85,7 +85,7 @@ class LossTally:
         if not observation.step.loss:
             return None
         if isinstance(observation, Observation) and observation.timers is not None:
-            # With the last value heard in place of a lost one, the log does not tell lost messages from late ones.
+            # With the last value received in place of a lost one, the log does not tell lost messages from late ones.
             return None if observation.step.holds or observation.step.burst is not None else cls(observation)
         return cls(observation) if observation.lost is not None else None
 

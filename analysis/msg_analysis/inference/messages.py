@@ -146,13 +146,13 @@ MIN_SAMPLES = 100  # fewest steps of all replicas for the normal law of a score
 
 
 class StaleValues(Diagnostic):
-    """Regression of the innovations on weight * (neighbour's previous value - the one that was used).
+    """Regression of the residuals on weight * (neighbour's previous value - the one that was used).
 
     The coefficient is the share of stale values, expected 0. The test takes the clearest link, or all links together
     where agents are independent, with half of the level each and the number of coefficients as a factor (Bonferroni).
     """
 
-    name = "innovations: stale values"
+    name = "residuals: stale values"
     meaning = "agents use values that are one step older than the log says"
 
     def __init__(self, law: Law) -> None:
@@ -165,23 +165,23 @@ class StaleValues(Diagnostic):
 
     def add(self, block: Block) -> FloatArray:
         """Scores and information of all links."""
-        heard, looks = block.reception, block.looks
-        steps, agents, neighbours = heard.used.shape
+        received, analyses = block.reception, block.analyses
+        steps, agents, neighbours = received.used.shape
         if not len(self._links):
-            return np.empty((looks.count, 0, 1))
-        shape = looks.count, agents, agents
+            return np.empty((analyses.count, 0, 1))
+        shape = analyses.count, agents, agents
         score, information = np.zeros((2, *shape))
-        look = looks.after(np.arange(steps))
+        analysis = analyses.after(np.arange(steps))
         self.samples += steps * block.white.shape[2]
         receivers = np.broadcast_to(np.arange(agents), (steps, agents))
         for d in range(neighbours):
-            senders, used = heard.senders[:, :, d], heard.used[:, :, d]
-            there = self._used[receivers, senders] & (heard.weights[:, :, d] != 0.0) & (used > 0)
+            senders, used = received.senders[:, :, d], received.used[:, :, d]
+            there = self._used[receivers, senders] & (received.weights[:, :, d] != 0.0) & (used > 0)
             at, who = np.nonzero(there)
             sender, newest = senders[at, who], used[at, who]
-            older = heard.published[newest - 1, sender] - heard.published[newest, sender]
-            part = (heard.weights[at, who, d] / block.scale[at, who])[:, None] * older
-            place = np.ravel_multi_index((look[at], who, sender), shape)
+            older = received.published[newest - 1, sender] - received.published[newest, sender]
+            part = (received.weights[at, who, d] / block.scale[at, who])[:, None] * older
+            place = np.ravel_multi_index((analysis[at], who, sender), shape)
             for total, values in ((score, part * block.white[at, who]), (information, part**2)):
                 total += np.bincount(place, values.sum(axis=1), minlength=total.size).reshape(shape)
         score, information = self.score + score.cumsum(axis=0), self.information + information.cumsum(axis=0)

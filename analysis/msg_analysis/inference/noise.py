@@ -43,14 +43,14 @@ from msg_analysis.inference.statistics import log_chi2_below, log_chi2_tail, log
 class Noise(Question):
     """Whether the covariance of the residuals is that of the noise."""
 
-    name = "innovations: covariance"
+    name = "residuals: covariance"
     meaning = "the noise of some agents is larger, smaller, or correlated otherwise than in the file"
     main = True
 
     @classmethod
     def tests(cls, run: Statistics) -> list[Test]:
         """Of the whole covariance."""
-        return one_test(cls.name, run.innovations.p_covariance)
+        return one_test(cls.name, run.residuals.p_covariance)
 
     def evidence(self, sums: RunningSums) -> FloatArray:
         """One row for each agent whose noise is known to be independent over time."""
@@ -95,12 +95,12 @@ def _noise_cause(found: Finding, names: Sequence[str], p: float) -> Cause:
 
 
 class NoiseByGraph(Diagnostic):
-    """Squares of standardised innovations by graph and agent, and of all agents together where these are independent.
+    """Squares of standardised residuals by graph and agent, and of all agents together where these are independent.
 
     Each sum is chi-square; the test is two-sided, with the number of sums as a factor (Bonferroni).
     """
 
-    name = "innovations: noise by graph"
+    name = "residuals: noise by graph"
     meaning = "the size of the noise is wrong under some graph"
 
     def __init__(self, law: Law) -> None:
@@ -112,10 +112,10 @@ class NoiseByGraph(Diagnostic):
 
     def add(self, block: Block) -> FloatArray:
         """Every agent by the graph that it used."""
-        size, looks = (block.white**2).sum(axis=2), block.looks
+        size, analyses = (block.white**2).sum(axis=2), block.analyses
         there = [block.reception.graphs == graph for graph in range(self._graphs)]
-        samples = np.stack([looks.counts(each) for each in there], axis=1) * block.white.shape[2]  # (T, n, m)
-        squares = np.stack([looks.sums(size * each) for each in there], axis=1)
+        samples = np.stack([analyses.counts(each) for each in there], axis=1) * block.white.shape[2]  # (T, n, m)
+        squares = np.stack([analyses.sums(size * each) for each in there], axis=1)
         samples, squares = self.samples + samples.cumsum(axis=0), self.squares + squares.cumsum(axis=0)
         self.samples, self.squares = samples[-1], squares[-1]
         return self._evidence(samples, squares)
@@ -184,7 +184,7 @@ SHARE = 0.1  # of the logarithm of the p-value
 
 
 class NoiseOverTime(Diagnostic):
-    """Squares of standardised innovations in windows of 1, 2, 4, ... steps, by agent and of all where independent.
+    """Squares of standardised residuals in windows of 1, 2, 4, ... steps, by agent and of all where independent.
 
     The sum over a window is chi-square. The law of the largest and the smallest is bounded by the union over windows:
     every length has the same share of the level, and within it every window and agent (weighted Bonferroni).
@@ -194,7 +194,7 @@ class NoiseOverTime(Diagnostic):
     chi-square distribution function, which are exactly N(0, 1). Windows and lags have half of the level each.
     """
 
-    name = "innovations: noise over time"
+    name = "residuals: noise over time"
     meaning = "the size of the noise is wrong in a part of the run, or changes with time"
 
     def __init__(self, law: Law) -> None:
@@ -221,18 +221,18 @@ class NoiseOverTime(Diagnostic):
 
     def add(self, block: Block) -> FloatArray:
         """The windows that end in the block."""
-        looks = block.looks
+        analyses = block.analyses
         if not self._columns:
-            return np.empty((looks.count, 0, 1))
+            return np.empty((analyses.count, 0, 1))
         squares = (block.white[:, self._agents] ** 2).sum(axis=2)
         if self._together:
             squares = np.column_stack([squares, squares.sum(axis=1)])
-        lags = lag_evidence(*self._lags.add(normal_score(squares, self._numbers)[:, :, None], looks))
+        lags = lag_evidence(*self._lags.add(normal_score(squares, self._numbers)[:, :, None], analyses))
         ended = self._windows.add(squares)
         self._keep(ended)
         numbers, constant = (np.repeat(each[ended.levels], ended.counts, axis=0) for each in (self._sizes, self._known))
         mixed = log_mean(variance_evidence(numbers, ended.sums, constant), axis=-1)
-        windows = self._evidence.add(ended, mixed, looks)
+        windows = self._evidence.add(ended, mixed, analyses)
         return np.concatenate([windows, _mean_over_lags(lags)], axis=1)[:, :, None]
 
     def _keep(self, ended: EndedWindows) -> None:
@@ -369,18 +369,18 @@ def _mean_over_lags(evidence: FloatArray) -> FloatArray:
     return log_mean(evidence.reshape(*evidence.shape[:-2], math.prod(evidence.shape[-2:])), axis=-1)
 
 
-LARGE = 4.0  # standard deviations; smaller innovations have the evidence 0
+LARGE = 4.0  # standard deviations; smaller residuals have the evidence 0
 
 
 class LargestResidual(Diagnostic):
-    """Every innovation by itself, N(0, 1) after division by its standard deviation.
+    """Every residual by itself, N(0, 1) after division by its standard deviation.
 
     The test is that of the largest, with their number as a factor (Bonferroni). The evidence is the mean over all
-    innovations of a run of that of each one against a larger variance; those to come count 1. Half of the whole always
+    residuals of a run of that of each one against a larger variance; those to come count 1. Half of the whole always
     counts 1.
     """
 
-    name = "innovations: largest"
+    name = "residuals: largest"
     meaning = "a single step is much larger than the noise"
 
     def __init__(self, law: Law) -> None:
@@ -391,15 +391,15 @@ class LargestResidual(Diagnostic):
         self._largest, self._agent, self._place, self._runs = 0.0, 0, Place(0, 0), 1
 
     def add(self, block: Block) -> FloatArray:
-        """Look at the innovations of a block."""
-        white, looks = block.white[:, self._agents], block.looks
+        """Add the residuals of a block."""
+        white, analyses = block.white[:, self._agents], block.analyses
         if not white.size:
-            return np.empty((looks.count, 0, 1))
+            return np.empty((analyses.count, 0, 1))
         self._samples += white.size
         sizes = np.abs(white)
         large = sizes > LARGE
         logarithms = variance_evidence(np.ones(int(large.sum())), sizes[large] ** 2)[:, 0]
-        seen, when = looks.lengths * white[0].size, looks.after(np.nonzero(large)[0])
+        seen, when = analyses.lengths * white[0].size, analyses.after(np.nonzero(large)[0])
         at = int(np.argmax(sizes))
         if not sizes.flat[at] <= abs(self._largest):  # also a NaN
             step, place, _ = np.unravel_index(at, white.shape)
@@ -429,7 +429,7 @@ class LargestResidual(Diagnostic):
     def about(self, row: int) -> str:
         """One, about all agents."""
         del row
-        return "largest innovation"
+        return "largest residual"
 
     @classmethod
     def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:

@@ -16,7 +16,7 @@ from msg_analysis.inference.observation import Observation, Timers
 from msg_analysis.model.reception import neighbour_tables
 from msg_analysis.model.step_model import StepModel
 
-OWN = int(np.iinfo(np.int32).min)  # stands for a value that was never heard; the agent's own value takes its place
+OWN = int(np.iinfo(np.int32).min)  # stands for a value that was never received; the agent's own value takes its place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,11 +106,11 @@ class _Maker:
             begun[first:last] = -1
         for i in range(self._step.agents):
             seen = int(self._order.newest[self._observation.steps - 1, i])
-            senders, heard = self._senders[column(graphs, i)[:seen], i], column(used, i)[:seen]
-            k, d = np.nonzero(heard >= 0)
-            by = np.lexsort((heard[k, d], senders[k, d]))  # uses of a message stay in the order of the agent's steps
+            senders, received = self._senders[column(graphs, i)[:seen], i], column(used, i)[:seen]
+            k, d = np.nonzero(received >= 0)
+            by = np.lexsort((received[k, d], senders[k, d]))  # uses of a message stay in the order of the agent's steps
             k, d = k[by], d[by]
-            new = (np.diff(heard[k, d], prepend=-1) != 0) | (np.diff(senders[k, d], prepend=-1) != 0)
+            new = (np.diff(received[k, d], prepend=-1) != 0) | (np.diff(senders[k, d], prepend=-1) != 0)
             start = np.flatnonzero(new)
             count = np.diff(start, append=len(k))
             again = np.repeat(count > 1, count)
@@ -152,12 +152,12 @@ class _Maker:
         graphs, used, made = timers.graphs[begin:end], timers.used[begin:end], timers.made
         senders = self._senders[graphs, np.arange(m)]
         period = self._period(made[begin + 1 : end + 1])
-        heard = (used >= 0) & (period < self._observation.steps)[:, :, None]
-        again = np.zeros_like(heard)
+        received = (used >= 0) & (period < self._observation.steps)[:, :, None]
+        again = np.zeros_like(received)
         if self._begun is not None:
             first_use = self._begun[begin:end]
-            again = heard & (first_use >= 0) & (first_use != np.arange(begin, end)[:, None, None])
-        k, i, d = np.nonzero(heard & ~again)
+            again = received & (first_use >= 0) & (first_use != np.arange(begin, end)[:, None, None])
+        k, i, d = np.nonzero(received & ~again)
         sender, message, last = senders[k, i, d], used[k, i, d], period[k, i] - 1
         if step.broadcast:  # from the first sampling time at which it has been published
             first = np.where(message > 0, self._period(made[message, sender]), 0)

@@ -64,7 +64,7 @@ def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> C
     if total is None:
         comparison = verdict.without_numbers(trajectory, level, prediction, 0)
     else:
-        comparison = verdict.judge(trajectory, prediction, total, level, pool.p)
+        comparison = verdict.evaluate(trajectory, prediction, total, level, pool.p)
     return dataclasses.replace(comparison, pool=pool)
 
 
@@ -75,7 +75,7 @@ def _examine(name: str, run: Run, prediction: Prediction, level: float) -> tuple
         missing = Estimate(predicted=prediction.emulated.system_error)
         return Member(name, run.record, 0, run.completeness, missing, missing, "incomplete"), None
     evidence = Evidence.of(observation, level)
-    alone = verdict.judge(run, prediction, evidence, level)
+    alone = verdict.evaluate(run, prediction, evidence, level)
     tested = alone.given.system_error if alone.given else alone.system_error
     member = Member(name, run.record, evidence.steps, run.completeness, alone.system_error, tested, alone.verdict)
     return member, evidence

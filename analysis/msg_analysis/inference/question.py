@@ -21,11 +21,11 @@ from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.inference import candidates
 from msg_analysis.inference.candidates import Cause, Parameters, Selected, select
-from msg_analysis.inference.e_values import Looks
+from msg_analysis.inference.e_values import Analyses
 from msg_analysis.inference.estimates import CovarianceTest, Estimate
 from msg_analysis.inference.losses import LossTally, LossTest
-from msg_analysis.inference.received_values import HeardValues
-from msg_analysis.inference.residuals import BroadcastSums, InnovationSums, InnovationTests
+from msg_analysis.inference.received_values import ReceivedValues
+from msg_analysis.inference.residuals import BroadcastSums, ResidualSums, ResidualTests
 from msg_analysis.inference.transitions import SwitchingTest, Transitions
 from msg_analysis.model.step_model import StepModel
 
@@ -109,7 +109,7 @@ class Statistics:
     system_error: Estimate | None  # as it is tested: given the path of the graphs where that is known
     node_errors: Sequence[Estimate]
     covariance: CovarianceTest | None
-    innovations: InnovationTests
+    residuals: ResidualTests
     switching: SwitchingTest | None
     loss: LossTest | None
     p_broadcast: float | None
@@ -130,7 +130,7 @@ class Search:
         chain: MarkovChain,
         dt: float,
         reference: float,
-        innovations: InnovationSums,
+        residuals: ResidualSums,
         transitions: Transitions,
         loss: LossTally | None,
         broadcast: BroadcastSums | None,
@@ -138,12 +138,12 @@ class Search:
         level: float,
     ) -> None:
         self.names, self.chain, self.dt, self.reference = names, chain, dt, reference  # names of the graphs
-        self.innovations, self.transitions, self.loss_tally = innovations, transitions, loss
+        self.residuals, self.transitions, self.loss_tally = residuals, transitions, loss
         self.findings, self.level = findings, level
         self.families = 0  # classes of candidates, all questions together
-        self.frozen = candidates.frozen(innovations)
+        self.frozen = candidates.frozen(residuals)
         self.excluded = [agent for agent, _, _ in self.frozen]
-        self.gains = candidates.gains(innovations, self.excluded)
+        self.gains = candidates.gains(residuals, self.excluded)
         self.losses = candidates.losses(loss) if loss else None
         self.broadcast = candidates.variances(np.diag(broadcast.scatter), broadcast.samples) if broadcast else None
 
@@ -157,26 +157,26 @@ class Search:
     @cached_property
     def selected_gains(self) -> tuple[list[Selected], FloatArray]:
         """What is found in the regression, and the total change of its coefficients."""
-        return self._select(self.gains) if self.gains else ([], np.zeros(len(self.innovations.terms)))
+        return self._select(self.gains) if self.gains else ([], np.zeros(len(self.residuals.terms)))
 
     @property
     def any_noise(self) -> Parameters | None:
         """The noise variances as if all gains were right."""
-        return candidates.noise(self.innovations, self.excluded, np.zeros(len(self.innovations.terms)))
+        return candidates.noise(self.residuals, self.excluded, np.zeros(len(self.residuals.terms)))
 
     @cached_property
     def noise(self) -> Parameters | None:
         """The noise variances, without what wrong gains explain."""
-        return candidates.noise(self.innovations, self.excluded, self.selected_gains[1])
+        return candidates.noise(self.residuals, self.excluded, self.selected_gains[1])
 
 
 @dataclass(slots=True, eq=False)
 class RunningSums:
-    """Sums over the steps before each of T looks, for m agents, n graphs and L rates of the system error."""
+    """Sums over the steps before each of T analyses, for m agents, n graphs and L rates of the system error."""
 
     impossible: IntArray  # (T,) steps in which an agent without noise moved
-    samples: IntArray  # (T, m) innovations
-    squares: FloatArray  # (T, m) of innovations over their standard deviations
+    samples: IntArray  # (T, m) residuals
+    squares: FloatArray  # (T, m) of residuals over their standard deviations
     link_score: FloatArray  # (T, m, m) receiver, sender
     link_information: FloatArray  # (T, m, m)
     pair_score: FloatArray  # (T, m, m)
@@ -191,7 +191,7 @@ class RunningSums:
     error: FloatArray  # (T, L) logarithms of the martingales of the system error
 
     @classmethod
-    def zeros(cls, looks: int, agents: int, graphs: int, rates: int) -> RunningSums:
+    def zeros(cls, analyses: int, agents: int, graphs: int, rates: int) -> RunningSums:
         """Of no step."""
         m, n = agents, graphs
         shapes: dict[str, tuple[int, ...]] = {"counts": (n, n), "error": (rates,)}
@@ -200,22 +200,22 @@ class RunningSums:
         shapes |= dict.fromkeys(pairs, (m, m))
         whole = "impossible", "samples", "counts", "messages", "lost", "broadcast_samples"
         made: dict[str, Any] = {
-            each.name: np.zeros((looks, *shapes.get(each.name, ())), np.int64 if each.name in whole else np.float64)
+            each.name: np.zeros((analyses, *shapes.get(each.name, ())), np.int64 if each.name in whole else np.float64)
             for each in fields(cls)
         }
         return cls(**made)
 
     def then(self, parts: RunningSums) -> RunningSums:
-        """After each look, from the last sums of these and those between the looks."""
+        """After each analysis, from the last sums of these and those between the analyses."""
         added = {each.name: getattr(parts, each.name).cumsum(axis=0) for each in fields(self)}
         return RunningSums(**{name: getattr(self, name)[-1] + values for name, values in added.items()})
 
     def last(self) -> RunningSums:
-        """After the last look only."""
+        """After the last analysis only."""
         return RunningSums(**{each.name: getattr(self, each.name)[-1:].copy() for each in fields(self)})
 
     def merge(self, other: RunningSums) -> None:
-        """Add the sums of another run, looked at as often."""
+        """Add the sums of another run, with as many analyses."""
         for each in fields(self):
             getattr(self, each.name).__iadd__(getattr(other, each.name))
 
@@ -228,10 +228,10 @@ class Law:
     graphs: Sequence[str]  # their names
     planned: int  # steps of a complete run
     replicas: int  # R
-    noisy: BoolArray  # (m,) agents whose innovations are known to be independent normal numbers over time
-    apart: bool  # whether those of different agents are independent of each other, given what they heard
-    links: IntArray  # (L, 2) receiver and sender, where innovations are independent of all that the receiver heard
-    plain: bool  # whether all agents hear the states themselves, in lockstep
+    noisy: BoolArray  # (m,) agents whose residuals are known to be independent normal numbers over time
+    apart: bool  # whether those of different agents are independent of each other, given what they received
+    links: IntArray  # (L, 2) receiver and sender, where residuals are independent of all that the receiver received
+    plain: bool  # whether all agents receive the states themselves, in lockstep
     gains: IntArray  # (G, 2) receivers and senders whose gains are asked about; the same agent twice: pull of a leader
     pairs: IntArray  # (P, 2) agents whose noises may be common
     lossy: IntArray  # (l, 2) receivers and senders whose losses are
@@ -261,7 +261,7 @@ class Question(ABC):
         return 1
 
     def evidence(self, sums: RunningSums) -> FloatArray:
-        """(T, rows, alternatives) logarithms of the evidence after each look; no row where it has none."""
+        """(T, rows, alternatives) logarithms of the evidence after each analysis; no row where it has none."""
         return np.empty((len(sums.impossible), 0, 1))
 
     def about(self, row: int) -> str:
@@ -293,11 +293,11 @@ class Block:
 
     first: int  # number of the first of the b steps
     graphs: IntArray  # (b + 1,) of these steps and of the next one; (b,) at the end of a run
-    white: FloatArray  # (b, m, R) innovations over their standard deviations, N(0, 1) by the law; 0 without noise
+    white: FloatArray  # (b, m, R) residuals over their standard deviations, N(0, 1) by the law; 0 without noise
     scale: FloatArray  # (b, m) these standard deviations; infinite without noise
     after: FloatArray  # (b, m, R) states after the steps
-    reception: HeardValues  # what was heard in the steps, and the states before them
-    looks: Looks  # when evidence is looked at, T times
+    reception: ReceivedValues  # what was received in the steps, and the states before them
+    analyses: Analyses  # the interim analyses, T of them
 
 
 class Diagnostic(Question):
@@ -308,7 +308,7 @@ class Diagnostic(Question):
 
     @abstractmethod
     def add(self, block: Block) -> FloatArray:
-        """Add steps, which follow those that were added before: (T, ...) of ``logarithms`` after each look."""
+        """Add steps, which follow those that were added before: (T, ...) of ``logarithms`` after each analysis."""
 
     @abstractmethod
     def merge(self, other: Self) -> None:

@@ -136,7 +136,7 @@ def pattern_means(observation: Observation, order: EventOrder) -> TimeMeans:
 
 
 def means_in_lockstep(observation: Observation) -> TimeMeans | None:
-    """Time means of a run in lockstep, given the path of the graphs and which values were heard.
+    """Time means of a run in lockstep, given the path of the graphs and which values were received.
 
     None where that would take too long.
     """
@@ -240,7 +240,7 @@ class Laws:
     """The laws of a run in real time."""
 
     pattern: Law  # given the values and graphs that the agents logged as used; exact for any timing
-    sequential: Law  # no step is late, every value is heard at once
+    sequential: Law  # no step is late, every value is received at once
     continuous: Law  # the paper's
 
     @property

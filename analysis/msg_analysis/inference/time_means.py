@@ -56,7 +56,7 @@ class TimeMeans:
 
     @property
     def long_enough(self) -> bool:
-        """Whether the errors of such runs are nearly normal: many sojourns, none of which decides the variance."""
+        """Whether the errors of such runs are nearly normal: many holding times, none of which decides the variance."""
         if self.heavy:
             return False
         if math.isinf(self.switches):

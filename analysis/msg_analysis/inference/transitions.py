@@ -132,7 +132,7 @@ def _drawn(law: bytes, paths: tuple[tuple[int, int], ...], number: int) -> Float
 def simulate_counts(
     transition: FloatArray, first: int, transitions: int, paths: int, random: np.random.Generator
 ) -> IntArray:
-    """(paths, n, n): transition counts of independent paths from the graph ``first``, drawn sojourn by sojourn."""
+    """(paths, n, n): transition counts of independent paths from the graph ``first``, by their holding times."""
     n = len(transition)
     leaving = 1.0 - np.diag(transition)
     jumps = transition - np.diag(np.diag(transition))

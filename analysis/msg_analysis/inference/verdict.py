@@ -22,7 +22,7 @@ from msg_analysis.inference.losses import loss_test
 from msg_analysis.inference.observation import Measurement, Observation, spaced_steps
 from msg_analysis.inference.question import Finding, Search, Statistics
 from msg_analysis.inference.questions import causes_of, decide
-from msg_analysis.inference.residuals import InnovationTests
+from msg_analysis.inference.residuals import ResidualTests
 from msg_analysis.inference.statistics import batch_interval, steps_to_half_width
 from msg_analysis.inference.time_means import TimeMeans
 from msg_analysis.inference.transitions import switching_test
@@ -65,10 +65,10 @@ def compare(trajectory: Run, *, level: float = 0.01) -> Comparison:
         return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
     until = trajectory.record.until
     decided = until is not None and until.decided
-    return judge(trajectory, prediction, Evidence.of(observation, level, decided=decided), level)
+    return evaluate(trajectory, prediction, Evidence.of(observation, level, decided=decided), level)
 
 
-def judge(
+def evaluate(
     trajectory: Run,
     prediction: Prediction,
     evidence: Evidence,
@@ -87,7 +87,7 @@ def judge(
         system_error=tested_error,
         node_errors=tested_nodes,
         covariance=covariance if evidence.decisive else None,
-        innovations=evidence.innovations.tests(),
+        residuals=evidence.residuals.tests(),
         switching=evidence.transitions.test(prediction.step.transition),
         loss=evidence.loss.test() if evidence.loss else None,
         p_broadcast=evidence.broadcast.p_value() if evidence.broadcast else None,
@@ -108,7 +108,7 @@ def judge(
         system_error=system_error,
         node_errors=node_errors,
         covariance=covariance,
-        innovations=run.innovations,
+        innovations=run.residuals,
         switching=run.switching,
         continuous_error=prediction.continuous.system_error if prediction.continuous_moments else None,
         batch=batch_interval(means.system_series),
@@ -168,7 +168,7 @@ def _search(prediction: Prediction, evidence: Evidence, findings: Mapping[str, F
         chain=experiment.chain,
         dt=experiment.step_length,
         reference=experiment.reference,
-        innovations=evidence.innovations,
+        residuals=evidence.residuals,
         transitions=evidence.transitions,
         loss=evidence.loss,
         broadcast=evidence.broadcast,
@@ -188,7 +188,7 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
         system_error=None,
         node_errors=(),
         covariance=None,
-        innovations=InnovationTests(None, None, None),
+        residuals=ResidualTests(None, None, None),
         switching=switching_test(measurement.modes, measurement.step.transition) if enough else None,
         loss=loss_test(measurement) if enough else None,
         p_broadcast=None,
@@ -202,7 +202,7 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
         system_error=Estimate() if covariance is None else Estimate(float(np.trace(covariance))),
         node_errors=nodes,
         covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
-        innovations=run.innovations,
+        innovations=run.residuals,
         switching=run.switching,
         continuous_error=None,
         batch=batch_interval(series) if enough else None,
@@ -228,7 +228,7 @@ def without_numbers(trajectory: Run, level: float, prediction: Prediction, steps
         system_error=Estimate(predicted=predicted.system_error),
         node_errors=[Estimate(predicted=float(error)) for error in predicted.node_errors],
         covariance=CovarianceTest(predicted=predicted.covariance),
-        innovations=InnovationTests(None, None, None),
+        innovations=ResidualTests(None, None, None),
         switching=None,
         continuous_error=prediction.continuous.system_error if prediction.continuous_moments else None,
         batch=None,

@@ -257,7 +257,7 @@ def conclude(result: RunResult, report: ReportWhen = "always") -> None:
         from msg_agents.channel.process import channel_findings
 
         timing = comparison.timing
-        result.channel["findings"] = channel_findings(result.channel, timing.unheard, timing.period_ms)
+        result.channel["findings"] = channel_findings(result.channel, timing.lost_messages, timing.period_ms)
     if report == "always" or (report == "on-failure" and comparison.verdict != "agrees"):
         from msg_analysis.report.page import write_report
 

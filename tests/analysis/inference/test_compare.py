@@ -132,7 +132,7 @@ def test_differences_that_are_only_rounding_are_no_evidence():
         run.states[:] = np.nextafter(run.states, random.choice([-np.inf, np.inf], run.states.shape))
         result = compare(run)
         assert result.verdict == "agrees"
-        assert "innovations: common gain" not in p_values(result)
+        assert "residuals: common gain" not in p_values(result)
 
 
 def simulate_air(experiment, seed):
@@ -198,8 +198,8 @@ def test_standard_errors_hold_when_the_graph_hardly_ever_switches():
 @pytest.mark.parametrize(
     ("truth", "found_by"),
     [
-        ({"noise": {"process": 1.05}}, "innovations: covariance"),
-        ({"noise": {"process": [1.0, 1.0, 1.15, 1.0, 1.0]}}, "innovations: covariance"),
+        ({"noise": {"process": 1.05}}, "residuals: covariance"),
+        ({"noise": {"process": [1.0, 1.0, 1.15, 1.0, 1.0]}}, "residuals: covariance"),
         (
             {
                 "graphs": {
@@ -207,7 +207,7 @@ def test_standard_errors_hold_when_the_graph_hardly_ever_switches():
                     "ring": {"edges": [[i, i % 5 + 1, 0.85] for i in range(1, 6)]},
                 }
             },
-            "innovations: gains",
+            "residuals: gains",
         ),
         ({"switching": {"generator": [[-1.0, 1.0], [1.0, -1.0]]}}, "switching"),
     ],
@@ -226,7 +226,7 @@ def test_power_against_a_wrong_reference():
     leaders = experiment.to_document()["leaders"] | {"reference": 2.3}
     result = compare(claimed(simulate(changed(experiment, leaders=leaders)), experiment))
     assert result.verdict == "disagrees"
-    assert p_values(result)["innovations: gains"] < 1e-4
+    assert p_values(result)["residuals: gains"] < 1e-4
 
 
 def test_power_of_the_time_means():
@@ -354,7 +354,7 @@ def test_a_number_too_large_to_compute_with_disagrees(name, value):
     states[20, 1, 0] = value
     comparison = compare(dataclasses.replace(run, states=states))
     assert comparison.verdict == "disagrees"
-    assert "innovations: covariance" in {test.name for test in comparison.tests if test.rejected}
+    assert "residuals: covariance" in {test.name for test in comparison.tests if test.rejected}
     json.dumps(comparison.to_json(), allow_nan=False)
 
 

@@ -43,7 +43,7 @@ WORDS = {
         r"the noise of all agents has correlation 0\.0[45]\S* \(.*\) with its own 20 steps before, not 0"
     ),
     "gamma sojourns of shape 10": (
-        r"the probability of leaving graph (line|ring) depends on the length of the sojourn: it is .*, not 0.0476"
+        r"the probability of leaving graph (line|ring) depends on how long it has lasted: it is .*, not 0.0476"
     ),
     "one innovation of 8 standard deviations": r"agent 4's noise is 8 standard deviations in step [\d,]+",
     "stale values in one message of five": (

@@ -16,7 +16,7 @@ from tests.support.switching_systems import LINE_RING
 
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.dependence import ConstantState, LongLags
-from msg_analysis.inference.e_values import Looks, WindowEvidence, Windows, variance_evidence
+from msg_analysis.inference.e_values import Analyses, WindowEvidence, Windows, variance_evidence
 from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.graphs import PARTS, HoldingTimes, SwappedGraphs
 from msg_analysis.inference.messages import StaleValues
@@ -94,7 +94,7 @@ def test_the_evidence_of_windows_is_their_mean(seen: int) -> None:
     evidence = WindowEvidence(windows, 1)
     ended = windows.add(np.zeros((seen, 1)))
     if seen:
-        evidence.add(ended, (logs[ended.first] / (ended.level + 1))[:, None], Looks.at_the_end(seen))
+        evidence.add(ended, (logs[ended.first] / (ended.level + 1))[:, None], Analyses.at_the_end(seen))
     levels = [
         [
             np.exp(logs[first] / (level + 1)) if first + 2**level <= seen else float(first >= seen)
@@ -157,7 +157,7 @@ def test_sojourns_are_counted_as_by_a_loop() -> None:
     path = chain(SLOW, 900, 2)
     sums = sojourns(SLOW, 900)
     for first in range(0, 900, 50):
-        sums.count(path[first : first + 51], Looks.at_the_end(50))
+        sums.count(path[first : first + 51], Analyses.at_the_end(50))
     steps, left, age = np.zeros((2, PARTS)), np.zeros((2, PARTS)), 0
     for now, following in zip(path[:-1].tolist(), path[1:].tolist(), strict=True):
         # Part p has the ages by which at least p, and fewer than p + 1, eighths of the sojourns have ended.
@@ -172,7 +172,7 @@ def test_sojourns_are_counted_as_by_a_loop() -> None:
 def test_the_statistic_of_sojourns_is_that_of_a_table() -> None:
     path = chain(SLOW, 20_000, 4)
     sums = sojourns(SLOW, 20_000)
-    sums.count(path, Looks.at_the_end(len(path)))
+    sums.count(path, Analyses.at_the_end(len(path)))
     finding = sums.finding()
     assert finding is not None
     total = sum(
@@ -188,7 +188,7 @@ def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], s
     p = []
     for seed in range(200):
         sums = sojourns(transition, steps)
-        sums.count(chain(transition, steps, seed), Looks.at_the_end(steps))
+        sums.count(chain(transition, steps, seed), Analyses.at_the_end(steps))
         finding = sums.finding()
         assert finding is not None
         p.append(np.exp(finding.log_p))
@@ -197,7 +197,7 @@ def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], s
 
 def test_few_sojourns_are_not_tested() -> None:
     sums = sojourns(SLOW, 300)
-    sums.count(chain(SLOW, 300, 1), Looks.at_the_end(300))
+    sums.count(chain(SLOW, 300, 1), Analyses.at_the_end(300))
     assert sums.finding() is None
 
 
@@ -257,7 +257,7 @@ def test_noise_over_time_by_lags(agent: int | None) -> None:
     sums = NoiseOverTime(made(observation.step, 1200, 2, np.ones(5, dtype=bool)))
     for first in range(0, 1200, 37):
         part = SimpleNamespace(
-            first=first, white=white[first : first + 37], looks=Looks.at_the_end(min(37, 1200 - first))
+            first=first, white=white[first : first + 37], looks=Analyses.at_the_end(min(37, 1200 - first))
         )
         sums.add(part)  # type: ignore[arg-type]
     squares = (white**2).sum(axis=2)

@@ -10,7 +10,7 @@ import pytest
 from tests.support.line_and_ring import experiment
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.evidence import Evidence, usual_looks
+from msg_analysis.inference.evidence import Evidence, usual_analyses
 from msg_analysis.inference.evidence_sums import EvidenceSums, WatchedEvidence, any_time_evidence
 from msg_analysis.inference.observation import Observation, spaced_steps
 from msg_analysis.inference.pool import compare_pooled
@@ -161,7 +161,7 @@ def test_what_never_moves_is_infinite_evidence() -> None:
     sums = EvidenceSums(same.prediction, 1)
     sums.add(same, 0, same.steps)
     assert sums.evidence() < 20.0
-    assert "innovations: covariance" in sums.families()
+    assert "residuals: covariance" in sums.families()
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_questions_of_single_parts_keep_their_share() -> None:
     assert evidence_weights([True, False, True, False, False]) == pytest.approx([0.375, 1 / 12, 0.375, 1 / 12, 1 / 12])
     assert evidence_weights([True]) == pytest.approx([1.0])
     assert evidence_weights([False, False]) == pytest.approx([0.5, 0.5])
-    names = ["innovations: covariance", "innovations: gains", "switching", "loss"]
+    names = ["residuals: covariance", "residuals: gains", "switching", "loss"]
     assert [question.name for question in QUESTIONS if question.main] == names
 
 
@@ -247,7 +247,7 @@ def test_questions_of_single_parts_keep_their_share() -> None:
 def test_one_pass_for_the_tests_and_the_evidence(changes: dict[str, Any]) -> None:
     """In the pass of the innovations the evidence is the same as in a pass of its own."""
     observation = observed(experiment(duration=40.0, **changes))
-    looks = spaced_steps(observation.steps, usual_looks(observation.steps))
+    looks = spaced_steps(observation.steps, usual_analyses(observation.steps))
     shared, own = Evidence.of(observation, 0.01).watched, WatchedEvidence.of(observation, looks)
     assert shared.steps is not None
     assert own.steps is not None

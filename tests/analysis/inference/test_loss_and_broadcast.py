@@ -11,9 +11,9 @@ from tests.support.p_values import kolmogorov_smirnov
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.losses import loss_test
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.received_values import HeardValues
-from msg_analysis.inference.regression import HeardRegression
-from msg_analysis.inference.residuals import BroadcastSums, InnovationSums, innovations
+from msg_analysis.inference.received_values import ReceivedValues
+from msg_analysis.inference.regression import ReceivedRegression
+from msg_analysis.inference.residuals import BroadcastSums, ResidualSums, residuals
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.prediction import predict
@@ -55,9 +55,9 @@ def test_calibration(case):
     """
     results = [compare(simulate(CASES[case].with_run(seed=seed))) for seed in SEEDS]
     collected = [{test.name: test.p for test in result.tests} for result in results]
-    names = {"system error", "covariance", "innovations: covariance", "innovations: gains", "loss"}
+    names = {"system error", "covariance", "residuals: covariance", "residuals: gains", "loss"}
     assert names <= set(collected[0])
-    assert ("innovations: whiteness" in collected[0]) == (case != "no process noise")
+    assert ("residuals: whiteness" in collected[0]) == (case != "no process noise")
     assert ("broadcast" in collected[0]) == (case in ("all", "correlated"))
     for name in collected[0]:
         assert kolmogorov_smirnov(name, [p[name] for p in collected]) > 2e-4, name
@@ -82,11 +82,11 @@ def test_many_second_moments_of_a_short_run():
     [
         ({"noise": AIR | {"loss": 0.25}}, "loss"),
         ({"noise": AIR | {"broadcast": 0.33}}, "broadcast"),
-        ({"noise": AIR | {"link": 4.0}}, "innovations: covariance"),
-        ({"noise": AIR | {"process": 1.1}}, "innovations: covariance"),
+        ({"noise": AIR | {"link": 4.0}}, "residuals: covariance"),
+        ({"noise": AIR | {"process": 1.1}}, "residuals: covariance"),
         (
             {"graphs": {"a": {"path": [1, 2, 3]}, "b": {"arcs": [[1, 2], [2, 3, 1.2], [3, 1], [1, 3]]}}},
-            "innovations: gains",
+            "residuals: gains",
         ),
     ],
 )
@@ -116,7 +116,7 @@ def nominal(what):
 @pytest.mark.parametrize("what", [CASES["all"], CASES["correlated"]])
 def test_innovations_are_what_is_left_of_each_step(what):
     observation, trajectory, weights = observe(what), simulate(what), nominal(what)
-    found = innovations(observation, 0, 400, HeardValues.of(observation, 0, 400))
+    found = residuals(observation, 0, 400, ReceivedValues.of(observation, 0, 400))
     for k, g in enumerate(trajectory.modes):
         for i in range(3):
             rest = trajectory.states[k + 1, i] - weights[g][i, i] * trajectory.states[k, i]
@@ -132,11 +132,11 @@ def test_regression_against_a_loop(most):
     """Each difference of each graph; the pull of each agent in each graph; in both graphs together."""
     what = CASES["correlated"]
     observation, trajectory, weights = observe(what), simulate(what), nominal(what)
-    regression = HeardRegression(observation, most)
+    regression = ReceivedRegression(observation, most)
     for first, last in ((0, 150), (150, 400)):
-        reception = HeardValues.of(observation, first, last)
-        regression.add(reception, innovations(observation, first, last, reception))
-    e = innovations(observation, 0, 400, HeardValues.of(observation, 0, 400))
+        reception = ReceivedValues.of(observation, first, last)
+        regression.add(reception, residuals(observation, first, last, reception))
+    e = residuals(observation, 0, 400, ReceivedValues.of(observation, 0, 400))
     process = what.run.dt * np.array(CORRELATED) @ np.array(CORRELATED).T
     links = [(i, j) for g in (0, 1) for i in range(3) for j in range(3) if j != i and weights[g][i, j]]
     size = {400: 3 + len(links) + 2, 12: 9, 8: 6}[most]
@@ -183,9 +183,9 @@ def test_regression_against_a_loop(most):
 
 def test_blocks_change_nothing(monkeypatch):
     observation = observe(CASES["correlated"])
-    whole = InnovationSums(observation).tests(), loss_test(observation), BroadcastSums(observation).p_value()
+    whole = ResidualSums(observation).tests(), loss_test(observation), BroadcastSums(observation).p_value()
     monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 70)
-    split = InnovationSums(observation).tests(), loss_test(observation), BroadcastSums(observation).p_value()
+    split = ResidualSums(observation).tests(), loss_test(observation), BroadcastSums(observation).p_value()
     for one, other in zip(whole[:2], split[:2], strict=True):
         for ours, theirs in zip(dataclasses.astuple(other), dataclasses.astuple(one), strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-9)
@@ -200,7 +200,7 @@ def test_agents_that_moved_without_having_heard_anything():
     assert compare(trajectory).verdict == "agrees"
     moved = trajectory.states.copy()
     moved[step + 1 :] += np.array([1e-4, 0.0, 0.0])[:, None]
-    result = InnovationSums(Observation.of(dataclasses.replace(trajectory, states=moved), predict(what))).tests()
+    result = ResidualSums(Observation.of(dataclasses.replace(trajectory, states=moved), predict(what))).tests()
     assert result.p_covariance == 0.0
 
 

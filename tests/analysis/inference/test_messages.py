@@ -22,8 +22,8 @@ from msg_analysis.inference.losses import LossTally, loss_test
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.period_tables import period_tables
 from msg_analysis.inference.realtime_laws import means_in_lockstep, pattern_means
-from msg_analysis.inference.received_values import HeardValues, RepeatedNoise
-from msg_analysis.inference.residuals import innovations
+from msg_analysis.inference.received_values import ReceivedValues, RepeatedNoise
+from msg_analysis.inference.residuals import residuals
 from msg_analysis.inference.verdict import compare
 from msg_analysis.theory.prediction import predict
 
@@ -143,14 +143,14 @@ def test_innovations_are_freed_of_noise_that_is_known(case):
     """Against a Cholesky factor of the covariance of all innovations of an agent."""
     observation = observed(case, duration=12)
     step, steps = observation.step, observation.steps
-    reception = HeardValues.of(observation, 0, steps)
-    e = innovations(observation, 0, steps, reception)
+    reception = ReceivedValues.of(observation, 0, steps)
+    e = residuals(observation, 0, steps, reception)
     parts = []
     repeated = RepeatedNoise.of(observation)
     if repeated is None:
         pytest.skip("every message is used once")
     for first in range(0, steps, 7):  # in blocks
-        piece = HeardValues.of(observation, first, min(first + 7, steps))
+        piece = ReceivedValues.of(observation, first, min(first + 7, steps))
         parts.append(repeated.free(e[first : first + 7], piece))
     freed, variances = (np.concatenate(part) for part in zip(*parts, strict=True))
     for i in range(step.agents):
@@ -187,7 +187,7 @@ def test_right_runs_agree(case):
     found = compare(observation)
     assert found.verdict == "agrees", [test for test in found.tests if test.rejected]
     names = {test.name for test in found.tests}
-    assert {"system error", "covariance", "innovations: gains", "innovations: whiteness"} <= names
+    assert {"system error", "covariance", "residuals: gains", "residuals: whiteness"} <= names
     assert found.system_error.predicted == pytest.approx(found.system_error.measured, rel=0.5)
 
 

@@ -13,7 +13,7 @@ from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.pool import compare_pooled
-from msg_analysis.inference.residuals import innovations
+from msg_analysis.inference.residuals import residuals
 from msg_analysis.inference.statistics import quadratic_form
 from msg_analysis.inference.transitions import Transitions
 from msg_analysis.inference.verdict import compare
@@ -77,7 +77,7 @@ def test_innovations_are_added_up(three):
     """Covariance and gains of all innovations put one after the other."""
     pooled = compare_pooled(three)
     observations = [Observation.of(run, predict(run.record.experiment)) for _, run in three]
-    e = np.concatenate([innovations(one, 0, one.steps) for one in observations])
+    e = np.concatenate([residuals(one, 0, one.steps) for one in observations])
     whitened = np.einsum("i,kir->kri", 1 / np.sqrt(np.diag(observations[0].step.noise[0])), e).reshape(-1, 3)
     n, scatter = len(whitened), whitened.T @ whitened / len(whitened)
     statistic = n * (np.trace(scatter) - np.log(np.linalg.det(scatter)) - 3) * (1 - 26 / (24 * n))

@@ -19,7 +19,7 @@ from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.estimates import CovarianceTest, Estimate
 from msg_analysis.inference.question import Test as FamilyTest
-from msg_analysis.inference.residuals import InnovationTests
+from msg_analysis.inference.residuals import ResidualTests
 from msg_analysis.inference.transitions import SwitchingTest
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.run import Completeness, Run
@@ -105,7 +105,7 @@ def _comparison(trajectory: Run) -> Comparison:
         system_error=Estimate(1.234567, 1.3, 0.05, -1.31, 0.19),
         node_errors=nodes,
         covariance=CovarianceTest(covariance, covariance * 1.01, 9.0, 10, 0.53),
-        innovations=InnovationTests(0.5, 0.5, None),
+        innovations=ResidualTests(0.5, 0.5, None),
         switching=SwitchingTest(np.array([[7, 1], [2, 9]]), np.array([[6.5, 1.5], [2.5, 8.5]]), 0.7),
         continuous_error=1.25,
         batch=(1.1, 1.4),
