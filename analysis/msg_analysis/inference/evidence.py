@@ -44,13 +44,15 @@ class Evidence:
     laws: Laws | None = None  # of one run in real time
 
     @property
-    def exact(self) -> list[TimeMeans]:
-        """The errors next to the laws that they can be tested against, the preferred one first.
+    def tested(self) -> TimeMeans | None:
+        """The errors next to the exact law that they are tested against; None where there is none.
 
-        In lockstep that given the path, which holds for every run, before that over all paths, which needs long runs.
+        In lockstep that given the path, which holds for every run, before that over all paths, which needs long runs;
+        but one with the errors of the agents before one without.
         """
-        laws = [self.given] if self.given else []
-        return [*laws, *([self.means] if self.means.long_enough else [])] if self.decisive else []
+        laws = [self.given, self.means if self.means.long_enough else None] if self.decisive else []
+        known = [law for law in laws if law]
+        return next((law for law in known if len(law.nodes)), known[0] if known else None)
 
     @classmethod
     def of(cls, observation: Observation, level: float, *, decided: bool = False) -> Evidence:

@@ -108,6 +108,7 @@ class Statistics:
 
     system_error: Estimate | None  # as it is tested: given the path of the graphs where that is known
     node_errors: Sequence[Estimate]
+    corrected: str  # what is added to the names of these tests where the errors are corrected for this path
     covariance: CovarianceTest | None
     residuals: ResidualTests
     switching: SwitchingTest | None

@@ -118,7 +118,7 @@ def _unknown(rejected: Sequence[str]) -> Cause:
     names = ", ".join(rejected)
     if list(rejected) == [Whiteness.name]:
         words = "the noise of successive steps or of replicas is correlated: random numbers are used twice"
-    elif set(rejected) <= {SystemMeanError.name, Covariance.name} or all(
+    elif all(name.startswith((SystemMeanError.name, Covariance.name)) for name in rejected) or all(
         name.startswith(AgentMeanErrors.name) for name in rejected
     ):
         words = f"the steps follow the law, but the errors differ: chance, or another start than in the file ({names})"

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One-step residuals (innovations) e(k) = x(k+1) - W_g(k) x(k) - offset_g(k), what a step adds to its mean; their tests.
+"""Tests of one-step residuals (innovations) e(k) = x(k+1) - W_g(k) x(k) - offset_g(k): what a step adds to its mean.
 
 Under the model the e(k) are independent N(0, N_g(k)), for any path of the graphs; so these tests are exact or nearly
 so, and find what the time means hardly show. With noise or loss of messages, and in real time, the same holds given the

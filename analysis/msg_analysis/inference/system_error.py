@@ -34,8 +34,8 @@ class SystemMeanError(Question):
 
     @classmethod
     def tests(cls, run: Statistics) -> list[Test]:
-        """Corrected for the sequence of graphs where that is known."""
-        return one_test(cls.name, run.system_error.p, run.system_error) if run.system_error else []
+        """Corrected for the run's sequence of graphs where that is known."""
+        return one_test(cls.name + run.corrected, run.system_error.p, run.system_error) if run.system_error else []
 
     def evidence(self, sums: RunningSums) -> FloatArray:
         """Over all paths of the graphs; only in lockstep without noise, delay or loss of the messages."""
@@ -52,7 +52,7 @@ class AgentMeanErrors(Question):
     def tests(cls, run: Statistics) -> list[Test]:
         """One for each agent."""
         nodes = enumerate(run.node_errors, start=1)
-        return [test for i, node in nodes for test in one_test(f"{cls.name} {i}", node.p, node)]
+        return [test for i, node in nodes for test in one_test(f"{cls.name} {i}{run.corrected}", node.p, node)]
 
     def number_of_tests(self) -> int:
         """One for each agent."""

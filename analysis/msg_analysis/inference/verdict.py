@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -82,10 +82,12 @@ def evaluate(
     means, lockstep = evidence.means, prediction.experiment.run.pace == "lockstep"
     system_error, node_errors = _over_all_paths(means, prediction.system)
     covariance = _covariance(evidence, prediction.system)
-    tested_error, tested_nodes = _tested_errors(evidence.exact, prediction.system)
+    law = evidence.tested
+    tested_error, tested_nodes = estimates(law, prediction.system) if law else (None, [])
     run = Statistics(
         system_error=tested_error,
         node_errors=tested_nodes,
+        corrected=", corrected" if law and law is evidence.given else "",
         covariance=covariance if evidence.decisive else None,
         residuals=evidence.residuals.tests(),
         switching=evidence.transitions.test(prediction.step.transition),
@@ -147,13 +149,6 @@ def _over_all_paths(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, lis
     return error.without_error(), [node.without_error() for node in nodes]
 
 
-def _tested_errors(laws: Sequence[TimeMeans], system: JumpSystem) -> tuple[Estimate | None, list[Estimate]]:
-    """The errors as they are tested; ``laws`` in the order of preference."""
-    if not laws:
-        return None, []
-    return estimates(next((law for law in laws if len(law.nodes)), laws[0]), system)
-
-
 def _covariance(evidence: Evidence, system: JumpSystem) -> CovarianceTest:
     """The second moments and their expectation over all paths, tested given the path."""
     shown = covariance_test(evidence.means, system)
@@ -187,6 +182,7 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
     run = Statistics(
         system_error=None,
         node_errors=(),
+        corrected="",
         covariance=None,
         residuals=ResidualTests(None, None, None),
         switching=switching_test(measurement.modes, measurement.step.transition) if enough else None,

@@ -55,7 +55,7 @@ def test_calibration(case):
     """
     results = [compare(simulate(CASES[case].with_run(seed=seed))) for seed in SEEDS]
     collected = [{test.name: test.p for test in result.tests} for result in results]
-    names = {"system error", "covariance", "residuals: covariance", "residuals: gains", "loss"}
+    names = {"system error, corrected", "covariance", "residuals: covariance", "residuals: gains", "loss"}
     assert names <= set(collected[0])
     assert ("residuals: whiteness" in collected[0]) == (case != "no process noise")
     assert ("broadcast" in collected[0]) == (case in ("all", "correlated"))

@@ -170,7 +170,7 @@ def test_regression_frees_innovations_of_those_made_before(late_timers):
 
 IN_DETAIL = [
     f"residuals: {what}"
-    for what in ("noise by graph", "noise over time", "standing still", "largest", "lags to 100", "stale values")
+    for what in ("noise by graph", "noise over time", "constant state", "largest", "lags to 100", "stale values")
 ]
 
 

@@ -45,7 +45,7 @@ def test_heavy_tails(document):
     assert found.any_time.half_width is None
     assert not found.running["standard_error"].any()
     tests = {test.name: test.p for test in found.tests}
-    assert tests["system error"] == pytest.approx(found.given.system_error.p)
+    assert tests["system error, corrected"] == pytest.approx(found.given.system_error.p)
     [words] = trust_words(found.to_json())
     assert "infinite" in words
     assert "Trust the errors given the path" in words
