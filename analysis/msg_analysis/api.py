@@ -30,12 +30,12 @@ from msg_analysis.common.text import markdown_table
 from msg_analysis.errors import BagError, InputError, NotAvailableError
 from msg_analysis.experiment import experiment as model
 from msg_analysis.experiment.examples import find
-from msg_analysis.experiment.experiment import Experiment as ValidExperiment
+from msg_analysis.experiment.experiment import ValidExperiment
 from msg_analysis.experiment.problems import ExperimentError
 from msg_analysis.inference import comparison as verdict
-from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.inference.verdict import compare as compare_trajectory
-from msg_analysis.model.run import Run as Trajectory
+from msg_analysis.inference.verdict import compare_pooled
+from msg_analysis.model.run import Trajectory
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory import prediction as theory
 from msg_analysis.theory import spectrum as spectra
@@ -334,7 +334,7 @@ class Experiment(PlannedExperiment):
         return super().load(find(path))
 
     @classmethod
-    def of(cls, experiment: model.Experiment) -> Self:
+    def of(cls, experiment: model.ValidExperiment) -> Self:
         """The same experiment with the methods of this class.
 
         Parameters

@@ -20,7 +20,7 @@ import numpy as np
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import HALF_WIDTH_95
 from msg_analysis.experiment.markov_chain import MarkovChain
-from msg_analysis.inference.losses import LossTally
+from msg_analysis.inference.counts import LossTally
 from msg_analysis.inference.received_values import NO_NOISE
 from msg_analysis.inference.regression import Term
 from msg_analysis.inference.residuals import ResidualSums

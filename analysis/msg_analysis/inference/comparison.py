@@ -27,16 +27,15 @@ from msg_analysis.common.text import (
 from msg_analysis.errors import ExitCode
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.candidates import Cause
+from msg_analysis.inference.counts import LossTest, SwitchingTest
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, Ranking
 from msg_analysis.inference.evidence_sums import AnyTimeEvidence
 from msg_analysis.inference.given_path import GivenPath
-from msg_analysis.inference.losses import LossTest
 from msg_analysis.inference.question import Test
 from msg_analysis.inference.realtime_laws import Laws
 from msg_analysis.inference.residuals import ResidualTests
 from msg_analysis.inference.time_means import TimeMeans
 from msg_analysis.inference.timing import Timing
-from msg_analysis.inference.transitions import SwitchingTest
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import step_law

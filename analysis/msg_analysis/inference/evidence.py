@@ -11,16 +11,15 @@ import numpy as np
 
 from msg_analysis.common.arrays import IntArray
 from msg_analysis.common.resources import blas_threads
+from msg_analysis.inference.counts import LossTally, Transitions
 from msg_analysis.inference.event_order import order_events
 from msg_analysis.inference.evidence_sums import Watch, WatchedEvidence
 from msg_analysis.inference.given_path import means_given_path
-from msg_analysis.inference.losses import LossTally
 from msg_analysis.inference.observation import Observation, spaced_steps
 from msg_analysis.inference.realtime_laws import Laws, means_in_lockstep, measure_laws
 from msg_analysis.inference.residuals import BroadcastSums, ResidualSums
 from msg_analysis.inference.time_means import TimeMeans, time_means
 from msg_analysis.inference.timing import Timing, measure_timing
-from msg_analysis.inference.transitions import Transitions
 
 ANALYSES = 20, 80  # at the evidence over time, in short and in long runs: each takes as long as some hundred steps
 STEPS_PER_ANALYSIS = 100  # between these

@@ -22,8 +22,8 @@ import scipy.linalg
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.inference.evidence_sums import EvidenceSums
-from msg_analysis.inference.gains import CommonGain, Gains
 from msg_analysis.inference.graphs import Switching
+from msg_analysis.inference.messages import CommonGain, Gains
 from msg_analysis.inference.noise import Noise
 from msg_analysis.inference.question import Diagnostic
 from msg_analysis.inference.received_values import NO_NOISE

@@ -19,9 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray, release
-from msg_analysis.inference.event_order import EventOrder
+from msg_analysis.inference.event_order import OWN, Entries, EventOrder, period_tables
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.period_tables import OWN, Entries, period_tables
 from msg_analysis.inference.received_values import neighbour_weights
 from msg_analysis.model.reception import neighbour_tables
 

@@ -21,12 +21,11 @@ from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.inference import candidates
 from msg_analysis.inference.candidates import Cause, Parameters, Selected, select
+from msg_analysis.inference.counts import LossTally, LossTest, SwitchingTest, Transitions
 from msg_analysis.inference.e_values import Analyses
 from msg_analysis.inference.estimates import CovarianceTest, Estimate
-from msg_analysis.inference.losses import LossTally, LossTest
 from msg_analysis.inference.received_values import ReceivedValues
 from msg_analysis.inference.residuals import BroadcastSums, ResidualSums, ResidualTests
-from msg_analysis.inference.transitions import SwitchingTest, Transitions
 from msg_analysis.model.step_model import StepModel
 
 

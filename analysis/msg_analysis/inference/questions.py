@@ -16,9 +16,8 @@ import numpy as np
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.dependence import ConstantState, LongLags, Whiteness
-from msg_analysis.inference.gains import CommonGain, Gains
 from msg_analysis.inference.graphs import HoldingTimes, SwappedGraphs, Switching
-from msg_analysis.inference.messages import Broadcast, Losses, StaleValues
+from msg_analysis.inference.messages import Broadcast, CommonGain, Gains, Losses, StaleValues
 from msg_analysis.inference.noise import LargestResidual, Noise, NoiseByGraph, NoiseOverTime
 from msg_analysis.inference.question import Diagnostic, Question, Search, Statistics, Test
 from msg_analysis.inference.statistics import holm

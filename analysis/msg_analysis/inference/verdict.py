@@ -1,32 +1,35 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Comparison of a run with its prediction, and the verdict."""
+"""Comparison of a run, or of several runs of one experiment, with the prediction, and the verdict."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import dataclasses
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from msg_analysis.common.arrays import FloatArray
+from msg_analysis.errors import InputError
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.candidates import Cause
-from msg_analysis.inference.comparison import Comparison, trusted
+from msg_analysis.inference.comparison import Comparison, Member, Pool, first_difference, trusted
+from msg_analysis.inference.counts import loss_test, switching_test
 from msg_analysis.inference.e_values import log_mean
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates, rank_agents
 from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.evidence_sums import AnyTimeEvidence, any_time_evidence
 from msg_analysis.inference.given_path import GivenPath
-from msg_analysis.inference.losses import loss_test
 from msg_analysis.inference.observation import Measurement, Observation, spaced_steps
 from msg_analysis.inference.question import Finding, Search, Statistics
 from msg_analysis.inference.questions import causes_of, decide
 from msg_analysis.inference.residuals import ResidualTests
-from msg_analysis.inference.statistics import batch_interval, steps_to_half_width
+from msg_analysis.inference.statistics import batch_interval, chi2_tail, steps_to_half_width
 from msg_analysis.inference.time_means import TimeMeans
-from msg_analysis.inference.transitions import switching_test
-from msg_analysis.model.run import Run
+from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.prediction import Prediction, predict
@@ -242,3 +245,138 @@ def _running(means: TimeMeans, dt: float) -> dict[str, FloatArray]:
         "system_error": np.cumsum(means.system_series)[counts - 1] / counts,
         "standard_error": errors if means.long_enough else np.zeros(len(counts)),
     }
+
+
+def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> Comparison:
+    """Compare several runs of one experiment, (name, trajectory) each, with its prediction, to one verdict.
+
+    Sums are added up over the runs, so that every step counts the same. A further test of the family asks whether the
+    runs are alike (Cochran's Q). No trajectory is kept.
+
+    Parameters
+    ----------
+    runs
+        name for messages, and trajectory; they are read one after the other
+    level
+        probability of a false "disagrees", all tests together
+
+    Raises
+    ------
+    InputError
+        no run, different experiments, a run or seed that is there twice, or no prediction
+    """
+    total: Evidence | None = None
+    prediction: Prediction | None = None
+    trajectory: Run | None = None
+    members: list[Member] = []
+    for name, run in runs:
+        _require_another(members, name, run.record)
+        if prediction is None:
+            _require_prediction(name, run.record.experiment)
+            prediction, trajectory = predict(run.record.experiment, run.record.step_model), _without_data(run)
+        prediction = prediction.for_run(run.record.experiment)
+        member, evidence = _examine(name, run, prediction, level)
+        members.append(member)
+        if evidence:
+            total = total.merged(evidence) if total else evidence
+    if prediction is None or trajectory is None:
+        raise InputError("no bag: give at least one")
+    account = _sum([member.completeness for member in members])
+    trajectory = dataclasses.replace(trajectory, completeness=account)
+    pool = _pool(members) if total and total.decisive else Pool(tuple(members))
+    if total is None:
+        comparison = without_numbers(trajectory, level, prediction, 0)
+    else:
+        comparison = evaluate(trajectory, prediction, total, level, pool.p)
+    return dataclasses.replace(comparison, pool=pool)
+
+
+def _examine(name: str, run: Run, prediction: Prediction, level: float) -> tuple[Member, Evidence | None]:
+    """One run by itself, with its prediction; no evidence where too little of it arrived."""
+    observation = Observation.of(run, prediction)
+    if observation.steps < MIN_STEPS and not run.completeness.complete:
+        missing = Estimate(predicted=prediction.emulated.system_error)
+        return Member(name, run.record, 0, run.completeness, missing, missing, "incomplete"), None
+    evidence = Evidence.of(observation, level)
+    alone = evaluate(run, prediction, evidence, level)
+    tested = alone.given.system_error if alone.given else alone.system_error
+    member = Member(name, run.record, evidence.steps, run.completeness, alone.system_error, tested, alone.verdict)
+    return member, evidence
+
+
+def _require_prediction(name: str, experiment: Experiment) -> None:
+    reason = experiment.unpredictable()
+    if reason:
+        raise InputError(f"{name}: {reason}, so there is nothing to pool: compare one bag at a time")
+
+
+def _require_another(members: list[Member], name: str, record: RunRecord) -> None:
+    """InputError unless it is another run of the same experiment, independent of the others."""
+    for other in members:
+        if record.run == other.record.run:
+            raise InputError(f"{name}: the same run as in {other.name} ({record.run}): give each run once")
+        if record.experiment.run.seed == other.record.experiment.run.seed:
+            raise InputError(
+                f"{name}: run.seed: {record.experiment.run.seed} as in {other.name}, so both have the same random "
+                "numbers: pool runs with different seeds"
+            )
+    if not members:
+        return
+    differs = first_difference(record.experiment, members[0].record.experiment)
+    if differs:
+        key, mine, others = differs
+        raise InputError(
+            f"{name}: {key}: {_shown(mine)}, but {_shown(others)} in {members[0].name}: pool runs of one experiment "
+            "(seed and duration may differ), and compare others with `msg-analysis tabulate`"
+        )
+
+
+def _shown(value: Any) -> str:
+    text = "nothing" if value is None else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _without_data(run: Run) -> Run:
+    """Only the record and the completeness."""
+    return dataclasses.replace(
+        run,
+        states=run.states[:0],
+        modes=run.modes[:0],
+        agent_modes=None,
+        published=None,
+        lost=None,
+        used=None,
+        made=None,
+    )
+
+
+def _sum(counts: list[Completeness]) -> Completeness:
+    refused: dict[str, int] = {}
+    for count in counts:
+        for reason, number in count.refused.items():
+            refused[reason] = refused.get(reason, 0) + number
+    return Completeness(
+        expected=sum(count.expected for count in counts),
+        received=sum(count.received for count in counts),
+        missing=sum(count.missing for count in counts),
+        duplicates=sum(count.duplicates for count in counts),
+        out_of_order=sum(count.out_of_order for count in counts),
+        refused=refused,
+        missing_modes=sum(count.missing_modes for count in counts),
+    )
+
+
+def _pool(members: list[Member]) -> Pool:
+    """Test whether measured - expected is the same in all runs: Cochran's Q."""
+    z, errors = [], []
+    for member in members:
+        error = member.tested
+        if error.z is not None and error.standard_error:
+            z.append(error.z)
+            errors.append(error.standard_error)
+    if len(z) < 2:
+        return Pool(tuple(members))
+    deviation, precision = np.array(z) * np.array(errors), 1.0 / np.array(errors) ** 2
+    mean = float(precision @ deviation / precision.sum())
+    chi2 = float(precision @ (deviation - mean) ** 2)
+    return Pool(tuple(members), chi2, len(z) - 1, float(chi2_tail(chi2, len(z) - 1)))

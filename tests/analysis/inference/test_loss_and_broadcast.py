@@ -9,7 +9,7 @@ from scipy import stats
 from tests.support.p_values import kolmogorov_smirnov
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.losses import loss_test
+from msg_analysis.inference.counts import loss_test
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.received_values import ReceivedValues
 from msg_analysis.inference.regression import ReceivedRegression

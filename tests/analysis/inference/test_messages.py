@@ -17,10 +17,9 @@ from msg_analysis.common import arrays
 from msg_analysis.common.arrays import in_file
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import pattern_events
-from msg_analysis.inference.event_order import newest_steps, order_events
-from msg_analysis.inference.losses import LossTally, loss_test
+from msg_analysis.inference.counts import LossTally, loss_test
+from msg_analysis.inference.event_order import newest_steps, order_events, period_tables
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.period_tables import period_tables
 from msg_analysis.inference.realtime_laws import means_in_lockstep, pattern_means
 from msg_analysis.inference.received_values import ReceivedValues, RepeatedNoise
 from msg_analysis.inference.residuals import residuals

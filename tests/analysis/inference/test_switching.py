@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from msg_analysis.inference.transitions import simulate_counts, switching_test
+from msg_analysis.inference.counts import simulate_counts, switching_test
 
 
 def path(transition, steps, seed, first=0):

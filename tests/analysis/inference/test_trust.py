@@ -8,8 +8,7 @@ from tests.analysis.theory.tails.test_fourth_moments import HEAVY, LOSSY
 
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.online_errors import LiveEstimate
-from msg_analysis.inference.pool import compare_pooled
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.verdict import compare, compare_pooled
 from msg_analysis.report.wording import trust_words
 from msg_analysis.twin.simulate import new_record, simulate
 

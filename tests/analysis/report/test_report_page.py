@@ -17,10 +17,10 @@ import pytest
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
+from msg_analysis.inference.counts import SwitchingTest
 from msg_analysis.inference.estimates import CovarianceTest, Estimate
 from msg_analysis.inference.question import Test as FamilyTest
 from msg_analysis.inference.residuals import ResidualTests
-from msg_analysis.inference.transitions import SwitchingTest
 from msg_analysis.inference.verdict import compare
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord

@@ -17,8 +17,7 @@ from browser import CUT, FAINT, Log, Tab
 from PIL import Image
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.pool import compare_pooled
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.verdict import compare, compare_pooled
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.report.page import write_report
 from msg_analysis.report.plot_style import BLUE, DARK

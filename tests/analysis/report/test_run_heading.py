@@ -9,8 +9,7 @@ import pytest
 
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.pool import compare_pooled
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.verdict import compare, compare_pooled
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.report.page import page_title, run_facts
