@@ -99,23 +99,13 @@ class Trust:
 
 
 def trusted(prediction: Prediction, means: TimeMeans, *, given: bool) -> Trust:
-    """Which errors of a run in lockstep to trust.
-
-    Parameters
-    ----------
-    prediction
-        of the experiment
-    means
-        over all paths, of one run or of several
-    given
-        whether there are errors given the path of the graphs
-    """
+    """Which errors in lockstep to trust, from means over all paths; ``given``: whether there are corrected ones."""
     reason = _reason(prediction, means)
     if reason is None:
         return Trust("all_paths")
     instead = "Trust the tests of residuals and switching, which do not depend on this."
     if given:
-        instead = "Trust the errors given the path, and the tests, which do not depend on this."
+        instead = "Trust the errors corrected for the graph sequence, and the tests, which do not depend on this."
     return Trust("given_path" if given else None, reason, f"{_why(reason, prediction, means)} {instead}")
 
 

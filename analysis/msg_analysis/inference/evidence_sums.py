@@ -460,19 +460,10 @@ def any_time_evidence(
     steps: int | None = None,
     planned: float | None = None,
 ) -> AnyTimeEvidence:
-    """The evidence in words and numbers.
+    """The evidence of one run or several in words and numbers.
 
-    Parameters
-    ----------
-    watched
-        of one run or several
-    level
-        probability that the threshold 1 / level is ever passed by a run that follows its law, at most
-    families
-        of the sums, where they are known
-    variance, steps, planned
-        sum of Var(D_k) of the system error over so many steps, and the number of steps at which its interval is to be
-        narrowest, chosen before the run; None where it is not known
+    ``variance``: sum of Var(D_k) of the system error over so many ``steps``; ``planned``: the number of steps at which
+    its interval is to be narrowest, chosen before the run. ``families`` are those of the sums, where they are known.
     """
     threshold, sums = 1.0 / level, watched.sums
     time, crossed = None, None

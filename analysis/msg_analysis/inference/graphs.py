@@ -88,19 +88,21 @@ class Switching(Question):
 def _rates(search: Search) -> list[Cause]:
     """Switching rates, or in discrete time probabilities, that are wrong."""
     names, counts = search.names, search.transitions.counts
-    transition = search.chain.transition(search.dt)
+    transition = search.experiment.chain.transition(search.experiment.step_length)
     found = []
     for g, h in np.argwhere((counts > 0) & (transition == 0.0)).tolist():
         words = f"the graph jumped {counts[g, h]} times from {names[g]} to {names[h]}, which the law excludes"
         found.append(Cause("switching", words, None, None, [names[g], names[h]], float(counts[g, h]), None, 0.0, 0.0))
     if found:
         return found
-    what = "rate" if search.chain.time == "continuous" else "probability"
-    for rate in find_rates(counts, search.chain, search.dt, search.families, search.level):
+    what = "rate" if search.experiment.chain.time == "continuous" else "probability"
+    for rate in find_rates(
+        counts, search.experiment.chain, search.experiment.step_length, search.families, search.level
+    ):
         low, high = rate.interval
         if len(rate.jumps) == 1:
             g, h = rate.jumps[0]
-            expected = float(search.chain.matrix[g, h])
+            expected = float(search.experiment.chain.matrix[g, h])
             estimate, interval = rate.factor * expected, (low * expected, high * expected)
             words = (
                 f"the {what} of switching from {names[g]} to {names[h]} is {numbers_text(estimate, interval)}, "

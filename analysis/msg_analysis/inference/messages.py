@@ -311,12 +311,15 @@ def _gain_words(one: Selected, search: Search) -> Cause:
     names, p = search.names, math.exp(one.log_p)
     low, high = one.interval
     if part == "reference":
-        at = search.reference
+        at = search.experiment.reference
         numbers = numbers_text(at + one.estimate, (at + low, at + high))
         words = f"the leaders are pulled to {numbers}, not to the reference {at:g}"
         return Cause("reference", words, None, None, None, at + one.estimate, (at + low, at + high), at, p)
     if part == "offset":
-        value, interval = one.estimate / search.dt, (low / search.dt, high / search.dt)
+        value, interval = (
+            one.estimate / search.experiment.step_length,
+            (low / search.experiment.step_length, high / search.experiment.step_length),
+        )
         words = f"agent {what + 1} has an additional drift of {numbers_text(value, interval)} per unit of time"
         return Cause("offset", words, what + 1, None, None, value, interval, 0.0, p)
     factor, interval = 1.0 + one.estimate, (1.0 + low, 1.0 + high)

@@ -45,6 +45,11 @@ class AnyTime:
     crossed: int | None = None  # steps that had been seen when the evidence was first found above the threshold
     strongest: str | None = None  # what the strongest evidence is about
 
+    @property
+    def exceeded(self) -> bool:
+        """Whether the threshold was exceeded."""
+        return self.crossed is not None
+
     def to_json(self) -> dict[str, Any]:
         """The document; evidence that is too large for a number is None."""
         known = self.log_evidence is not None and self.log_evidence < LARGEST_LOGARITHM
@@ -52,7 +57,7 @@ class AnyTime:
             "evidence": math.exp(self.log_evidence) if known and self.log_evidence is not None else None,
             "log_evidence": self.log_evidence,
             "threshold": self.threshold,
-            "disagrees": self.crossed is not None,
+            "disagrees": self.exceeded,
             "strongest": self.strongest,
             "half_width": self.half_width,
         }

@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
-from msg_analysis.experiment.markov_chain import MarkovChain
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import candidates
 from msg_analysis.inference.candidates import Cause, Parameters, Selected, select
 from msg_analysis.inference.counts import LossTally, LossTest, SwitchingTest, Transitions
@@ -105,14 +105,14 @@ class Finding:
 class Statistics:
     """What the tests of a run, or of several, are made of; None where it is not computed."""
 
-    system_error: Estimate | None  # as it is tested: given the path of the graphs where that is known
-    node_errors: Sequence[Estimate]
-    corrected: str  # what is added to the names of these tests where the errors are corrected for this path
-    covariance: CovarianceTest | None
-    residuals: ResidualTests
-    switching: SwitchingTest | None
-    loss: LossTest | None
-    p_broadcast: float | None
+    system_error: Estimate | None = None  # as it is tested: given the path of the graphs where that is known
+    node_errors: Sequence[Estimate] = ()
+    corrected: str = ""  # what is added to the names of these tests where the errors are corrected for this path
+    covariance: CovarianceTest | None = None
+    residuals: ResidualTests = field(default_factory=ResidualTests)
+    switching: SwitchingTest | None = None
+    loss: LossTest | None = None
+    p_broadcast: float | None = None
     findings: Mapping[str, Finding] = field(default_factory=dict)  # by name of the diagnostic
     p_alike: float | None = None  # of several runs
 
@@ -126,10 +126,7 @@ class Search:
 
     def __init__(
         self,
-        names: Sequence[str],
-        chain: MarkovChain,
-        dt: float,
-        reference: float,
+        experiment: Experiment,
         residuals: ResidualSums,
         transitions: Transitions,
         loss: LossTally | None,
@@ -137,7 +134,7 @@ class Search:
         findings: Mapping[str, Finding],
         level: float,
     ) -> None:
-        self.names, self.chain, self.dt, self.reference = names, chain, dt, reference  # names of the graphs
+        self.experiment, self.names = experiment, [graph.name for graph in experiment.graph_list]
         self.residuals, self.transitions, self.loss_tally = residuals, transitions, loss
         self.findings, self.level = findings, level
         self.families = 0  # classes of candidates, all questions together
@@ -159,7 +156,7 @@ class Search:
         """What is found in the regression, and the total change of its coefficients."""
         return self._select(self.gains) if self.gains else ([], np.zeros(len(self.residuals.terms)))
 
-    @property
+    @cached_property
     def any_noise(self) -> Parameters | None:
         """The noise variances as if all gains were right."""
         return candidates.noise(self.residuals, self.excluded, np.zeros(len(self.residuals.terms)))

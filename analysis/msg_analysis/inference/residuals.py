@@ -42,9 +42,9 @@ QUIET_ROUNDING = 1e-9  # relative size of what counts as rounding in directions 
 class ResidualTests:
     """p-values; None where there is nothing to test."""
 
-    p_covariance: float | None  # of their covariance being N_g; 0 if anything moves in a direction without noise
-    p_whiteness: float | None  # correlation in time (lags 1..10) and between replicas
-    p_gain: float | None  # regression on what the agents received: wrong gains, references, offsets
+    p_covariance: float | None = None  # of their covariance being N_g; 0 if anything moves in a direction without noise
+    p_whiteness: float | None = None  # correlation in time (lags 1..10) and between replicas
+    p_gain: float | None = None  # regression on what the agents received: wrong gains, references, offsets
     p_common_gain: float | None = None  # the same for one factor of all gains: ignored messages
     # (m,) measured over nominal variance; NaN where an agent has no noise in some graph
     ratios: tuple[float, ...] | None = None
@@ -133,7 +133,7 @@ class ResidualSums:
     def tests(self) -> ResidualTests:
         """All tests of the residuals."""
         if not self.independent:
-            return ResidualTests(None, None, None)
+            return ResidualTests()
         ratios: tuple[float, ...] | None = None
         # Variances below NO_NOISE are allowed for: ten standard deviations.
         hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in self.noises))

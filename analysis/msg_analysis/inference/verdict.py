@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -24,7 +24,7 @@ from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.evidence_sums import AnyTimeEvidence, any_time_evidence
 from msg_analysis.inference.given_path import GivenPath
 from msg_analysis.inference.observation import Measurement, Observation, spaced_steps
-from msg_analysis.inference.question import Finding, Search, Statistics
+from msg_analysis.inference.question import Search, Statistics
 from msg_analysis.inference.questions import causes_of, decide
 from msg_analysis.inference.residuals import ResidualTests
 from msg_analysis.inference.statistics import batch_interval, chi2_tail, steps_to_half_width
@@ -105,7 +105,8 @@ def evaluate(
     rejected = [test.name for test in tests if test.rejected]
     blame: list[Cause] = []
     if rejected and trajectory.completeness.complete:
-        blame = causes_of(_search(prediction, evidence, run.findings, level), rejected)
+        sums = evidence.residuals, evidence.transitions, evidence.loss, evidence.broadcast
+        blame = causes_of(Search(prediction.experiment, *sums, run.findings, level), rejected)
     return Comparison(
         trajectory=trajectory,
         level=level,
@@ -159,22 +160,6 @@ def _covariance(evidence: Evidence, system: JumpSystem) -> CovarianceTest:
     return replace(tested, measured=shown.measured, predicted=shown.predicted)
 
 
-def _search(prediction: Prediction, evidence: Evidence, findings: Mapping[str, Finding], level: float) -> Search:
-    experiment = prediction.experiment
-    return Search(
-        names=[graph.name for graph in experiment.graph_list],
-        chain=experiment.chain,
-        dt=experiment.step_length,
-        reference=experiment.reference,
-        residuals=evidence.residuals,
-        transitions=evidence.transitions,
-        loss=evidence.loss,
-        broadcast=evidence.broadcast,
-        findings=findings,
-        level=level,
-    )
-
-
 def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
     """Comparison without a prediction."""
     measurement = Measurement.of(trajectory)
@@ -183,14 +168,8 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
         enough = False
     series, covariance = measurement.system_series, measurement.covariance if enough else None
     run = Statistics(
-        system_error=None,
-        node_errors=(),
-        corrected="",
-        covariance=None,
-        residuals=ResidualTests(None, None, None),
         switching=switching_test(measurement.modes, measurement.step.transition) if enough else None,
         loss=loss_test(measurement) if enough else None,
-        p_broadcast=None,
     )
     nodes = [Estimate()] * agents if covariance is None else [Estimate(float(error)) for error in np.diag(covariance)]
     counts = spaced_steps(len(series)) if enough else np.empty(0, np.int64)
@@ -227,7 +206,7 @@ def without_numbers(trajectory: Run, level: float, prediction: Prediction, steps
         system_error=Estimate(predicted=predicted.system_error),
         node_errors=[Estimate(predicted=float(error)) for error in predicted.node_errors],
         covariance=CovarianceTest(predicted=predicted.covariance),
-        innovations=ResidualTests(None, None, None),
+        innovations=ResidualTests(),
         switching=None,
         continuous_error=prediction.continuous.system_error if prediction.continuous_moments else None,
         batch=None,
