@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -257,12 +257,12 @@ class Comparison:
     system_error: Estimate
     node_errors: list[Estimate]
     covariance: CovarianceTest
-    innovations: ResidualTests
-    switching: SwitchingTest | None
-    continuous_error: float | None
-    batch: tuple[float, float] | None
-    tests: list[Test]
     running: dict[str, FloatArray]
+    innovations: ResidualTests = field(default_factory=ResidualTests)
+    switching: SwitchingTest | None = None
+    continuous_error: float | None = None
+    batch: tuple[float, float] | None = None
+    tests: Sequence[Test] = ()
     loss: LossTest | None = None
     p_broadcast: float | None = None
     unpredicted: str | None = None

@@ -114,17 +114,8 @@ def means_given_path(observation: Observation) -> TimeMeans | None:
     y = without_rounding(y, system, observation.largest)
     expected = _expected_sum(which, matrices, noise, y.T @ y / len(y)) / steps
     seen, covariance, series, variances = _backwards(observation, kinds, forms, trace)
-    return TimeMeans(
-        second_moments=packed_symmetric.unpack(seen / steps, d),
-        expected_moments=expected,
-        joint=kind == "joint",
-        measured=forms @ (seen / steps),
-        predicted=forms @ packed_symmetric.pack(expected),
-        covariance=covariance / steps**2,
-        nodes=nodes,
-        trace=trace,
-        system_series=series,
-        system_variances=variances,
+    return TimeMeans.of(
+        (forms, nodes, trace), seen / steps, expected, covariance / steps**2, (series, variances), joint=kind == "joint"
     )
 
 

@@ -26,7 +26,6 @@ from msg_analysis.inference.given_path import GivenPath
 from msg_analysis.inference.observation import Measurement, Observation, spaced_steps
 from msg_analysis.inference.question import Search, Statistics
 from msg_analysis.inference.questions import causes_of, decide
-from msg_analysis.inference.residuals import ResidualTests
 from msg_analysis.inference.statistics import batch_interval, chi2_tail, steps_to_half_width
 from msg_analysis.inference.time_means import TimeMeans
 from msg_analysis.model.run import Completeness, Run
@@ -180,9 +179,7 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
         system_error=Estimate() if covariance is None else Estimate(float(np.trace(covariance))),
         node_errors=nodes,
         covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
-        innovations=run.residuals,
         switching=run.switching,
-        continuous_error=None,
         batch=batch_interval(series) if enough else None,
         tests=decide(run, level),
         running={
@@ -206,11 +203,7 @@ def without_numbers(trajectory: Run, level: float, prediction: Prediction, steps
         system_error=Estimate(predicted=predicted.system_error),
         node_errors=[Estimate(predicted=float(error)) for error in predicted.node_errors],
         covariance=CovarianceTest(predicted=predicted.covariance),
-        innovations=ResidualTests(),
-        switching=None,
         continuous_error=prediction.continuous.system_error if prediction.continuous_moments else None,
-        batch=None,
-        tests=[],
         running={key: np.empty(0) for key in ("time", "system_error", "standard_error")},
     )
 
