@@ -22,7 +22,7 @@ def departures():
 
 
 WORDS = {
-    "an agent stands still for 20 steps": r"agent 3 stood still from step ([\d,]+) to ([\d,]+), although it has noise",
+    "an agent stands still for 20 steps": r"agent 3 did not move from step ([\d,]+) to ([\d,]+), although it has noise",
     "names of the graphs swapped in 10 blocks of 20 steps": (
         r"the log has the names of the graphs line and ring swapped from step [\d,]+ to [\d,]+"
     ),

@@ -257,7 +257,7 @@ def test_noise_over_time_by_lags(agent: int | None) -> None:
     sums = NoiseOverTime(made(observation.step, 1200, 2, np.ones(5, dtype=bool)))
     for first in range(0, 1200, 37):
         part = SimpleNamespace(
-            first=first, white=white[first : first + 37], looks=Analyses.at_the_end(min(37, 1200 - first))
+            first=first, white=white[first : first + 37], analyses=Analyses.at_the_end(min(37, 1200 - first))
         )
         sums.add(part)  # type: ignore[arg-type]
     squares = (white**2).sum(axis=2)

@@ -81,7 +81,7 @@ def test_innovations_are_added_up(three):
     n, scatter = len(whitened), whitened.T @ whitened / len(whitened)
     statistic = n * (np.trace(scatter) - np.log(np.linalg.det(scatter)) - 3) * (1 - 26 / (24 * n))
     assert pooled.innovations.p_covariance == pytest.approx(stats.chi2.sf(statistic, 6), rel=1e-8)
-    sums = [Evidence.of(one, 0.01).innovations for one in observations]
+    sums = [Evidence.of(one, 0.01).residuals for one in observations]
     chi2, dof = quadratic_form(sum(s.score for s in sums), sum(s.covariance for s in sums))
     assert pooled.innovations.p_gain == pytest.approx(stats.chi2.sf(chi2, dof))
 
