@@ -76,10 +76,10 @@ def summary(case: str, comparison: Comparison) -> dict[str, Any]:
         "order": order is not None and any(pair.predicted is False for pair in order.distinctions),
         "p": {test.name: test.p for test in comparison.tests},
     }
-    if case in FALSE and comparison.blame:
-        first = comparison.blame[0]
+    if case in FALSE and comparison.causes:
+        first = comparison.causes[0]
         said = (first.kind, first.agent, list(first.link) if first.link else None)
-        kept |= {"right": said == FALSE[case][1], "said": first.words, "causes": len(comparison.blame)}
+        kept |= {"right": said == FALSE[case][1], "said": first.words, "causes": len(comparison.causes)}
     return kept
 
 

@@ -158,7 +158,7 @@ def summary(fault: str | None, replicas: int, seed: int) -> Kept:
     """Simulate and compare a run."""
     result = one_run(fault, replicas, seed)
     rejected = sorted({test.name.partition(" of agent")[0] for test in result.tests if test.rejected})
-    first = result.blame[0] if result.blame else None
+    first = result.causes[0] if result.causes else None
     assert result.any_time is not None
     right = bool(first and fault and first.kind == FAULTS[fault][1])
     words = first.words if first else ""

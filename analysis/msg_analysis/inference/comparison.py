@@ -240,7 +240,7 @@ class Comparison:
         errors given the path of the graphs; None where they are not computed
     order
         which agents have smaller errors than which; None where the run is too short to know
-    blame
+    causes
         what is wrong, where the verdict is "disagrees"
     pool
         the runs, where there are several
@@ -271,7 +271,7 @@ class Comparison:
     laws: Laws | None = None
     given: GivenPath | None = None
     order: Ranking | None = None
-    blame: Sequence[Cause] = ()
+    causes: Sequence[Cause] = ()
     pool: Pool | None = None
     any_time: AnyTimeEvidence | None = None
     trust: Trust | None = None
@@ -299,7 +299,7 @@ class Comparison:
         ]
         rows += [("...", "", "", "", "")] * (len(self.node_errors) > SHOWN_AGENTS)
         table = markdown_table(("mean-square error", "measured", "± (95 %)", "predicted", "z"), rows)
-        blame = "".join(f"- {with_names(cause.words, names)}\n" for cause in self.blame)
+        blame = "".join(f"- {with_names(cause.words, names)}\n" for cause in self.causes)
         return f"**{self.verdict}**\n\n{table}" + (f"\n{blame}" if blame else "")
 
     @property
@@ -375,7 +375,7 @@ class Comparison:
             "laws": self.laws.to_json() if self.laws else None,
             "given_path": self.given.to_json() if self.given else None,
             "order": self.order.to_json() if self.order else None,
-            "blame": [cause.to_json() for cause in self.blame],
+            "blame": [cause.to_json() for cause in self.causes],
             "continuous": {"system_error": self.continuous_error},
             "batch_means": {"interval": self.batch or (None, None)},
             "tests": [test.to_json() for test in self.tests],

@@ -102,10 +102,10 @@ def evaluate(
     logarithms = {name: float(log_mean(logs.reshape(-1))) for name, logs in families.items()}
     tests = decide(run, level, logarithms)
     rejected = [test.name for test in tests if test.rejected]
-    blame: list[Cause] = []
+    causes: list[Cause] = []
     if rejected and trajectory.completeness.complete:
         sums = evidence.residuals, evidence.transitions, evidence.loss, evidence.broadcast
-        blame = causes_of(Search(prediction.experiment, *sums, run.findings, level), rejected)
+        causes = causes_of(Search(prediction.experiment, *sums, run.findings, level), rejected)
     return Comparison(
         trajectory=trajectory,
         level=level,
@@ -125,7 +125,7 @@ def evaluate(
         laws=evidence.laws,
         given=GivenPath(means, evidence.given) if evidence.given else None,
         order=rank_agents(means, level) if means.long_enough else None,
-        blame=blame,
+        causes=causes,
         any_time=_any_time(trajectory.record, prediction, evidence, level, families),
         trust=trusted(prediction, means, given=evidence.given is not None) if lockstep else None,
     )

@@ -58,7 +58,7 @@ def test_a_fault_is_found_and_named(departures, fault: str) -> None:
     result = departures.one_run(fault, 16, 101)
     assert result.verdict == "disagrees"
     assert result.any_time.exceeded
-    first = result.blame[0]
+    first = result.causes[0]
     assert first.kind == departures.FAULTS[fault][1]
     assert re.fullmatch(WORDS[fault], first.words), first.words
     stretch = first.kind == "noise" and first.graph is None and "steps before" not in first.words
@@ -73,5 +73,5 @@ def test_the_stretch_is_the_right_one(departures) -> None:
     result = departures.one_run("an agent stands still for 20 steps", 16, 102)
     states = result.trajectory.states[:, 2]
     still = np.flatnonzero((states[1:] == states[:-1]).all(axis=1)) + 1
-    assert result.blame[0].steps == (still[0], still[-1])
+    assert result.causes[0].steps == (still[0], still[-1])
     assert len(still) == 20

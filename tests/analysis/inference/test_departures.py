@@ -328,7 +328,7 @@ def test_a_network_that_never_moves() -> None:
     assert (finding.log_p, finding.estimate) == (0.0, 0.0)
     result = compare(still)
     assert result.verdict == "disagrees"
-    assert result.blame[0].words == "agent 1 does not move in any of its steps, although it has noise"
+    assert result.causes[0].words == "agent 1 does not move in any of its steps, although it has noise"
 
 
 def test_long_lags() -> None:

@@ -271,7 +271,7 @@ def test_a_link_that_loses_more_is_named(on_loss, burst):
     actual = experiment(noise | {"loss": {"arcs": [links[0], [2, 3, 0.3], links[2]]}}, duration=400, start="zero")
     found = compare(message_run(claimed, 6, actual=actual))
     assert found.verdict == "disagrees"
-    first = next(cause for cause in found.blame if cause.kind == "loss")
+    first = next(cause for cause in found.causes if cause.kind == "loss")
     assert first.link == (2, 3)
     assert first.expected == pytest.approx(0.2)
     assert first.interval[0] < 0.3 < first.interval[1]

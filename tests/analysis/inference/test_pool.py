@@ -128,8 +128,8 @@ def test_a_fault_that_one_run_does_not_show():
     assert compare(found[0][1]).verdict == "agrees"
     pooled = compare_pooled(found)
     assert pooled.verdict == "disagrees"
-    assert (pooled.blame[0].kind, pooled.blame[0].agent) == ("noise", None)
-    assert pooled.blame[0].interval[0] < 1.05 < pooled.blame[0].interval[1]
+    assert (pooled.causes[0].kind, pooled.causes[0].agent) == ("noise", None)
+    assert pooled.causes[0].interval[0] < 1.05 < pooled.causes[0].interval[1]
 
 
 def test_paths_start_anew_in_every_run():
@@ -151,7 +151,7 @@ def test_incomplete_runs_are_named(three):
         ("stump", 0, False),
     ]
     assert pooled.steps == 549
-    assert pooled.blame == []
+    assert pooled.causes == []
     stumps = compare_pooled([(f"stump {i}", cut(run, 20)) for i, (_, run) in enumerate(three)])
     assert (stumps.verdict, stumps.system_error.measured) == ("incomplete", None)
     json.dumps(stumps.to_json(), allow_nan=False)
