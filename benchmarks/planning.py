@@ -24,13 +24,12 @@ import numpy as np
 from msg_analysis.api import Experiment
 from msg_analysis.common.resources import count_cores
 from msg_analysis.common.text import percent
-from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.fault_power import Fault, fault_powers
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.sample_size import precision_of
 from msg_analysis.inference.statistics import simultaneous_half_width
 from msg_analysis.inference.time_means import time_means
-from msg_analysis.inference.verdict import evaluate
+from msg_analysis.inference.verdict import Evidence, evaluate
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.theory.time_mean_variance import mean_variance
 from msg_analysis.twin.simulate import simulate

@@ -19,9 +19,8 @@ import numpy as np
 from msg_analysis.common.resources import count_cores
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.estimates import estimates
-from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.verdict import evaluate
+from msg_analysis.inference.verdict import Evidence, evaluate
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.twin.simulate import simulate
 

@@ -291,6 +291,7 @@ class ConstantState(Diagnostic):
 
     name = "residuals: constant state"
     meaning = "the state of an agent with noise does not change for some steps"
+    subject = "agents whose state is constant"
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)
@@ -351,11 +352,6 @@ class ConstantState(Diagnostic):
     def logarithms(self) -> FloatArray:
         """(1, 1)."""
         return np.array([[self._evidence.logarithm()]]) if len(self._agents) else np.empty((0, 1))
-
-    def about(self, row: int) -> str:
-        """One, about all agents."""
-        del row
-        return "agents whose state is constant"
 
     @classmethod
     def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:

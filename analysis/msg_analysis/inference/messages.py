@@ -288,6 +288,7 @@ class CommonGain(Question):
 
     name = "residuals: common gain"
     meaning = "all gains are too small or too large by one factor, or messages have no effect"
+    subject = "all gains"
 
     @classmethod
     def tests(cls, run: Statistics) -> list[Test]:
@@ -299,11 +300,6 @@ class CommonGain(Question):
         if not self.law.apart:
             return super().evidence(sums)
         return coefficient_evidence(sums.common_score, sums.common_information)[:, None]
-
-    def about(self, row: int) -> str:
-        """One row."""
-        del row
-        return "all gains"
 
 
 def _gain_words(one: Selected, search: Search) -> Cause:

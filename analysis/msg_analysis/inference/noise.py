@@ -382,6 +382,7 @@ class LargestResidual(Diagnostic):
 
     name = "residuals: largest"
     meaning = "a single step is much larger than the noise"
+    subject = "largest residual"
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)
@@ -425,11 +426,6 @@ class LargestResidual(Diagnostic):
     def logarithms(self) -> FloatArray:
         """(1, 1)."""
         return np.array([[self._evidence.logarithm()]]) if self._evidence.planned else np.empty((0, 1))
-
-    def about(self, row: int) -> str:
-        """One, about all agents."""
-        del row
-        return "largest residual"
 
     @classmethod
     def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:

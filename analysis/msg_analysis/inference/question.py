@@ -242,6 +242,7 @@ class Question(ABC):
 
     name: ClassVar[str]  # of the test in the verdict
     meaning: ClassVar[str]  # what is wrong where it is rejected
+    subject: ClassVar[str] = ""  # of its evidence, where that has one row and is not about the name
     main: ClassVar[bool] = False  # whether one part of the law answers it, see ``evidence_weights``
     about_chain: ClassVar[bool] = False  # whether it is about the graphs, not about the steps of the agents
 
@@ -264,7 +265,7 @@ class Question(ABC):
     def about(self, row: int) -> str:
         """What a row of ``evidence`` is about, in words."""
         del row
-        return self.name
+        return self.subject or self.name
 
     @classmethod
     def classes(cls, search: Search) -> int:

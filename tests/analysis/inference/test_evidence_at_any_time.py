@@ -10,12 +10,11 @@ import pytest
 from tests.support.line_and_ring import experiment
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.evidence import Evidence, usual_analyses
 from msg_analysis.inference.evidence_sums import EvidenceSums, WatchedEvidence, any_time_evidence
 from msg_analysis.inference.observation import Observation, spaced_steps
 from msg_analysis.inference.questions import QUESTIONS, evidence_weights
 from msg_analysis.inference.system_error import ErrorMartingale
-from msg_analysis.inference.verdict import compare, compare_pooled
+from msg_analysis.inference.verdict import Evidence, compare, compare_pooled, usual_analyses
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate

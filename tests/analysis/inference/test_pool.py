@@ -11,11 +11,10 @@ from tests.support.p_values import kolmogorov_smirnov
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.counts import Transitions
-from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.residuals import residuals
 from msg_analysis.inference.statistics import quadratic_form
-from msg_analysis.inference.verdict import compare, compare_pooled
+from msg_analysis.inference.verdict import Evidence, compare, compare_pooled
 from msg_analysis.model.run import Completeness
 from msg_analysis.theory.prediction import predict
 from msg_analysis.twin.simulate import simulate
