@@ -262,7 +262,7 @@ class Comparison:
     switching: SwitchingTest | None = None
     continuous_error: float | None = None
     batch: tuple[float, float] | None = None
-    tests: Sequence[Test] = ()
+    tests: list[Test] = field(default_factory=list)
     loss: LossTest | None = None
     p_broadcast: float | None = None
     unpredicted: str | None = None

@@ -47,7 +47,7 @@ def test_heavy_tails(document):
     assert tests["system error, corrected"] == pytest.approx(found.given.system_error.p)
     [words] = trust_words(found.to_json())
     assert "infinite" in words
-    assert "Trust the errors given the path" in words
+    assert "Trust the errors corrected for the graph sequence" in words
 
 
 def test_heavy_tails_of_several_runs():
