@@ -17,8 +17,8 @@ import numpy as np
 
 from msg_analysis.common.resources import count_cores
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.inference.evidence_sums import WatchedEvidence
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.sequential_sums import WatchedEvidence
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.twin.simulate import simulate
 

@@ -25,7 +25,7 @@ from calibration_tables import complaints, message_tables, tables
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.estimates import Estimate
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.simulate import new_record, simulate
 
@@ -76,10 +76,10 @@ def summary(case: str, comparison: Comparison) -> dict[str, Any]:
         "order": order is not None and any(pair.predicted is False for pair in order.distinctions),
         "p": {test.name: test.p for test in comparison.tests},
     }
-    if case in FALSE and comparison.blame:
-        first = comparison.blame[0]
+    if case in FALSE and comparison.causes:
+        first = comparison.causes[0]
         said = (first.kind, first.agent, list(first.link) if first.link else None)
-        kept |= {"right": said == FALSE[case][1], "said": first.words, "causes": len(comparison.blame)}
+        kept |= {"right": said == FALSE[case][1], "said": first.words, "causes": len(comparison.causes)}
     return kept
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from any_time import EVERY, LEVEL, experiment
 from scipy import stats
 
+from msg_analysis.inference.evidence_sums import WatchedEvidence
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.sequential_sums import WatchedEvidence
 from msg_analysis.inference.statistics import simultaneous_half_width
 from msg_analysis.inference.time_means import time_means
 from msg_analysis.theory.prediction import Prediction, predict

@@ -21,7 +21,7 @@ from calibration_laws import TRUE, line_ring
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.model.step_model import StepModel
 from msg_analysis.twin.simulate import simulate
 
@@ -158,11 +158,11 @@ def summary(fault: str | None, replicas: int, seed: int) -> Kept:
     """Simulate and compare a run."""
     result = one_run(fault, replicas, seed)
     rejected = sorted({test.name.partition(" of agent")[0] for test in result.tests if test.rejected})
-    first = result.blame[0] if result.blame else None
+    first = result.causes[0] if result.causes else None
     assert result.any_time is not None
     right = bool(first and fault and first.kind == FAULTS[fault][1])
     words = first.words if first else ""
-    return Kept(result.verdict == "disagrees", result.any_time.disagrees, right, rejected, words)
+    return Kept(result.verdict == "disagrees", result.any_time.exceeded, right, rejected, words)
 
 
 CORRECT = {"line/ring, 16 replicas": line_ring(replicas=16)} | {
@@ -184,7 +184,7 @@ def correct_run(law: str, seed: int) -> Correct:
     result = compare(simulate(Experiment.parse(CORRECT[law]).with_run(seed=seed)))
     assert result.any_time is not None
     p = {test.name: test.p for test in result.tests if " of agent" not in test.name}
-    return Correct(result.verdict == "disagrees", result.any_time.disagrees, p)
+    return Correct(result.verdict == "disagrees", result.any_time.exceeded, p)
 
 
 def print_faults(pool: ProcessPoolExecutor, faults: list[str], runs: int, replicas: int, words: bool) -> None:

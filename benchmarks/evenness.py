@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.simulate import simulate
 

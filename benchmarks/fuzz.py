@@ -33,7 +33,7 @@ from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import loading
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.report.documents import describe_bag, describe_experiment
 
 ROOT = Path(__file__).parents[1]

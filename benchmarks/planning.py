@@ -24,13 +24,12 @@ import numpy as np
 from msg_analysis.common.resources import count_cores
 from msg_analysis.common.text import percent
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.fault_power import Fault, fault_powers
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.sample_size import precision_of
 from msg_analysis.inference.statistics import simultaneous_half_width
 from msg_analysis.inference.time_means import time_means
-from msg_analysis.inference.verdict import judge
+from msg_analysis.inference.verdict import Evidence, evaluate
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.theory.time_mean_variance import mean_variance
 from msg_analysis.twin.simulate import simulate
@@ -104,7 +103,7 @@ def disagrees(fault: str, duration: float, seed: int) -> tuple[bool, float]:
     run = simulate(any_time.experiment(seed, duration, **any_time.FAULTS[fault]))
     prediction = any_time.law("consensus", duration)
     evidence = Evidence.of(Observation.of(run, prediction), any_time.LEVEL)
-    verdict = judge(run, prediction, evidence, any_time.LEVEL)
+    verdict = evaluate(run, prediction, evidence, any_time.LEVEL)
     assert verdict.any_time
     crossed = verdict.any_time.crossed
     return bool(verdict.verdict == "disagrees"), np.inf if crossed is None else crossed / prediction.step.dt

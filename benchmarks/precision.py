@@ -16,7 +16,7 @@ from pathlib import Path
 
 from msg_agents.run.runner import run_network
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.twin.simulate import simulate
 
 EXPERIMENT = Path(__file__).parents[1] / "analysis/msg_analysis/experiment/bundled/line_ring.yaml"

@@ -19,9 +19,8 @@ import numpy as np
 from msg_analysis.common.resources import count_cores
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.estimates import estimates
-from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.verdict import judge
+from msg_analysis.inference.verdict import Evidence, evaluate
 from msg_analysis.theory.prediction import Prediction, predict
 from msg_analysis.twin.simulate import simulate
 
@@ -79,7 +78,7 @@ def examine(kind: str, switches: int | None, seed: int) -> tuple[float, float, f
     trajectory = simulate(prediction.experiment.with_run(seed=seed))
     evidence = Evidence.of(Observation.of(trajectory, prediction), 0.01)
     error = estimates(evidence.means, prediction.system)[0]  # also where the verdict leaves its interval out
-    comparison = judge(trajectory, prediction, evidence, 0.01)
+    comparison = evaluate(trajectory, prediction, evidence, 0.01)
     assert error.measured is not None
     assert error.predicted is not None
     assert error.z is not None

@@ -70,7 +70,7 @@ def main() -> None:
                     if reached(until, live.report()):
                         last = int(at[-1]) + 1
                         break
-                result = verdicts.compare(shorter(replace(whole, record=record), last))
+                result = verdicts.compare_run(shorter(replace(whole, record=record), last))
                 assert result.any_time is not None
                 half, error = result.any_time.half_width, result.system_error
                 assert half is not None

@@ -40,7 +40,7 @@ def assert_agrees(*runs: Run | str | Path, level: float = 0.001) -> Comparison:
     if comparison.verdict != "agrees":
         rejected = [f"{test.name} (adjusted p {test.p_adjusted:.3g})" for test in comparison.tests if test.rejected]
         missing = f"{comparison.trajectory.completeness.missing} states are missing"
-        causes = [cause.words for cause in comparison.blame]
+        causes = [cause.words for cause in comparison.causes]
         reasons = [comparison.unpredicted or ", ".join(rejected) or missing, *causes]
         raise AssertionError(f"{comparison!r}: {'; '.join(reasons)}")
     return comparison

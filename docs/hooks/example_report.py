@@ -13,7 +13,7 @@ from mkdocs.utils import get_relative_url
 
 from msg_analysis.experiment import examples
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.report.page import render
 from msg_analysis.twin.simulate import simulate
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 

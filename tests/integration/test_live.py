@@ -15,7 +15,7 @@ from awaiting_network import BAG, failures_of, network_awaiting
 
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.writing import write_trajectory
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.twin.simulate import new_record, simulate
 
 LISTENER = """

@@ -16,7 +16,7 @@ import yaml
 from msg_agents.run import lifeline
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 

@@ -28,7 +28,7 @@ from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment
 from msg_agents.run.result import read_steps
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.model.phases import phases
 from msg_analysis.model.run import Run
 from msg_analysis.twin.check import check

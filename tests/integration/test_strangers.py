@@ -16,7 +16,7 @@ from stranger import STEPS, Forgery, batch, graph, run_beside, states
 
 from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.messages.messages import Progress, encode_string
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.twin.check import check

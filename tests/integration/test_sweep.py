@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.paper import figures as emulation
 from msg_analysis.twin.simulate import simulate
 

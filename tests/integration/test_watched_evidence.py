@@ -27,7 +27,7 @@ LAWS: dict[str, dict[str, Any]] = {
 
 # Agent 3 has 1.3 times its noise in every process of the run; the record does not know it.
 NOISY = """
-from msg_analysis.model.step import process_noise
+from msg_analysis.model import process_noise
 
 class Noisy(process_noise.ProcessNoise):
     def block(self, agent, *others):
@@ -48,9 +48,10 @@ def test_watchers_have_the_evidence_of_the_comparison(
 ) -> None:
     """The observer of the run by the checkpoints, and `live` by the topics of its replay."""
     observers: list[run_observer.RunObserver] = []
+    made = run_observer.RunObserver
 
     def observer(record: Any, checkpoints: Path) -> run_observer.RunObserver:
-        observers.append(run_observer.RunObserver(record, checkpoints))
+        observers.append(made(record, checkpoints))
         return observers[-1]
 
     monkeypatch.setattr(early_end, "RunObserver", observer)

@@ -14,7 +14,7 @@ from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.verdict import compare as compare
+from msg_analysis.inference.pool import compare as compare
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.prediction import Prediction, predict

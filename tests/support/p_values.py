@@ -7,13 +7,13 @@ from scipy import stats
 from msg_analysis.inference.comparison import Comparison
 
 BY_A_BOUND = {
-    "innovations: noise by graph",
-    "innovations: noise over time",
-    "innovations: standing still",
-    "innovations: largest",
-    "innovations: lags to 100",
-    "innovations: stale values",
-    "innovations: swapped graphs",
+    "residuals: noise by graph",
+    "residuals: noise over time",
+    "residuals: constant state",
+    "residuals: largest",
+    "residuals: lags to 100",
+    "residuals: stale values",
+    "residuals: swapped graphs",
 }
 """Tests whose p is a bound (of Bonferroni or Markov), so that small ones may be rarer than of a uniform number."""
 

@@ -3,9 +3,9 @@
 import random
 
 from msg_analysis.bags import writing
+from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.online_errors import LiveEstimate, LiveReport
-from msg_analysis.inference.sequential_sums import EvidenceSums
 from msg_analysis.messages.acceptance import state_frame
 from msg_analysis.messages.messages import ActiveGraph
 from msg_analysis.model.run import Run

@@ -20,10 +20,10 @@ import numpy as np
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import HALF_WIDTH_95
 from msg_analysis.experiment.markov_chain import MarkovChain
-from msg_analysis.inference.gains import Term
-from msg_analysis.inference.messages import LossTally
+from msg_analysis.inference.counts import LossTally
 from msg_analysis.inference.received_values import NO_NOISE
-from msg_analysis.inference.residuals import InnovationSums
+from msg_analysis.inference.regression import Term
+from msg_analysis.inference.residuals import ResidualSums
 from msg_analysis.inference.statistics import chi2_quantile, log_normal_tail, pseudo_inverse
 
 MOST = 6  # causes searched for in one group
@@ -200,12 +200,12 @@ def numbers_text(value: float, interval: tuple[float, float]) -> str:
     return f"{value:#.3g} ({interval[0]:#.3g} to {interval[1]:#.3g})"
 
 
-MIN_SAMPLES = 30  # fewest innovations for a variance
+MIN_SAMPLES = 30  # fewest residuals for a variance
 MAX_PARAMETERS = 600  # most parameters whose information is inverted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Suspects:
+class Parameters:
     """A group of parameters that may be wrong."""
 
     score: FloatArray  # (K,)
@@ -213,23 +213,23 @@ class Suspects:
     classes: list[list[Candidate]]  # candidates, class by class; the more specific of equal ones first
 
 
-def frozen(sums: InnovationSums) -> list[tuple[int, int, int]]:
-    """(agent, steps in which it did not move, steps) of agents that cannot have stood still with their noise."""
+def frozen(sums: ResidualSums) -> list[tuple[int, int, int]]:
+    """(agent, steps in which it did not move, steps) of agents that cannot have did not move with their noise."""
     noisy = np.sqrt(np.diagonal(sums.noises, axis1=1, axis2=2)) > 1e-12 * sums.largest
     still, steps = (sums.still * noisy).sum(axis=0), (sums.steps[:, None] * noisy).sum(axis=0)
     # One or two unmoved steps may be a coincidence of rounding.
     return [(i, int(still[i]), int(steps[i])) for i in np.flatnonzero(still >= 3).tolist()]
 
 
-def gains(sums: InnovationSums, pardoned: Iterable[int]) -> Suspects | None:
-    """Parameters of the regression on what the agents heard, without the ``pardoned``; None where it is not available.
+def gains(sums: ResidualSums, excluded: Iterable[int]) -> Parameters | None:
+    """Parameters of the regression on received values, without the ``excluded``; None where it is not available.
 
     Changes of gains are relative, those of the reference and of offsets (per step) absolute. The score G C^-1 U and the
     information G C^-1 G follow from the regression's score U, covariance C and gram G.
     """
     if sums.gram is None or len(sums.terms) > MAX_PARAMETERS:
         return None
-    out = set(pardoned)
+    out = set(excluded)
     kept = np.array([a for a, term in enumerate(sums.terms) if term.agent not in out], dtype=np.int64)
     if not kept.size:
         return None
@@ -238,7 +238,7 @@ def gains(sums: InnovationSums, pardoned: Iterable[int]) -> Suspects | None:
     back = sums.gram[square] @ inverse
     score, information = np.zeros(len(sums.terms)), np.zeros_like(sums.gram)
     score[kept], information[square] = back @ sums.score[kept], back @ sums.gram[square]
-    return Suspects(score, information, _gain_classes(sums.terms))
+    return Parameters(score, information, _gain_classes(sums.terms))
 
 
 def _gain_classes(terms: Sequence[Term]) -> list[list[Candidate]]:
@@ -287,14 +287,14 @@ def _reference(terms: Sequence[Term]) -> FloatArray:
     )
 
 
-def noise(sums: InnovationSums, pardoned: Iterable[int], change: FloatArray) -> Suspects | None:
+def noise(sums: ResidualSums, excluded: Iterable[int], change: FloatArray) -> Parameters | None:
     """Logarithms of the noise variances over their nominal values, by graph and agent; None without usable ones.
 
-    Left out are the ``pardoned`` agents, and what the coefficients ``change`` (K,) of the regression explain.
+    Left out are the ``excluded`` agents, and what the coefficients ``change`` (K,) of the regression explain.
     """
     n, m = sums.still.shape
     out = np.zeros(m, np.bool_)
-    out[list(pardoned)] = True
+    out[list(excluded)] = True
     should = np.diagonal(sums.noises, axis1=1, axis2=2)
     squares = np.diagonal(sums.scatter, axis1=1, axis2=2) - _explained(sums, change)
     usable: BoolArray = (should > NO_NOISE * should.max(initial=0.0)) & (sums.samples >= MIN_SAMPLES)[:, None] & ~out
@@ -315,10 +315,10 @@ def noise(sums: InnovationSums, pardoned: Iterable[int], change: FloatArray) -> 
         [Candidate("graph", int(g), (graph == g) * 1.0) for g in np.unique(graph)],
         [Candidate("all", None, np.ones(len(cells)))],
     ]
-    return Suspects(information @ ratios, information, classes if n > 1 else [classes[0], classes[3]])
+    return Parameters(information @ ratios, information, classes if n > 1 else [classes[0], classes[3]])
 
 
-def variances(squares: FloatArray, samples: int) -> Suspects:
+def variances(squares: FloatArray, samples: int) -> Parameters:
     """Logarithms of the variances of m kinds of independent normal numbers, nominally 1.
 
     ``squares`` (m,) are sums of squares of as many numbers as ``samples``.
@@ -328,10 +328,10 @@ def variances(squares: FloatArray, samples: int) -> Suspects:
         [Candidate("agent", i, row) for i, row in enumerate(np.eye(len(squares)))],
         [Candidate("all", None, np.ones(len(squares)))],
     ]
-    return Suspects(information @ np.log(np.maximum(squares, 1e-300) / samples), information, classes)
+    return Parameters(information @ np.log(np.maximum(squares, 1e-300) / samples), information, classes)
 
 
-def losses(tally: LossTally) -> Suspects:
+def losses(tally: LossTally) -> Parameters:
     """Log-odds of losing a message, link by link."""
     pairs = tally.pairs
     score, information = tally.score()
@@ -345,10 +345,10 @@ def losses(tally: LossTally) -> Suspects:
         [Candidate("sender", int(j), (pairs[:, 1] == j) * usable.astype(float)) for j in np.unique(pairs[usable, 1])],
         [Candidate("all", None, usable.astype(float))],
     ]
-    return Suspects(np.asarray(score), np.diag(information), classes)
+    return Parameters(np.asarray(score), np.diag(information), classes)
 
 
-def _explained(sums: InnovationSums, change: FloatArray) -> FloatArray:
+def _explained(sums: ResidualSums, change: FloatArray) -> FloatArray:
     """(n, m): how much smaller the sums of squares are with this change of the law."""
     n, m = sums.still.shape
     explained = np.zeros((n, m))

@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -27,13 +27,13 @@ from msg_analysis.common.text import (
 from msg_analysis.errors import ExitCode
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.candidates import Cause
+from msg_analysis.inference.counts import LossTest, SwitchingTest
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, Ranking
+from msg_analysis.inference.evidence_sums import AnyTimeEvidence
 from msg_analysis.inference.given_path import GivenPath
-from msg_analysis.inference.messages import LossTest
+from msg_analysis.inference.question import Test
 from msg_analysis.inference.realtime_laws import Laws
-from msg_analysis.inference.residuals import InnovationTests
-from msg_analysis.inference.sequential_sums import AnyTimeEvidence
-from msg_analysis.inference.switching import SwitchingTest
+from msg_analysis.inference.residuals import ResidualTests
 from msg_analysis.inference.time_means import TimeMeans
 from msg_analysis.inference.timing import Timing
 from msg_analysis.model.run import Completeness, Run
@@ -102,23 +102,13 @@ class Trust:
 
 
 def trusted(prediction: Prediction, means: TimeMeans, *, given: bool) -> Trust:
-    """Which errors of a run in lockstep to trust.
-
-    Parameters
-    ----------
-    prediction
-        of the experiment
-    means
-        over all paths, of one run or of several
-    given
-        whether there are errors given the path of the graphs
-    """
+    """Which errors in lockstep to trust, from means over all paths; ``given``: whether there are corrected ones."""
     reason = _reason(prediction, means)
     if reason is None:
         return Trust("all_paths")
-    instead = "Trust the tests of innovations and switching, which do not depend on this."
+    instead = "Trust the tests of residuals and switching, which do not depend on this."
     if given:
-        instead = "Trust the errors given the path, and the tests, which do not depend on this."
+        instead = "Trust the errors corrected for the graph sequence, and the tests, which do not depend on this."
     return Trust("given_path" if given else None, reason, f"{_why(reason, prediction, means)} {instead}")
 
 
@@ -147,7 +137,7 @@ def _why(reason: Reason, prediction: Prediction, means: TimeMeans) -> str:
     if reason == "short_run":
         return "The run is too short for intervals of the errors over all paths of the graphs."
     return (
-        f"This run sees few sojourns of the graphs (some graph is left {number_text(means.switches, 3)} times on "
+        f"This run has few switches (some graph is left {number_text(means.switches, 3)} times on "
         "average), so the errors over all paths of the graphs depend on a few random lengths: they are far from "
         "normal, and their intervals are too wide."
     )
@@ -169,16 +159,6 @@ EXIT_CODES: dict[Verdict, ExitCode] = {
     "incomplete": ExitCode.INCOMPLETE,
     "unpredicted": ExitCode.FINE,
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Test:
-    """One member of the family of tests that the verdict is about."""
-
-    name: str
-    p: float  # of this test alone
-    p_adjusted: float  # Holm's, over the family
-    rejected: bool  # whether ``p_adjusted`` is below the level
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,12 +243,12 @@ class Comparison:
         errors given the path of the graphs; None where they are not computed
     order
         which agents have smaller errors than which; None where the run is too short to know
-    blame
+    causes
         what is wrong, where the verdict is "disagrees"
     pool
         the runs, where there are several
     any_time
-        evidence that may be looked at any time; None where too few steps arrived, or without a prediction
+        evidence that holds at any time; None where too few steps arrived, or without a prediction
     trust
         in lockstep: which errors have valid intervals, and why; None where too few steps arrived, or without a
         prediction
@@ -280,12 +260,12 @@ class Comparison:
     system_error: Estimate
     node_errors: list[Estimate]
     covariance: CovarianceTest
-    innovations: InnovationTests
-    switching: SwitchingTest | None
-    continuous_error: float | None
-    batch: tuple[float, float] | None
-    tests: list[Test]
     running: dict[str, FloatArray]
+    innovations: ResidualTests = field(default_factory=ResidualTests)
+    switching: SwitchingTest | None = None
+    continuous_error: float | None = None
+    batch: tuple[float, float] | None = None
+    tests: list[Test] = field(default_factory=list)
     loss: LossTest | None = None
     p_broadcast: float | None = None
     unpredicted: str | None = None
@@ -294,7 +274,7 @@ class Comparison:
     laws: Laws | None = None
     given: GivenPath | None = None
     order: Ranking | None = None
-    blame: Sequence[Cause] = ()
+    causes: Sequence[Cause] = ()
     pool: Pool | None = None
     any_time: AnyTimeEvidence | None = None
     trust: Trust | None = None
@@ -322,7 +302,7 @@ class Comparison:
         ]
         rows += [("...", "", "", "", "")] * (len(self.node_errors) > SHOWN_AGENTS)
         table = markdown_table(("mean-square error", "measured", "± (95 %)", "predicted", "z"), rows)
-        blame = "".join(f"- {with_names(cause.words, names)}\n" for cause in self.blame)
+        blame = "".join(f"- {with_names(cause.words, names)}\n" for cause in self.causes)
         return f"**{self.verdict}**\n\n{table}" + (f"\n{blame}" if blame else "")
 
     @property
@@ -335,7 +315,7 @@ class Comparison:
         if not self.trajectory.completeness.complete:
             return "incomplete"
         until = self.trajectory.record.until
-        decided = until is not None and until.decided and self.any_time is not None and self.any_time.disagrees
+        decided = until is not None and until.decided and self.any_time is not None and self.any_time.exceeded
         if decided or any(test.rejected for test in self.tests):
             return "disagrees"
         return "unpredicted" if self.unpredicted else "agrees"
@@ -410,10 +390,10 @@ class Comparison:
             "laws": self.laws.to_json() if self.laws else None,
             "given_path": self.given.to_json() if self.given else None,
             "order": self.order.to_json() if self.order else None,
-            "blame": [cause.to_json() for cause in self.blame],
+            "blame": [cause.to_json() for cause in self.causes],
             "continuous": {"system_error": self.continuous_error},
             "batch_means": {"interval": self.batch or (None, None)},
-            "tests": [asdict(test) for test in self.tests],
+            "tests": [test.to_json() for test in self.tests],
             "any_time": self.any_time.to_json() if self.any_time else None,
             "trust": self.trust.to_json() if self.trust else None,
         }

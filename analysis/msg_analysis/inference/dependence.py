@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Diagnostics of dependence in time: long lags, constant states."""
+"""Questions about dependence: between agents and successive steps, at long lags, and states that do not change."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -13,9 +14,95 @@ import numpy as np
 import scipy.fft
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
-from msg_analysis.inference.diagnostics import Block, Departure, Finding, Law, Place, Question
-from msg_analysis.inference.e_values import EventEvidence, Looks, coefficient_evidence
-from msg_analysis.inference.statistics import log_normal_tail
+from msg_analysis.common.text import HALF_WIDTH_95, percent
+from msg_analysis.inference import candidates
+from msg_analysis.inference.candidates import Cause, numbers_text
+from msg_analysis.inference.e_values import Analyses, EventEvidence, coefficient_evidence
+from msg_analysis.inference.question import (
+    Block,
+    Diagnostic,
+    Finding,
+    Law,
+    Place,
+    Question,
+    RunningSums,
+    Search,
+    Statistics,
+    Test,
+    one_test,
+)
+from msg_analysis.inference.statistics import binomial_interval, log_normal_tail
+
+
+class Whiteness(Question):
+    """Whether residuals of successive steps, of replicas, and of two agents are independent as they should be."""
+
+    name = "residuals: whiteness"
+    meaning = "the noise of successive steps, of replicas or of agents is correlated: random numbers are used twice"
+
+    @classmethod
+    def tests(cls, run: Statistics) -> list[Test]:
+        """Lags of 1 to 10 steps, and pairs of replicas."""
+        return one_test(cls.name, run.residuals.p_whiteness)
+
+    def evidence(self, sums: RunningSums) -> FloatArray:
+        """One row for each pair of agents."""
+        i, j = self.law.pairs.T
+        return coefficient_evidence(sums.pair_score[:, i, j], sums.pair_information[:, i, j])
+
+    def about(self, row: int) -> str:
+        """Two agents."""
+        first, second = (self.law.pairs[row] + 1).tolist()
+        return f"common noise of agents {first} and {second}"
+
+    @classmethod
+    def classes(cls, search: Search) -> int:
+        """The pairs."""
+        del search
+        return 1
+
+    @classmethod
+    def causes(cls, search: Search) -> list[Cause]:
+        """Correlations of pairs; where gains are wrong, these correlate the residuals, too."""
+        _, change = search.selected_gains
+        return [] if search.noise is None or change.any() else _correlations(search)
+
+
+MAX_NOISE_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
+
+
+def _correlations(search: Search) -> list[Cause]:
+    """Pairs of agents whose noise correlation differs from the expected one, by Fisher's z."""
+    sums, families, level = search.residuals, search.families, search.level
+    m = sums.still.shape[1]
+    agents = [i for i in range(m) if i not in search.excluded]
+    pairs = [(i, j) for place, i in enumerate(agents) for j in agents[:place]]
+    if not 0 < len(pairs) <= MAX_NOISE_PAIRS:
+        return []
+    samples = int(sums.samples.sum())
+    should = np.tensordot(sums.samples, sums.noises, axes=1)
+    scatter = sums.scatter.sum(axis=0)
+    found = []
+    for j, i in sorted((j, i) for i, j in pairs):
+        size, expected_size = scatter[i, i] * scatter[j, j], should[i, i] * should[j, j]
+        if size <= 0.0 or expected_size <= 0.0 or samples < candidates.MIN_SAMPLES:
+            continue
+        seen, expected = scatter[i, j] / math.sqrt(size), should[i, j] / math.sqrt(expected_size)
+        if 1.0 - expected**2 < 1e-6 or 1.0 - seen**2 < 1e-12:
+            continue
+        z = (math.atanh(seen) - math.atanh(expected)) * math.sqrt(samples - 3)
+        log_p = math.log(2.0 * len(pairs) * families) + float(log_normal_tail(abs(z)))
+        if log_p < math.log(level):
+            half = HALF_WIDTH_95 / math.sqrt(samples - 3)
+            interval = math.tanh(math.atanh(seen) - half), math.tanh(math.atanh(seen) + half)
+            words = (
+                f"the noise of agents {j + 1} and {i + 1} has correlation {numbers_text(seen, interval)}, "
+                f"not {expected:.3g}"
+            )
+            link = (j + 1, i + 1)
+            found.append(Cause("correlation", words, None, link, None, seen, interval, expected, math.exp(log_p)))
+    return found
+
 
 LAGS = 100
 MIN_SAMPLES = 100  # fewest products for the normal law of their sum
@@ -44,20 +131,20 @@ class LagSums:
         shape = (LAGS, columns)
         self.score, self.information, self.products = np.zeros(shape), np.zeros(shape), np.zeros(LAGS, np.int64)
 
-    def add(self, numbers: FloatArray, looks: Looks) -> tuple[FloatArray, FloatArray]:
+    def add(self, numbers: FloatArray, analyses: Analyses) -> tuple[FloatArray, FloatArray]:
         """Add the products of numbers (b, columns, samples) with the earlier ones.
 
-        (T, 100, columns) each: ``score`` and ``information`` after each look.
+        (T, 100, columns) each: ``score`` and ``information`` after each analysis.
         """
         joined = np.concatenate([self._tail, numbers])
         old, lags = len(self._tail), np.arange(1, LAGS + 1)
-        # (T, lags): between the looks, the numbers that have one so many steps before them, in ``joined``.
-        ends = np.repeat(old + looks.ends[:, None], LAGS, axis=1)
-        begins = np.minimum(np.maximum(old + looks.begins[:, None], lags), ends)
+        # (T, lags): between the analyses, the numbers that have one so many steps before them, in ``joined``.
+        ends = np.repeat(old + analyses.ends[:, None], LAGS, axis=1)
+        begins = np.minimum(np.maximum(old + analyses.begins[:, None], lags), ends)
         sums = np.vstack([np.zeros(joined.shape[1]), (joined**2).sum(axis=2).cumsum(axis=0)])
         information = sums[np.maximum(ends - lags, 0)] - sums[np.maximum(begins - lags, 0)]
         information = self.information + information.cumsum(axis=0)
-        score = self.score + _products(joined, old, looks).cumsum(axis=0)
+        score = self.score + _products(joined, old, analyses).cumsum(axis=0)
         self.score, self.information = score[-1], information[-1]
         self.products += (ends - begins).sum(axis=0) * numbers.shape[2]
         self._tail = joined[-LAGS:].copy()
@@ -92,19 +179,19 @@ class LagSums:
         )
 
 
-def _products(joined: FloatArray, old: int, looks: Looks) -> FloatArray:
-    """(T, LAGS, columns): sums of numbers between the looks times those 1 to 100 steps before.
+def _products(joined: FloatArray, old: int, analyses: Analyses) -> FloatArray:
+    """(T, LAGS, columns): sums of numbers between the analyses times those 1 to 100 steps before.
 
     ``joined`` (old + b, columns, samples): the numbers, after ``old`` earlier ones.
     """
-    found, columns = np.empty((looks.count, LAGS, joined.shape[1])), joined.transpose(1, 2, 0)
+    found, columns = np.empty((analyses.count, LAGS, joined.shape[1])), joined.transpose(1, 2, 0)
     # By Fourier transforms so long that no two products overlap; stretches of about the same length together.
-    classes = np.frexp(looks.lengths + LAGS)[1]
+    classes = np.frexp(analyses.lengths + LAGS)[1]
     for each in np.unique(classes):
         rows = np.flatnonzero(classes == each)
-        length = scipy.fft.next_fast_len(int(looks.lengths[rows].max()) + LAGS, real=True)
+        length = scipy.fft.next_fast_len(int(analyses.lengths[rows].max()) + LAGS, real=True)
         every = np.zeros((len(rows), *joined.shape[1:], length))
-        for part, begin, end in zip(every, old + looks.begins[rows], old + looks.ends[rows], strict=True):
+        for part, begin, end in zip(every, old + analyses.begins[rows], old + analyses.ends[rows], strict=True):
             before = min(begin, LAGS)
             part[:, :, LAGS - before : LAGS + end - begin] = columns[:, :, begin - before : end]
         late = every.copy()
@@ -119,22 +206,24 @@ def lag_evidence(score: FloatArray, information: FloatArray) -> FloatArray:
     return coefficient_evidence(score.swapaxes(-1, -2), information.swapaxes(-1, -2))
 
 
-class LongLags(Departure):
-    """Regression of every innovation on that of the same agent 1 to 100 steps before.
+class LongLags(Diagnostic):
+    """Regression of every residual on that of the same agent 1 to 100 steps before.
 
     The test takes the clearest lag: of an agent, or of all together where they are independent, with half of the
     level each.
     """
 
-    test = "innovations: lags to 100"
+    name = "residuals: lags to 100"
+    meaning = "the noise of a step depends on that of up to 100 steps before"
 
     def __init__(self, law: Law) -> None:
+        super().__init__(law)
         self._agents, self._together = np.flatnonzero(law.noisy), bool(law.apart and law.noisy.sum() > 1)
         self.sums = LagSums(len(self._agents), law.replicas)
 
     def add(self, block: Block) -> FloatArray:
-        """Add the innovations of a block."""
-        return self._evidence(*self.sums.add(block.white[:, self._agents], block.looks))
+        """Add the residuals of a block."""
+        return self._evidence(*self.sums.add(block.white[:, self._agents], block.analyses))
 
     def merge(self, other: Self) -> None:
         """Add the sums of other runs."""
@@ -147,7 +236,6 @@ class LongLags(Departure):
             return None
         best = min((lag for lag in (each, whole) if lag), key=lambda lag: lag.log_p)
         return Finding(
-            self.test,
             min(0.0, best.log_p + math.log(1.0 + self._together)),
             agent=None if best is whole else int(self._agents[best.column]),
             span=(best.steps, best.steps),
@@ -156,7 +244,7 @@ class LongLags(Departure):
             expected=0.0,
         )
 
-    def evidence(self) -> FloatArray:
+    def logarithms(self) -> FloatArray:
         """(100 (agents + 1), K): lags of each agent, and of all together."""
         return self._evidence(self.sums.score, self.sums.information)
 
@@ -168,17 +256,31 @@ class LongLags(Departure):
         found = lag_evidence(score, information)
         return found.reshape(*found.shape[:-3], -1, found.shape[-1])
 
-    def questions(self) -> list[Question]:
+    def about(self, row: int) -> str:
         """A lag of an agent, or of all."""
-        whose = [f"agent {agent + 1}" for agent in self._agents.tolist()] + ["all agents"] * self._together
-        return [(f"noise of {who} and {lag} steps before", ()) for who in whose for lag in range(1, LAGS + 1)]
+        column, lag = divmod(row, LAGS)
+        who = f"agent {self._agents[column] + 1}" if column < len(self._agents) else "all agents"
+        return f"noise of {who} and {lag + 1} steps before"
+
+    @classmethod
+    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+        """A correlation."""
+        del names
+        assert found.span is not None
+        value, interval = found.estimate or 0.0, found.interval
+        words = (
+            f"the noise of {found.whose} has correlation {numbers_text(value, interval)} with its own {found.span[0]} "
+            "steps before, not 0"
+        )
+        agent = None if found.agent is None else found.agent + 1
+        return Cause("lag", words, agent, None, None, value, interval, found.expected, p)
 
 
 ROUNDINGS = 4.0  # of the largest state, in the computation of a state, at most
 EPSILON = float(np.finfo(np.float64).eps)
 
 
-class StandingStill(Departure):
+class ConstantState(Diagnostic):
     """Steps in which no replica of an agent moves.
 
     The density of a normal number is below 0.4 over its standard deviation, so the probability q of such a step is at
@@ -187,9 +289,12 @@ class StandingStill(Departure):
     p of the test (Markov).
     """
 
-    test = "innovations: standing still"
+    name = "residuals: constant state"
+    meaning = "the state of an agent with noise does not change for some steps"
+    subject = "agents whose state is constant"
 
     def __init__(self, law: Law) -> None:
+        super().__init__(law)
         self._agents = np.flatnonzero(law.noisy)
         self._evidence = EventEvidence(law.planned * len(self._agents))
         self._since = np.full(len(self._agents), -1)  # first step of what may go on, from 0; -1: moved
@@ -197,24 +302,24 @@ class StandingStill(Departure):
         self._runs = 1
 
     def add(self, block: Block) -> FloatArray:
-        """Look at the steps of a block."""
-        looks = block.looks
+        """Add the steps of a block."""
+        analyses = block.analyses
         if not len(self._agents):
-            return np.empty((looks.count, 0, 1))
+            return np.empty((analyses.count, 0, 1))
         before, after = block.reception.states, block.after
         still: BoolArray = (after[:, self._agents] == before[:, self._agents]).all(axis=2)
         at, which = np.nonzero(still)
         size = np.spacing(np.abs(before[at]).max(axis=1))  # (s, R)
         chance = ROUNDINGS * (size / block.scale[at, self._agents[which]][:, None] + EPSILON)
-        seen, logarithms = looks.lengths * len(self._agents), -np.log(np.minimum(chance, 1.0)).sum(axis=1)
+        seen, logarithms = analyses.lengths * len(self._agents), -np.log(np.minimum(chance, 1.0)).sum(axis=1)
         for place in np.unique(which).tolist():
             self._stretches(place, block.first, block.first + at[which == place])
         moved = ~still[-1]
         self._since[moved] = -1
-        return self._evidence.add(seen, logarithms, looks.after(at))[:, None, None]
+        return self._evidence.add(seen, logarithms, analyses.after(at))[:, None, None]
 
     def _stretches(self, place: int, first: int, steps: IntArray) -> None:
-        """The longest stretch of an agent that stood still in ``steps`` from ``first`` on, ascending."""
+        """The longest stretch of an agent that did not move in ``steps`` from ``first`` on, ascending."""
         begins = steps[np.append(True, np.diff(steps) > 1)]
         ends = steps[np.append(np.diff(steps) > 1, True)]
         if self._since[place] >= 0 and begins[0] == first:
@@ -240,14 +345,36 @@ class StandingStill(Departure):
             return None
         log_p = min(0.0, -self._evidence.logarithm())
         if self._longest is None:
-            return Finding(self.test, log_p)
+            return Finding(log_p)
         length, agent, place = self._longest
-        return Finding(self.test, log_p, agent=agent, place=place, estimate=float(length), expected=0.0)
+        return Finding(log_p, agent=agent, place=place, estimate=float(length), expected=0.0)
 
-    def evidence(self) -> FloatArray:
+    def logarithms(self) -> FloatArray:
         """(1, 1)."""
         return np.array([[self._evidence.logarithm()]]) if len(self._agents) else np.empty((0, 1))
 
-    def questions(self) -> list[Question]:
-        """One, about all agents."""
-        return [("agents that stand still", ())]
+    @classmethod
+    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+        """An agent in some steps."""
+        assert found.place is not None
+        del names
+        words = f"{found.whose} did not move {found.place.words}, although it has noise"
+        agent = None if found.agent is None else found.agent + 1
+        return Cause("frozen", words, agent, None, None, None, None, found.expected, p, found.steps)
+
+    @classmethod
+    def causes(cls, search: Search) -> list[Cause]:
+        """Agents that cannot have been where they were by chance."""
+        return [_frozen_cause(*entry, search.findings.get(cls.name)) for entry in search.frozen]
+
+
+def _frozen_cause(agent: int, still: int, steps: int, found: Finding | None) -> Cause:
+    """An agent, from 0, that did not move in so many of its steps; with the stretch if that is all of them."""
+    share, interval = still / steps, binomial_interval(still, steps)
+    when = "does not move in any of its steps" if still == steps else f"does not move in {percent(share)} of its steps"
+    stretch = found.place if found and found.agent == agent else None
+    where = None
+    if stretch and still < steps and still == stretch.last - stretch.first + 1:
+        when, where = f"did not move {stretch.words}", (stretch.first, stretch.last)
+    words = f"agent {agent + 1} {when}, although it has noise"
+    return Cause("frozen", words, agent + 1, None, None, share, interval, 0.0, 0.0, where)

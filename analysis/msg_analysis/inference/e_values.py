@@ -3,7 +3,7 @@
 
 """E-values: evidence against a hypothesis that holds at any number of interim analyses.
 
-Evidence that may be looked at any time: likelihood ratios mixed over alternatives, in closed form, as logarithms.
+Evidence that holds at any time: likelihood ratios mixed over alternatives, in closed form, as logarithms.
 
 Each is a martingale of mean 1 while the null hypothesis holds, so it ever passes 1/level with probability at most
 ``level`` (Ville's inequality). Sums over independent runs may be added up before.
@@ -22,13 +22,13 @@ from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looks:
-    """Looks at a block of b steps."""
+class Analyses:
+    """Analyses at a block of b steps."""
 
-    ends: IntArray  # (T,) numbers of steps before each look, from 1, ascending; the last is b
+    ends: IntArray  # (T,) numbers of steps before each analysis, from 1, ascending; the last is b
 
     @classmethod
-    def at_the_end(cls, steps: int) -> Looks:
+    def at_the_end(cls, steps: int) -> Analyses:
         """Only one, after so many steps."""
         return cls(np.array([steps]))
 
@@ -39,22 +39,22 @@ class Looks:
 
     @property
     def begins(self) -> IntArray:
-        """(T,): first step between each look and the one before it."""
+        """(T,): first step between each analysis and the one before it."""
         begins = np.zeros_like(self.ends)
         begins[1:] = self.ends[:-1]
         return begins
 
     @property
     def lengths(self) -> IntArray:
-        """(T,): steps between each look and the one before it."""
+        """(T,): steps between each analysis and the one before it."""
         return self.ends - self.begins
 
     def after(self, steps: IntArray) -> IntArray:
-        """The look that comes next after each of these steps, from 0."""
+        """The analysis that comes next after each of these steps, from 0."""
         return np.searchsorted(self.ends, steps, side="right")
 
     def sums(self, values: FloatArray) -> FloatArray:
-        """(T, ...): sums of values (b, ...) over the steps between each look and the one before it."""
+        """(T, ...): sums of values (b, ...) over the steps between each analysis and the one before it."""
         return np.asarray(np.add.reduceat(values, self.begins, axis=0))
 
     def counts(self, values: IntArray | BoolArray) -> IntArray:
@@ -325,17 +325,17 @@ class WindowEvidence:
         self._windows = windows
         self._ended, self._others = np.full(columns, -np.inf), np.zeros(columns)
 
-    def add(self, ended: EndedWindows, logarithms: FloatArray, looks: Looks) -> FloatArray:
-        """Evidence (w, K) of windows that ended in the newest steps, a block with these looks: (T, K) after each."""
-        levels, begun = ended.level, self._windows.steps - int(looks.ends[-1])
-        look = looks.after(ended.first + (1 << levels) - 1 - begun)
-        order = np.argsort(look, kind="stable")
+    def add(self, ended: EndedWindows, logarithms: FloatArray, analyses: Analyses) -> FloatArray:
+        """Evidence (w, K) of windows that ended in the newest steps, a block with these analyses: (T, K) after each."""
+        levels, begun = ended.level, self._windows.steps - int(analyses.ends[-1])
+        analysis = analyses.after(ended.first + (1 << levels) - 1 - begun)
+        order = np.argsort(analysis, kind="stable")
         shares = np.log(self._windows.planned[levels] * float(self._windows.levels))
-        begins = np.searchsorted(look[order], np.arange(looks.count))  # a window of one step ends in every step
+        begins = np.searchsorted(analysis[order], np.arange(analyses.count))  # a window of one step ends in every step
         each = log_sums((logarithms - shares[:, None])[order], begins)
         total = np.logaddexp.accumulate(np.vstack([self._ended, each]), axis=0)[1:]
         self._ended = total[-1]
-        return self._after(begun + looks.ends, total)
+        return self._after(begun + analyses.ends, total)
 
     def merge(self, other: WindowEvidence) -> None:
         """With that of other runs."""
@@ -362,14 +362,14 @@ class EventEvidence:
         self.planned = planned
         self._seen, self._ended, self._others = 0, -np.inf, 0.0
 
-    def add(self, seen: IntArray, logarithms: FloatArray, looks: IntArray) -> FloatArray:
-        """The evidence after each of T looks, (T,).
+    def add(self, seen: IntArray, logarithms: FloatArray, analyses: IntArray) -> FloatArray:
+        """The evidence after each of T analyses, (T,).
 
-        ``seen`` (T,): events between each look and the one before it; ``logarithms`` (e,): evidence of those of them
-        where it is not 0, and the ``looks`` (e,) that come next.
+        ``seen`` (T,): events between each analysis and the one before it; ``logarithms`` (e,): those of the evidence
+        that is not 0, and the ``analyses`` (e,) that come next.
         """
         ended = np.full(len(seen), -np.inf)
-        np.logaddexp.at(ended, looks, logarithms - math.log(self.planned))
+        np.logaddexp.at(ended, analyses, logarithms - math.log(self.planned))
         ended = np.logaddexp.accumulate(np.append(self._ended, ended))[1:]
         number = self._seen + np.cumsum(seen)
         self._seen, self._ended = int(number[-1]), float(ended[-1])

@@ -32,7 +32,7 @@ class Estimate:
         (measured - predicted) / standard_error; None without noise
     p
         two-sided, of z
-    p_holm
+    p_adjusted
         adjusted over the nodes; None for the system error
     """
 
@@ -41,7 +41,7 @@ class Estimate:
     standard_error: float | None = None
     z: float | None = None
     p: float | None = None
-    p_holm: float | None = None
+    p_adjusted: float | None = None
 
     def _repr_markdown_(self) -> str:
         numbers = (self.measured, self.predicted, self.standard_error, self.z, self.p)

@@ -21,10 +21,13 @@ import scipy.linalg
 
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.markov_chain import MarkovChain
-from msg_analysis.inference.gains import MAX_REGRESSORS, regressors
+from msg_analysis.inference.evidence_sums import EvidenceSums
+from msg_analysis.inference.graphs import Switching
+from msg_analysis.inference.messages import CommonGain, Gains
+from msg_analysis.inference.noise import Noise
+from msg_analysis.inference.question import Diagnostic
 from msg_analysis.inference.received_values import NO_NOISE
-from msg_analysis.inference.sequential_questions import kind_weights
-from msg_analysis.inference.sequential_sums import EvidenceSums
+from msg_analysis.inference.regression import MAX_REGRESSORS, regressors
 from msg_analysis.inference.statistics import chi2_quantile, needed_noncentrality, noncentral_chi2_tail
 from msg_analysis.model.step_model import StepModel
 from msg_analysis.theory.prediction import Prediction
@@ -40,7 +43,7 @@ class Fault:
 
     kind: Kind  # noise variance of an agent, gain of a link in all graphs, all rates of switching
     factor: float
-    agent: int | None = None  # from 0: whose noise, or who hears; None: where the fault is hardest to find
+    agent: int | None = None  # from 0: whose noise, or who receives; None: where the fault is hardest to find
     sender: int | None = None
 
 
@@ -65,7 +68,7 @@ class FaultPower:
     """How surely a fault is found, at one agent or link."""
 
     fault: Fault
-    agent: int | None  # from 0: whose noise, or who hears with this gain
+    agent: int | None  # from 0: whose noise, or who receives with this gain
     sender: int | None
     tests: Sequence[StepInformation]  # those of the fault
     level: float  # of each test
@@ -123,11 +126,11 @@ def fault_powers(
         each is one row of the result
     """
     step, sums = prediction.step, EvidenceSums(prediction, replicas, in_detail=True)
-    departures = sums.departures.families() if sums.departures else {}
-    # While a run goes on, departures are not looked for.
-    questions = {kind: logs.size for kind, logs in sums.families().items() if kind not in departures}
-    weights = dict(zip(questions, kind_weights(list(questions)).tolist(), strict=True))
-    share = level / (_family(prediction) + len(departures))
+    # While a run goes on, diagnostics are not asked.
+    families = {name: logs.size for name, logs in sums.families().items()}
+    questions = {name: size for name, size in families.items() if not isinstance(sums.questions[name], Diagnostic)}
+    weights = dict(zip(questions, sums.weights(questions).tolist(), strict=True))
+    share = level / sum(question.number_of_tests() for question in sums.questions.values())
     found = []
     for fault in faults:
         informations = {
@@ -143,8 +146,8 @@ def fault_powers(
         (agent, sender), tests = min(
             informations.items(), key=lambda entry: max(test.noncentrality for test in entry[1])
         )
-        asked = fault.kind in questions
-        price = math.log(questions[fault.kind] / (weights[fault.kind] * level)) if asked else math.inf
+        name = {"noise": Noise.name, "gain": Gains.name, "switching": Switching.name}[fault.kind]
+        price = math.log(questions[name] / (weights[name] * level)) if name in questions else math.inf
         found.append(FaultPower(fault, agent, sender, tests, share, price))
     return found
 
@@ -152,14 +155,8 @@ def fault_powers(
 _Informations = dict[tuple[int | None, int | None], list[StepInformation]]
 
 
-def _family(prediction: Prediction) -> int:
-    """Number of tests without departures: errors and covariance, innovations, and those of what the experiment has."""
-    step = prediction.step
-    return 1 + step.agents + 1 + 4 + (step.modes > 1) + (step.loss > 0.0) + (step.broadcast > 0.0)
-
-
 def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
-    """Per agent with noise: the likelihood ratio of the covariance of the innovations."""
+    """Per agent with noise: the likelihood ratio of the covariance of the residuals."""
     same = bool((step.noise == step.noise[0]).all())
     found: _Informations = {}
     bases = [_noisy(noise) for noise in step.noise]
@@ -173,7 +170,7 @@ def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
             values = np.linalg.eigvalsh(change)
             divergence += float(share * (values - np.log1p(values)).sum())
         if divergence > 0.0:
-            found[agent, None] = [StepInformation("innovations: covariance", dof, replicas * divergence)]
+            found[agent, None] = [StepInformation(Noise.name, dof, replicas * divergence)]
     return found
 
 
@@ -185,10 +182,10 @@ def _noisy(noise: FloatArray) -> FloatArray:
 
 
 def _gain(prediction: Prediction, factor: float, replicas: int) -> _Informations:
-    """Per link: the regression of the innovations on all that is heard, and on their sum."""
+    """Per link: the regression of the residuals on all that is received, and on their sum."""
     step, system = prediction.step, prediction.system
     covariances = system.lifted(system.by_graph(prediction.steady))  # (n, m, m), times pi
-    air = step.link**2 + step.broadcast**2
+    reception = step.link**2 + step.broadcast**2
     _, _, terms = regressors(step, MAX_REGRESSORS)
     links: dict[tuple[int, int], tuple[float, float]] = {}
     total = 0.0
@@ -205,16 +202,16 @@ def _gain(prediction: Prediction, factor: float, replicas: int) -> _Informations
                 received, weight = 1.0 - float(step.losses[i, j]), float(step.nominal[mode, i, j])
                 difference = np.zeros(step.agents)
                 difference[i], difference[j] = -weight, weight
-                own = float(difference @ covariance @ difference) + law * weight**2 * air
-                with_all = float(difference @ covariance @ row) + law * weight**2 * air
+                own = float(difference @ covariance @ difference) + law * weight**2 * reception
+                with_all = float(difference @ covariance @ row) + law * weight**2 * reception
                 before = links.get((i, j), (0.0, 0.0))
                 links[i, j] = before[0] + received * own / variance, before[1] + received * with_all / variance
-                total += law * weight**2 * air * received / variance
+                total += law * weight**2 * reception * received / variance
     change = (factor - 1.0) ** 2 * replicas
     return {
         link: [
-            StepInformation("innovations: gains", len(terms), change * own),
-            StepInformation("innovations: common gain", 1, change * with_all**2 / total),
+            StepInformation(Gains.name, len(terms), change * own),
+            StepInformation(CommonGain.name, 1, change * with_all**2 / total),
         ]
         for link, (own, with_all) in links.items()
         if own > 0.0
@@ -233,7 +230,7 @@ def _switching(step: StepModel, factor: float) -> _Informations:
         terms = np.where(wrong > 0.0, wrong * np.log(wrong / law), 0.0)
     divergence = 2.0 * float(step.stationary @ terms.sum(axis=1))
     dof = int((law > 0.0).sum()) - step.modes
-    return {(None, None): [StepInformation("switching", dof, divergence)]} if divergence > 0.0 else {}
+    return {(None, None): [StepInformation(Switching.name, dof, divergence)]} if divergence > 0.0 else {}
 
 
 def _faster(chain: MarkovChain, dt: float, factor: float) -> FloatArray | None:

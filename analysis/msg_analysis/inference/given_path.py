@@ -12,8 +12,8 @@ y(k)], with martingale increments D. The covariance of their sum is estimated by
 
     Cov(D_a, D_b | y(k)) = tr( Y_a N Y_b (2 N + 4 W y y^T W^T) ) / R,
 
-an exact function of the states. Where a few sojourns decide the errors (far starts, short runs, rare jumps), the law
-over all paths is far from normal; this ratio is not.
+an exact function of the states. Where a few holding times decide the errors (far starts, short runs, rare jumps),
+the law over all paths is far from normal; this ratio is not.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class GivenPath:
 
     @property
     def node_errors(self) -> list[Estimate]:
-        """Corrected for the path, without ``p_holm``; empty where only the system error is estimated."""
+        """Corrected for the path, without ``p_adjusted``; empty where only the system error is estimated."""
         return [self._corrected(one, other) for one, other in zip(self.given.nodes, self.means.nodes, strict=False)]
 
     def _corrected(self, given: FloatArray, means: FloatArray) -> Estimate:
@@ -119,17 +119,8 @@ def means_given_path(
     y = without_rounding(y, system, observation.largest)
     expected = _expected_sum(which, matrices, noise, y.T @ y / len(y)) / steps
     seen, covariance, series, variances = _backwards(observation, kinds, forms, trace)
-    return TimeMeans(
-        second_moments=packed_symmetric.unpack(seen / steps, d),
-        expected_moments=expected,
-        joint=kind == "joint",
-        measured=forms @ (seen / steps),
-        predicted=forms @ packed_symmetric.pack(expected),
-        covariance=covariance / steps**2,
-        nodes=nodes,
-        trace=trace,
-        system_series=series,
-        system_variances=variances,
+    return TimeMeans.of(
+        (forms, nodes, trace), seen / steps, expected, covariance / steps**2, (series, variances), joint=kind == "joint"
     )
 
 
@@ -246,7 +237,7 @@ def _with_losses(
     observation: Observation, step: StepModel, mode: int, lost: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """W and N (m, m) of a step under a graph in which these messages (m, D) are lost."""
-    tables, air = neighbour_tables(step), observation.prediction.experiment.noise
+    tables, reception = neighbour_tables(step), observation.prediction.experiment.noise
     weights = step.nominal[mode].copy()
     for i, missing in enumerate(lost):
         count = tables.count[mode, i]
@@ -254,5 +245,5 @@ def _with_losses(
             weights[i, i] += weights[i, j]
             weights[i, j] = 0.0
     coupling = weights - np.diag(np.diag(weights))
-    noise = step.noise_gain[mode] @ step.noise_gain[mode].T + air.broadcast**2 * coupling @ coupling.T
-    return weights, noise + air.link**2 * np.diag((coupling**2).sum(axis=1))
+    noise = step.noise_gain[mode] @ step.noise_gain[mode].T + reception.broadcast**2 * coupling @ coupling.T
+    return weights, noise + reception.link**2 * np.diag((coupling**2).sum(axis=1))

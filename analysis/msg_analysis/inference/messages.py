@@ -1,258 +1,162 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tests of messages: losses, stale values, messages that came too late.
-
-Tests of the logged message losses, link by link: their number, their runs, and losses of links at the same time.
-
-Given the graphs, the losses of a link are independent, or with ``noise.burst`` a Markov chain with two states. In
-lockstep the log has the fate of every message of an active link. In real time it has that of every use: a message that
-is used again counts again, which leaves the share of the lost ones right, but not its variance.
-"""
+"""Questions about messages, and about the gains with which received values are used."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
 
-from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray, column
+from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.text import percent
-from msg_analysis.inference.diagnostics import Block, Departure, Finding, Law, Question
-from msg_analysis.inference.e_values import coefficient_evidence
-from msg_analysis.inference.observation import Measurement, Observation
-from msg_analysis.inference.received_values import mode_links
-from msg_analysis.inference.statistics import binomial_interval, chi2_quantile, chi2_tail, log_normal_tail
-from msg_analysis.model.reception import neighbour_tables
-
-MIN_EXPECTED_LOSSES = 25.0  # smallest expected count for which a chi-square law is used
-
-
-@dataclass(frozen=True, slots=True)
-class LossTest:
-    """The logged losses against the law of every link."""
-
-    lost: int  # messages
-    expected: float  # sum over the messages of the probability of their link
-    p: float | None  # None where there was no message
-
-
-def loss_test(observation: Observation | Measurement) -> LossTest | None:
-    """Test that messages are lost with the probability of their link, as the law says; None without (logged) loss.
-
-    The statistic adds one chi-square per link, in bursts one for the messages after a lost one and one for those after
-    another, and two for products of (lost - expected) in standard errors: of messages of one link in successive steps,
-    and of pairs of messages in one step. What has too few messages for a chi-square law is pooled, with all of the same
-    probability, and tested by the exact binomial law; products that are too rare are left out.
-    """
-    tally = LossTally.of(observation)
-    return tally.test() if tally else None
+from msg_analysis.inference.candidates import Cause, Selected, numbers_text
+from msg_analysis.inference.counts import LossTally
+from msg_analysis.inference.e_values import coefficient_evidence, proportion_evidence, variance_evidence
+from msg_analysis.inference.question import (
+    Block,
+    Diagnostic,
+    Finding,
+    Law,
+    Question,
+    RunningSums,
+    Search,
+    Statistics,
+    Test,
+    one_test,
+)
+from msg_analysis.inference.statistics import binomial_interval, log_normal_tail
 
 
-class LossTally:
-    """Sums over the messages of a run with ``noise.loss``."""
+class Losses(Question):
+    """Whether messages are lost as often as the experiment says."""
 
-    def __init__(self, observation: Observation | Measurement) -> None:
-        step = observation.step
-        self.pairs: IntArray = np.argwhere(step.listens())  # (links, 2) receiver and sender of links in any graph
-        links = len(self.pairs)
-        self.probability = step.losses[self.pairs[:, 0], self.pairs[:, 1]]  # (links,)
-        after_lost, after_kept = self.probability, self.probability
-        if step.burst is not None:
-            after_lost = np.where(self.probability > 0.0, 1.0 - 1.0 / step.burst, 0.0)
-            after_kept = self.probability / (step.burst * (1.0 - self.probability))
-        # Correlation of the losses of two successive messages of a link.
-        self.persistence = after_lost - after_kept
-        self._bursts = step.burst is not None
-        self._products = observation.timers is None if isinstance(observation, Observation) else True
-        self.messages, self.lost = np.zeros(links, np.int64), np.zeros(links, np.int64)
-        self.repeated = np.zeros(links, np.int64)  # in real time: uses of a message that was used before
-        # Of messages after a lost one, after one that was not, and without one just before: chance, number, lost ones.
-        self._chances = np.stack([after_lost, after_kept, self.probability])
-        self._tried, self._failed = np.zeros((3, links), np.int64), np.zeros((3, links), np.int64)
-        # Sums of products of standardised losses, of successive messages of a link and of pairs in one step: number of
-        # products, and how many are expected to be of two rare events.
-        self._successive, self._same_step = np.zeros(3), np.zeros(3)
-        numbers = np.cumsum(step.listens().ravel()).reshape(step.agents, step.agents) - 1
-        graphs = []
-        for mode in range(step.modes):
-            receiver, sender, which = mode_links(step, mode)
-            graphs.append((numbers[receiver, sender], receiver, which))
-        before = np.zeros((1, links), np.bool_), np.zeros((1, links), np.bool_)
-        for first, last in observation.blocks(4 * links, "loss"):
-            before = self._add(*_block(observation, graphs, links, first, last), before)
+    name = "loss"
+    meaning = "messages are lost more or less often, or in other sequences, than the file says"
+    main = True
 
     @classmethod
-    def of(cls, observation: Observation | Measurement) -> LossTally | None:
-        """Tally of a run; None where no message can be lost, or no loss was logged."""
-        if not observation.step.loss:
-            return None
-        if isinstance(observation, Observation) and observation.timers is not None:
-            # With the last value heard in place of a lost one, the log does not tell lost messages from late ones.
-            return None if observation.step.holds or observation.step.burst is not None else cls(observation)
-        return cls(observation) if observation.lost is not None else None
+    def tests(cls, run: Statistics) -> list[Test]:
+        """Of all links."""
+        return one_test(cls.name, run.loss.p) if run.loss else []
 
-    def merge(self, other: LossTally) -> None:
-        """Add the tally of another run of the same experiment, with another seed."""
-        self.messages += other.messages
-        self.lost += other.lost
-        self.repeated += other.repeated
-        self._tried += other._tried
-        self._failed += other._failed
-        self._successive += other._successive
-        self._same_step += other._same_step
+    def number_of_tests(self) -> int:
+        """None where no message is lost."""
+        return int(self.law.step.loss > 0.0)
 
-    def score(self) -> tuple[FloatArray, FloatArray]:
-        """(links,) each: losses beyond the expected ones, and their information, of what says most about the chance.
+    def evidence(self, sums: RunningSums) -> FloatArray:
+        """One row for each link that loses messages independently."""
+        i, j = self.law.lossy.T
+        return proportion_evidence(sums.lost[:, i, j], sums.messages[:, i, j], self.law.step.losses[i, j])
 
-        In bursts, whose mean length is given, that are the messages after one that was not lost.
-        """
-        if self._bursts:
-            chance, tried, failed = self._chances[1], self._tried[1], self._failed[1]
-        else:
-            chance, tried, failed = self.probability, self.messages, self.lost
-        excess, variance = failed - chance * tried, tried * chance * (1.0 - chance)
-        # Where messages are counted several times, each counts for less.
-        return (excess, variance) if self._bursts else (excess / self.inflation, variance / self.inflation)
+    def about(self, row: int) -> str:
+        """A link."""
+        agent, other = (self.law.lossy[row] + 1).tolist()
+        return f"losses from agent {other} to agent {agent}"
 
-    def after_losses(self, chosen: BoolArray) -> tuple[float, float] | None:
-        """Share of the messages after a lost one that were lost, too, and its expectation; None without bursts."""
-        tried = int(self._tried[0][chosen].sum())
-        if not self._bursts or not tried:
-            return None
-        failed, expected = self._failed[0][chosen].sum(), self._chances[0][chosen] @ self._tried[0][chosen]
-        return float(failed / tried), float(expected / tried)
+    @classmethod
+    def classes(cls, search: Search) -> int:
+        """Links, receivers, senders, all."""
+        return len(search.losses.classes) if search.losses else 0
 
-    @property
-    def inflation(self) -> FloatArray:
-        """(links,): variance of the number of losses over that of independent ones."""
-        again = self.repeated.sum() / max(int((self.messages - self.lost).sum()), 1)
-        return np.asarray((1.0 + self.persistence) / (1.0 - self.persistence) + 2.0 * again)
-
-    def test(self) -> LossTest:
-        """See ``loss_test``."""
-        if not self.messages.any():
-            return LossTest(0, 0.0, None)
-        expected = float(self.probability @ self.messages)
-        lost = int(self.lost.sum())
-        if self.lost[self.probability == 0.0].any():
-            return LossTest(lost, expected, 0.0)
-        chi2, dof = self._counts()
-        if self._products:
-            for product, pairs, rare in (self._successive, self._same_step):
-                if rare >= MIN_EXPECTED_LOSSES:
-                    chi2, dof = chi2 + product**2 / pairs, dof + 1
-        return LossTest(lost, expected, float(chi2_tail(chi2, dof)) if dof else None)
-
-    def _counts(self) -> tuple[float, int]:
-        """Chi-square, and its degrees of freedom, of the numbers of losses."""
-        if self._bursts:
-            chance, tried, failed, widened = self._chances.ravel(), self._tried.ravel(), self._failed.ravel(), 1.0
-        else:
-            chance, tried, failed = self.probability, self.messages, self.lost
-            widened = float(self.inflation.max())
-        used = (tried > 0) & (chance > 0.0)
-        chance, tried, failed = chance[used], tried[used], failed[used]
-        often = tried * np.minimum(chance, 1.0 - chance) >= MIN_EXPECTED_LOSSES
-        parts = (failed - chance * tried)[often] ** 2 / (tried * chance * (1.0 - chance))[often]
-        chi2, dof = float(parts.sum()) / widened, int(often.sum())
-        for one in np.unique(chance[~often]).tolist():
-            from scipy.stats import binomtest  # here, since it takes longer to import than all the rest
-
-            same = ~often & (chance == one)
-            p = float(binomtest(int(failed[same].sum()), int(tried[same].sum()), one).pvalue)
-            chi2, dof = chi2 + float(chi2_quantile(p, 1)), dof + 1
-        return chi2, dof
-
-    def _add(
-        self, sent: BoolArray, lost: BoolArray, again: BoolArray, before: tuple[BoolArray, BoolArray]
-    ) -> tuple[BoolArray, BoolArray]:
-        """Add a block of steps, given the last step before it; returns the last step of the block."""
-        self.messages += sent.sum(axis=0)
-        self.lost += lost.sum(axis=0)
-        self.repeated += again.sum(axis=0)
-        all_sent, all_lost = np.concatenate([before[0], sent]), np.concatenate([before[1], lost])
-        known, failed = all_sent[:-1], all_lost[:-1]
-        kinds = (sent & failed, sent & known & ~failed, sent & ~known)
-        chance = np.zeros(sent.shape)
-        for kind, here in enumerate(kinds):
-            self._tried[kind] += here.sum(axis=0)
-            self._failed[kind] += (here & lost).sum(axis=0)
-            chance += here * self._chances[kind]
-        spread = np.sqrt(chance * (1.0 - chance))
-        xi = np.divide(lost - chance, spread, out=np.zeros(sent.shape), where=sent & (spread > 0.0))
-        rare = np.where(sent, np.minimum(chance, 1.0 - chance), 0.0)
-        drawn = sent & (spread > 0.0)
-        self._same_step += [
-            float((xi.sum(axis=1) ** 2 - (xi**2).sum(axis=1)).sum()) / 2,
-            int((drawn.sum(axis=1) * (drawn.sum(axis=1) - 1) // 2).sum()),
-            float((rare.sum(axis=1) ** 2 - (rare**2).sum(axis=1)).sum()) / 2,
-        ]
-        if not self._bursts:
-            follows = drawn & known
-            was = np.divide(failed - self.probability, spread, out=np.zeros(sent.shape), where=follows)
-            self._successive += [float((xi * was).sum()), int(follows.sum()), float((follows * rare**2).sum())]
-        return sent[-1:], lost[-1:]
+    @classmethod
+    def causes(cls, search: Search) -> list[Cause]:
+        """Probabilities that explain the counted losses."""
+        tally = search.loss_tally
+        return [_loss_words(one, tally) for one in search.select(search.losses)] if tally else []
 
 
-def _block(
-    observation: Observation | Measurement,
-    graphs: list[tuple[IntArray, IntArray, IntArray]],
-    links: int,
-    first: int,
-    last: int,
-) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """(b, links) of the steps first..last-1: whether there was a message, whether it was lost, or used before."""
-    if isinstance(observation, Observation) and observation.timers is not None:
-        return _uses(observation, links, first, last)
-    assert observation.lost is not None
-    modes, logged = observation.modes[first:last], observation.lost[first:last]
-    sent, lost = np.zeros((len(modes), links), np.bool_), np.zeros((len(modes), links), np.bool_)
-    for mode, (number, receiver, which) in enumerate(graphs):
-        at = np.flatnonzero(modes == mode)[:, None]
-        sent[at, number] = True
-        lost[at, number] = logged[at, receiver, which]
-    # The message with x(0) is used several times where there is a delay, and never lost where values are held.
-    early = np.arange(first, last) < observation.sure_messages
-    sent[early], lost[early] = False, False
-    return sent, lost, np.zeros_like(sent)
+class Broadcast(Question):
+    """Whether the noise in published values is as the experiment says."""
+
+    name = "broadcast"
+    meaning = "the noise in published values is larger, smaller, or correlated otherwise than in the file"
+
+    @classmethod
+    def tests(cls, run: Statistics) -> list[Test]:
+        """Of the covariance of all agents' noise."""
+        return one_test(cls.name, run.p_broadcast)
+
+    def number_of_tests(self) -> int:
+        """None without this noise."""
+        return int(self.law.step.broadcast > 0.0)
+
+    def evidence(self, sums: RunningSums) -> FloatArray:
+        """One row for each agent."""
+        if not sums.broadcast_samples.any():
+            return super().evidence(sums)
+        samples = np.broadcast_to(sums.broadcast_samples[:, None], sums.broadcast_squares.shape)
+        return variance_evidence(samples, sums.broadcast_squares)
+
+    def about(self, row: int) -> str:
+        """An agent."""
+        return f"broadcast noise of agent {row + 1}"
+
+    @classmethod
+    def classes(cls, search: Search) -> int:
+        """Agents, all."""
+        return len(search.broadcast.classes) if search.broadcast else 0
+
+    @classmethod
+    def causes(cls, search: Search) -> list[Cause]:
+        """Variances that explain the squares of the noise."""
+        return [_broadcast_words(one) for one in search.select(search.broadcast)]
 
 
-def _uses(observation: Observation, links: int, first: int, last: int) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """The same of a run in real time."""
-    step, timers = observation.step, observation.timers
-    assert timers is not None
-    tables, agents = neighbour_tables(step), np.arange(step.agents)
-    graphs, used = timers.graphs[first:last], timers.used[first:last]
-    numbers = (np.cumsum(step.listens().ravel()) - 1).reshape(step.agents, step.agents)
-    number = numbers[agents[:, None], tables.senders[graphs, agents]]
-    there = np.arange(step.most_neighbours) < tables.count[graphs, agents][:, :, None]
-    there &= np.arange(first, last)[:, None, None] >= observation.sure_messages
-    sent, lost, again = (np.zeros((len(used), links), np.bool_) for _ in range(3))
-    k, i, d = np.nonzero(there)
-    sent[k, number[k, i, d]] = True
-    lost[k, number[k, i, d]] = used[k, i, d] < 0
-    newest = np.full((len(used), links), -1)
-    newest[k, number[k, i, d]] = used[k, i, d]
-    again[1:] = (newest[1:] >= 0) & (newest[1:] == newest[:-1])
-    return sent, lost, again
+def _loss_words(one: Selected, tally: LossTally) -> Cause:
+    part, what = one.part, one.what
+    receiver, sender = tally.pairs.T
+    chosen = np.ones(len(receiver), dtype=np.bool_)
+    agent, link, whose = None, None, "all messages"
+    if part == "link":
+        chosen = (sender == what[0]) & (receiver == what[1])
+        link, whose = (what[0] + 1, what[1] + 1), f"the messages from agent {what[0] + 1} to agent {what[1] + 1}"
+    elif part in ("receiver", "sender"):
+        chosen = (receiver if part == "receiver" else sender) == what
+        agent, whose = what + 1, f"the messages {'to' if part == 'receiver' else 'of'} agent {what + 1}"
+    lost, messages = int(tally.lost[chosen].sum()), int(tally.messages[chosen].sum())
+    weights = tally.messages[chosen] / messages
+    expected = float(weights @ tally.probability[chosen])
+    # In bursts, so many messages say as much as fewer independent ones.
+    alike = float(weights @ tally.inflation[chosen])
+    share, interval = lost / messages, binomial_interval(round(lost / alike), round(messages / alike))
+    words = (
+        f"{percent(share)} ({100 * interval[0]:.3g} to {100 * interval[1]:.3g} %) of {whose} are lost, "
+        f"not {percent(expected)}"
+    )
+    again = tally.after_losses(chosen)
+    if again:
+        words += f"; after a lost one, {percent(again[0])} are, not {percent(again[1])}"
+    return Cause("loss", words, agent, link, None, share, interval, expected, math.exp(one.log_p))
+
+
+def _broadcast_words(one: Selected) -> Cause:
+    part, what = one.part, one.what
+    factor, interval = math.exp(one.estimate), (math.exp(one.interval[0]), math.exp(one.interval[1]))
+    agent = what + 1 if part == "agent" else None
+    whose = "all agents publish" if agent is None else f"agent {agent} publishes"
+    words = f"the variance of the noise in what {whose} is {numbers_text(factor, interval)} times what the file says"
+    return Cause("broadcast", words, agent, None, None, factor, interval, 1.0, math.exp(one.log_p))
 
 
 MIN_SAMPLES = 100  # fewest steps of all replicas for the normal law of a score
 
 
-class StaleValues(Departure):
-    """Regression of the innovations on weight * (neighbour's previous value - the one that was used).
+class StaleValues(Diagnostic):
+    """Regression of the residuals on weight * (neighbour's previous value - the one that was used).
 
     The coefficient is the share of stale values, expected 0. The test takes the clearest link, or all links together
     where agents are independent, with half of the level each and the number of coefficients as a factor (Bonferroni).
     """
 
-    test = "innovations: stale values"
+    name = "residuals: stale values"
+    meaning = "agents use values that are one step older than the log says"
 
     def __init__(self, law: Law) -> None:
+        super().__init__(law)
         m = law.step.agents
         self._links, self._together = law.links, law.apart and len(law.links) > 1
         self._used = np.zeros((m, m), np.bool_)
@@ -261,23 +165,23 @@ class StaleValues(Departure):
 
     def add(self, block: Block) -> FloatArray:
         """Scores and information of all links."""
-        heard, looks = block.reception, block.looks
-        steps, agents, neighbours = heard.used.shape
+        received, analyses = block.reception, block.analyses
+        steps, agents, neighbours = received.used.shape
         if not len(self._links):
-            return np.empty((looks.count, 0, 1))
-        shape = looks.count, agents, agents
+            return np.empty((analyses.count, 0, 1))
+        shape = analyses.count, agents, agents
         score, information = np.zeros((2, *shape))
-        look = looks.after(np.arange(steps))
+        analysis = analyses.after(np.arange(steps))
         self.samples += steps * block.white.shape[2]
         receivers = np.broadcast_to(np.arange(agents), (steps, agents))
         for d in range(neighbours):
-            senders, used = heard.senders[:, :, d], heard.used[:, :, d]
-            there = self._used[receivers, senders] & (heard.weights[:, :, d] != 0.0) & (used > 0)
+            senders, used = received.senders[:, :, d], received.used[:, :, d]
+            there = self._used[receivers, senders] & (received.weights[:, :, d] != 0.0) & (used > 0)
             at, who = np.nonzero(there)
             sender, newest = senders[at, who], used[at, who]
-            older = heard.published[newest - 1, sender] - heard.published[newest, sender]
-            part = (heard.weights[at, who, d] / block.scale[at, who])[:, None] * older
-            place = np.ravel_multi_index((look[at], who, sender), shape)
+            older = received.published[newest - 1, sender] - received.published[newest, sender]
+            part = (received.weights[at, who, d] / block.scale[at, who])[:, None] * older
+            place = np.ravel_multi_index((analysis[at], who, sender), shape)
             for total, values in ((score, part * block.white[at, who]), (information, part**2)):
                 total += np.bincount(place, values.sum(axis=1), minlength=total.size).reshape(shape)
         score, information = self.score + score.cumsum(axis=0), self.information + information.cumsum(axis=0)
@@ -307,7 +211,6 @@ class StaleValues(Departure):
             best = min(best, (log_p, None, None, s, j), key=lambda candidate: candidate[0])
         log_p, agent, sender, s, j = best
         return Finding(
-            self.test,
             min(0.0, log_p),
             agent=agent,
             sender=sender,
@@ -316,7 +219,7 @@ class StaleValues(Departure):
             expected=0.0,
         )
 
-    def evidence(self) -> FloatArray:
+    def logarithms(self) -> FloatArray:
         """(links + 1, K): of each link, and of all together."""
         return self._evidence(self.score, self.information)
 
@@ -327,117 +230,125 @@ class StaleValues(Departure):
             rows = [np.concatenate([each, each.sum(axis=-1, keepdims=True)], axis=-1) for each in rows]
         return coefficient_evidence(*rows)
 
-    def questions(self) -> list[Question]:
+    def about(self, row: int) -> str:
         """A link, or all."""
-        links = (self._links + 1).tolist()
-        named = [f"stale values from agent {sender} to agent {receiver}" for receiver, sender in links]
-        return [(words, ()) for words in [*named, "stale values"]]
+        if row == len(self._links):
+            return "stale values"
+        receiver, sender = (self._links[row] + 1).tolist()
+        return f"stale values from agent {sender} to agent {receiver}"
+
+    @classmethod
+    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+        """The share of the values of a link, or of all."""
+        del names
+        agent, sender = found.agent, found.sender
+        link = None if sender is None or agent is None else (sender + 1, agent + 1)
+        which = f"the values of agent {link[0]} that agent {link[1]} uses" if link else "the values that agents use"
+        value, (low, high) = found.estimate or 0.0, found.interval
+        share = f"{percent(value)} ({100 * low:.3g} to {100 * high:.3g} %)"
+        words = f"{share} of {which} are one step older than the log says"
+        return Cause("stale", words, None, link, None, value, found.interval, found.expected, p)
 
 
-SHOWN_LINKS = 20
-LEAST_EXCESS = 0.01  # smallest difference of shares that is put into words: a busy machine has a few late messages
+class Gains(Question):
+    """Whether residuals depend on the values that the agents used."""
+
+    name = "residuals: gains"
+    meaning = "a gain, a reference or an offset is not that of the file, or received values are not used as they should"
+    main = True
+
+    @classmethod
+    def tests(cls, run: Statistics) -> list[Test]:
+        """Of all coefficients together."""
+        return one_test(cls.name, run.residuals.p_gain)
+
+    def evidence(self, sums: RunningSums) -> FloatArray:
+        """One row for each link and each leader."""
+        i, j = self.law.gains.T
+        return coefficient_evidence(sums.link_score[:, i, j], sums.link_information[:, i, j])
+
+    def about(self, row: int) -> str:
+        """A link or a leader."""
+        agent, other = (self.law.gains[row] + 1).tolist()
+        return f"gain of leader {agent}" if agent == other else f"gain of the link from agent {other} to agent {agent}"
+
+    @classmethod
+    def classes(cls, search: Search) -> int:
+        """Links, edges, receivers, senders, graphs, leaders, offsets, the reference."""
+        return len(search.gains.classes) if search.gains else 0
+
+    @classmethod
+    def causes(cls, search: Search) -> list[Cause]:
+        """The changes of gains that explain the residuals."""
+        return [_gain_words(one, search) for one in search.selected_gains[0]]
 
 
-@dataclass(frozen=True, slots=True)
-class UnheardMessages:
-    """By directed link.
+class CommonGain(Question):
+    """Whether all gains are wrong by one factor, as where messages are ignored; its causes are those of the gains."""
 
-    A message is judged at the first step of its receiver after it was published and at the next one, if the link is
-    active in both and no newer message was published before the first: it was heard in time if one of them used it.
-    With timers that keep their periods, and messages faster than a period, those that were not are the lost ones.
-    """
+    name = "residuals: common gain"
+    meaning = "all gains are too small or too large by one factor, or messages have no effect"
+    subject = "all gains"
 
-    links: IntArray  # (L, 2) receiver and sender
-    messages: IntArray  # (L,) that could be judged
-    unheard: IntArray  # (L,) of these
-    probability: FloatArray  # (L,) that the experiment loses a message
-    inflation: float  # variance of the number of losses over that of independent ones (bursts)
+    @classmethod
+    def tests(cls, run: Statistics) -> list[Test]:
+        """Of one direction of the regression."""
+        return one_test(cls.name, run.residuals.p_common_gain)
 
-    @property
-    def expected(self) -> FloatArray:
-        """(L,): messages that the experiment loses."""
-        return self.messages * self.probability
+    def evidence(self, sums: RunningSums) -> FloatArray:
+        """One row, where the agents' residuals are independent."""
+        if not self.law.apart:
+            return super().evidence(sums)
+        return coefficient_evidence(sums.common_score, sums.common_information)[:, None]
 
-    def share(self, which: Any = slice(None)) -> tuple[float, tuple[float, float], float]:
-        """Share of some links' messages, its 95 % interval, and what the experiment loses; 0 where there was none."""
-        messages, unheard = int(self.messages[which].sum()), int(self.unheard[which].sum())
-        if not messages:
-            return 0.0, (0.0, 1.0), 0.0
-        interval = binomial_interval(round(unheard / self.inflation), max(round(messages / self.inflation), 1))
-        return unheard / messages, interval, float(self.expected[which].sum()) / messages
 
-    def words(self) -> str | None:
-        """What differs from the experiment, without a full stop; None where nothing does."""
-        share, (low, high), expected = self.share()
-        if low <= expected <= high or abs(share - expected) < LEAST_EXCESS:
-            return None
-        text = (
-            f"{percent(share)} ({100 * low:.3g} to {100 * high:.3g} %) of the messages between agents were not heard "
-            f"in time, while the experiment loses {percent(expected)}: "
+def _gain_words(one: Selected, search: Search) -> Cause:
+    part, what = one.part, one.what
+    names, p = search.names, math.exp(one.log_p)
+    low, high = one.interval
+    if part == "reference":
+        at = search.experiment.reference
+        numbers = numbers_text(at + one.estimate, (at + low, at + high))
+        words = f"the leaders are pulled to {numbers}, not to the reference {at:g}"
+        return Cause("reference", words, None, None, None, at + one.estimate, (at + low, at + high), at, p)
+    if part == "offset":
+        value, interval = (
+            one.estimate / search.experiment.step_length,
+            (low / search.experiment.step_length, high / search.experiment.step_length),
         )
-        text += "the network lost them or was late" if share > expected else "the experiment's losses were not made"
-        place = int(self._order[0])
-        worst = self.share(place)[0]
-        receiver, sender = (self.links[place] + 1).tolist()
-        return f"{text}; most different: {percent(worst)} of those from agent {sender} to agent {receiver}"
-
-    def to_json(self) -> dict[str, Any]:
-        """The JSON document: all links together, and those that differ most from the experiment."""
-        share, interval, expected = self.share()
-        rows = []
-        for place in self._order[:SHOWN_LINKS].tolist():
-            found, around, should = self.share(place)
-            receiver, sender = self.links[place].tolist()
-            row = {"sender": sender + 1, "receiver": receiver + 1, "messages": int(self.messages[place])}
-            row |= {"unheard": int(self.unheard[place]), "share": found, "interval": list(around), "expected": should}
-            rows.append(row)
-        return {
-            "messages": int(self.messages.sum()),
-            "unheard": int(self.unheard.sum()),
-            "share": share,
-            "interval": list(interval),
-            "expected": expected,
-            "words": self.words(),
-            "links": rows,
-        }
-
-    @property
-    def _order(self) -> IntArray:
-        """(L,): places of the links, those first that differ most, in standard errors."""
-        spread = np.sqrt(np.maximum(self.expected * (1.0 - self.probability), 1.0))
-        return np.argsort(-np.abs(self.unheard - self.expected) / spread, kind="stable")
+        words = f"agent {what + 1} has an additional drift of {numbers_text(value, interval)} per unit of time"
+        return Cause("offset", words, what + 1, None, None, value, interval, 0.0, p)
+    factor, interval = 1.0 + one.estimate, (1.0 + low, 1.0 + high)
+    if part in ("all", "sender") and -1.2 < one.estimate < 0.0:
+        share, around = -one.estimate, (max(-high, 0.0), -low)
+        whose = "all messages" if part == "all" else f"the messages of agent {what + 1}"
+        shown = f"{percent(share)} ({100 * around[0]:.3g} to {100 * around[1]:.3g} %)"
+        words = f"{shown} of {whose} have no effect: they are ignored, or all gains on them are too small by this share"
+        return Cause("ignored", words, None if part == "all" else what + 1, None, None, share, around, 0.0, p)
+    whose, agent, link, graph = _whose_gain(part, what)
+    name = None if graph is None else names[graph]
+    where = "" if name is None else f" in graph {name}"
+    words = f"{whose}{where} is {numbers_text(factor, interval)} times what the file says"
+    return Cause("gain", words, agent, link, name, factor, interval, 1.0, p)
 
 
-def unheard_messages(observation: Observation) -> UnheardMessages:
-    """Judge the messages of a run in real time, see ``UnheardMessages``; with a delay, so many steps later."""
-    timers, step = observation.timers, observation.step
-    assert timers is not None
-    tables = neighbour_tables(step)
-    links = np.argwhere(step.listens())
-    messages, unheard = np.zeros(len(links), np.int64), np.zeros(len(links), np.int64)
-    late = step.delay
-    steps = len(timers.graphs) - 1 - late  # that can be the first one after a message was published
-    for receiver in np.unique(links[:, 0]).tolist() if steps >= 1 else ():
-        graphs, made = column(timers.graphs, receiver), column(timers.made, receiver)
-        there = np.arange(step.most_neighbours) < tables.count[graphs, receiver][:, None]
-        senders, heard = tables.senders[graphs, receiver], column(timers.used, receiver)
-        for number in np.flatnonzero(links[:, 0] == receiver).tolist():
-            sender = int(links[number, 1])
-            chosen = there & (senders == sender)  # (N, D): at most one of a step
-            active = chosen.any(axis=1)
-            used = np.where(chosen, heard, -1).max(axis=1, initial=-1)
-            first, second = used[late : late + steps], used[late + 1 : late + 1 + steps]
-            newest = np.searchsorted(column(timers.made, sender), made[1 : steps + 1], side="left") - 1
-            newest = np.maximum(newest, first)  # of equal times, a value comes before the steps that use it
-            judged = active[late : late + steps] & active[late + 1 : late + 1 + steps]
-            judged &= np.diff(newest, prepend=newest[0]) > 0
-            judged[: observation.sure_messages] = False
-            messages[number] = judged.sum()
-            unheard[number] = (judged & (first != newest) & (second != newest)).sum()
-    probability = step.losses[links[:, 0], links[:, 1]] if step.loss else np.zeros(len(links))
-    persistence = 0.0
-    if step.burst is not None and probability.any():
-        chance = float(probability.max())
-        persistence = 1.0 - 1.0 / step.burst - chance / (step.burst * (1.0 - chance))
-    inflation = (1.0 + persistence) / (1.0 - persistence)
-    return UnheardMessages(links, messages, unheard, np.asarray(probability), inflation)
+def _whose_gain(part: str, what: Any) -> tuple[str, int | None, tuple[int, int] | None, int | None]:
+    """In words; agent and link from 1, graph from 0."""
+    if part == "link":
+        sender, receiver, graph = what
+        return f"the gain of agent {receiver + 1} on agent {sender + 1}", None, (sender + 1, receiver + 1), graph
+    if part == "edge":
+        pair, graph = what
+        first, second = sorted(pair)
+        return f"the gain of edge {first + 1}-{second + 1} in both directions", None, (first + 1, second + 1), graph
+    if part == "receiver in graph":
+        return f"agent {what[0] + 1}'s gain on all that it receives", what[0] + 1, None, what[1]
+    if part == "receiver":
+        return f"agent {what + 1}'s gain on all that it receives", what + 1, None, None
+    if part == "leader":
+        return f"agent {what + 1}'s gain as a leader", what + 1, None, None
+    if part == "sender":
+        return f"the gain of all others on agent {what + 1}", what + 1, None, None
+    if part == "graph":
+        return "every gain", None, None, what
+    return ("the gain of the leaders" if part == "leaders" else "every gain"), None, None, None

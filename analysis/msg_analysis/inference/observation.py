@@ -129,7 +129,7 @@ class Observation:
     states: FloatArray  # (N + 1, m, R) x(0..N), clipped by ``bounded``
     modes: IntArray  # (N,) g(0..N-1)
     start: FloatArray  # (m, R) x(0) of the record
-    published: FloatArray | None = None  # (N + 1, m, R) what others heard of x(0..N); None where that is x
+    published: FloatArray | None = None  # (N + 1, m, R) what others received of x(0..N); None where that is x
     lost: BoolArray | None = None  # (N, m, D) see ``Run.lost``
     timers: Timers | None = None  # None in lockstep
     used: IntArray | None = None  # (N, m, D) in lockstep, see ``Run.used``

@@ -31,7 +31,7 @@ from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.prediction import Prediction, predict
 
 if TYPE_CHECKING:
-    from msg_analysis.inference.online_evidence import HeardEvidence
+    from msg_analysis.inference.online_evidence import ReceivedEvidence
     from msg_analysis.inference.online_steps import LoggedStates, StateLog
 
 
@@ -113,17 +113,17 @@ class LiveEstimate:
         prediction = None if reason else predict(experiment, record.step_model)
         self._errors = RunningErrors(record, prediction, nodes=nodes)
         self._plain: RunningEvidence | None = None
-        self._heard: HeardEvidence | None = None
+        self._received: ReceivedEvidence | None = None
         self.log: StateLog | None = None  # None: the messages are not needed
         if evidence and prediction is not None and supports(prediction):
             if needs_log(experiment):
-                from msg_analysis.inference.online_evidence import HeardEvidence  # most runs need none of these
+                from msg_analysis.inference.online_evidence import ReceivedEvidence  # most runs need none of these
                 from msg_analysis.inference.online_steps import StateLog
 
-                self._heard, self.log = HeardEvidence(prediction, experiment.run.replicas), StateLog(record)
+                self._received, self.log = ReceivedEvidence(prediction, experiment.run.replicas), StateLog(record)
             else:
                 self._plain = RunningEvidence(prediction, experiment.run.replicas)
-        self.evidence = self._heard or self._plain
+        self.evidence = self._received or self._plain
         self.steps = StepCollector(
             experiment.agents,
             len(experiment.graph_list),
@@ -143,7 +143,7 @@ class LiveEstimate:
             self._note = "where values are kept from step to step, intervals need the whole run: compare the bag"
         elif prediction is not None and prediction.fourth_moment.finite is not True:
             self._note = "fourth moments are infinite, so that errors have no standard errors: compare the bag"
-        elif prediction is not None and not self._errors.nodes_judged:
+        elif prediction is not None and not self._errors.nodes_tested:
             self._note = "too many agents for intervals of the agent errors"
 
     @property
@@ -165,12 +165,12 @@ class LiveEstimate:
 
     def add_logged(self, logged: LoggedStates) -> None:
         """Add whole states with their logs, besides ``add_whole``; nothing where there is no ``log``."""
-        if self._heard is not None:
-            self._heard.add(logged)
+        if self._received is not None:
+            self._received.add(logged)
 
     def add_sojourn(self, first: int, last: int, graph: int) -> bool:
-        """In real time: take a sojourn of the network's graph, from 0, from step to step; False: it contradicts one."""
-        return self._heard is None or self._heard.add_sojourn(first, last, graph)
+        """In real time: take steps in which the network has a graph, from 0; False: they contradict earlier ones."""
+        return self._received is None or self._received.add_sojourn(first, last, graph)
 
     def add_whole(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
         """Add whole steps k (b,), each only once: graphs of k -> k+1 from 0 (b,), x(k) and x(k+1) (b, m, width)."""
@@ -205,7 +205,7 @@ class LiveEstimate:
             system=system,
             nodes=nodes,
             note=self._note,
-            any_time=self.evidence.look(half_width) if self.evidence else AnyTime(half_width),
+            any_time=self.evidence.report(half_width) if self.evidence else AnyTime(half_width),
             refused={reason: count for reason, count in sorted(self.steps.refused.items()) if count},
             recent=self._recent.newest(),
             lateness=self._lateness.medians() if self._lateness else None,
@@ -221,16 +221,16 @@ class RunningErrors:
         self._agents, self._replicas = experiment.agents, experiment.run.replicas
         self.first = self.last = -1  # first and last step that was added; -1: none
         self.count = 0  # steps that were added
-        self.nodes_judged = False  # whether the nodes have standard errors, too
+        self.nodes_tested = False  # whether the nodes have standard errors, too
         self._squares = np.zeros(self._agents)  # sums of the agents' errors
-        self._judge: _Judge | None = None
+        self._variances: _ErrorVariances | None = None
         self._expected: _Expected | None = None
         if prediction is not None:
             self._expected = _Expected(prediction)
             heavy = prediction.fourth_moment.finite is not True
             if experiment.run.pace == "lockstep" and prediction.system.readout is None and not heavy:
-                self._judge = _Judge(prediction, self._replicas, nodes=nodes)
-                self.nodes_judged = self._judge.nodes
+                self._variances = _ErrorVariances(prediction, self._replicas, nodes=nodes)
+                self.nodes_tested = self._variances.nodes
 
     def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> FloatArray:
         """Add steps, arrays as in ``LiveEstimate.add_whole``; their system errors (b,)."""
@@ -243,11 +243,11 @@ class RunningErrors:
             known = np.flatnonzero(steps == 0)
             self._expected.add(steps, self._record, int(modes[known[0]]) if len(known) else None)
         deviations = self._deviations(states)
-        later = self._deviations(after) if self._judge is not None and self._judge.needs_later else deviations
+        later = self._deviations(after) if self._variances is not None and self._variances.needs_later else deviations
         squares = (deviations**2).mean(axis=2)
         self._squares += squares.sum(axis=0)
-        if self._judge is not None:
-            self._judge.add(steps, modes, deviations, later)
+        if self._variances is not None:
+            self._variances.add(steps, modes, deviations, later)
         return np.asarray(squares.sum(axis=1))
 
     def estimates(self) -> tuple[Estimate, list[Estimate]]:
@@ -259,14 +259,14 @@ class RunningErrors:
             return Estimate(float(measured[0])), [Estimate(float(error)) for error in measured[1:]]
         nodes = self._expected.total / self.count
         predicted = np.concatenate([[nodes.sum()], nodes])
-        if self._judge is None:
+        if self._variances is None:
             found = [Estimate(float(m), float(p)) for m, p in zip(measured, predicted, strict=True)]
             return found[0], found[1:]
-        errors = np.sqrt(self._judge.variances().clip(0.0)) / self.count
-        judged = len(errors)
-        system, judged_nodes = beside(measured[:judged], predicted[:judged], errors)
-        pairs = zip(measured[judged:], predicted[judged:], strict=True)
-        return system, judged_nodes + [Estimate(float(m), float(p)) for m, p in pairs]
+        errors = np.sqrt(self._variances.variances().clip(0.0)) / self.count
+        tested = len(errors)
+        system, tested_nodes = beside(measured[:tested], predicted[:tested], errors)
+        pairs = zip(measured[tested:], predicted[tested:], strict=True)
+        return system, tested_nodes + [Estimate(float(m), float(p)) for m, p in pairs]
 
     def _deviations(self, states: FloatArray) -> FloatArray:
         """(b, m, R): deviations of the agents from the reference, or in consensus from their mean."""
@@ -276,14 +276,14 @@ class RunningErrors:
         return np.asarray(values - self._record.experiment.reference)
 
 
-class _Judge:
+class _ErrorVariances:
     """Sums that give the variances of the time means, as in ``martingale.time_means``."""
 
     def __init__(self, prediction: Prediction, replicas: int, *, nodes: bool = True) -> None:
         system = prediction.system
         p = packed_symmetric.size(system.dimension)
         agents = len(system.output)
-        # Whether the node errors are judged, too, and not only the system error.
+        # Whether the node errors are tested, too, and not only the system error.
         self.nodes = nodes and 8 * system.modes**2 * agents * (p + 1) <= MOST_BYTES
         forms, _, trace = forms_of(system, "nodes" if self.nodes else "system")
         self._system, self._replicas = system, replicas
@@ -299,7 +299,7 @@ class _Judge:
             for value in self._values
         ]
         self._squares = np.zeros(1 + len(self._each))
-        self._looked = self._count = 0  # steps used for the nodes, and all
+        self._sampled = self._count = 0  # steps used for the nodes, and all
         self._length = max(1, BLOCK_NUMBERS // max(p, agents * replicas))
 
     def add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
@@ -311,15 +311,15 @@ class _Judge:
     def _add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
         a = self._packed(deviations)
         b = self._packed(later) if self.needs_later else a
-        looked = steps % self._stride == 0
-        self._looked += int(looked.sum())
+        sampled = steps % self._stride == 0
+        self._sampled += int(sampled.sum())
         self._count += len(steps)
         for mode in np.unique(modes).tolist():
             here = modes == mode
             self._totals[mode] += a[here].sum(axis=0)
             self._squares[0] += self._sum_squares(mode, self._trace[None], a[here], b[here])[0]
             if self.nodes:
-                some = here & looked
+                some = here & sampled
                 self._squares[1:] += self._sum_squares(mode, self._each, a[some], b[some])
 
     def _packed(self, deviations: FloatArray) -> FloatArray:
@@ -344,8 +344,8 @@ class _Judge:
     def variances(self) -> FloatArray:
         """(1,) or (1 + m,): of the sums over all steps, of the system error and of the node errors."""
         found = self._squares.copy()
-        if self._looked:
-            found[1:] *= self._count / self._looked
+        if self._sampled:
+            found[1:] *= self._count / self._sampled
         for known, total in zip(self._known, self._totals, strict=True):
             if known is not None:
                 found += known @ total / self._replicas

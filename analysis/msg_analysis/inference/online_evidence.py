@@ -3,14 +3,12 @@
 
 """Evidence against the law of a running network, and the interval of its system error that holds at all times at once.
 
-The sums of ``sequential.evidence_sums``, one stretch of whole steps after the other; O(1) per step. Which steps are
+The sums of ``evidence_sums``, one stretch of whole steps after the other; O(1) per step. Which steps are
 left out, because they were not seen whole, must not depend on what happened in them.
 
-Evidence against the law of a running network from what every agent heard: on the air, with delay, in real time.
-
-The sums of ``sequential.evidence_sums``. The newest steps are kept until the values that were used in them are there. A
-value that is not there, because its step was not seen or is older than what is kept, leaves out the agent that used it
-in this step: that depends on times and losses only, never on states. O(1) per step; bounded memory.
+With reception noise, with delay and in real time, from what every agent received. The newest steps are stored until the
+values that were used in them are there. A value that is not there, because its step was not seen or is too old, leaves
+out the agent that used it in this step: that depends on times and losses only, never on states. Memory is bounded.
 """
 
 from __future__ import annotations
@@ -24,13 +22,11 @@ import numpy as np
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference.e_values import log_mean
+from msg_analysis.inference.evidence_sums import LARGEST_LOGARITHM, EvidenceSums
 from msg_analysis.inference.observation import Observation, bounded
 from msg_analysis.inference.online_steps import LoggedStates
-from msg_analysis.inference.received_values import HeardValues
-from msg_analysis.inference.residuals import heard_innovations
-from msg_analysis.inference.sequential_questions import question_words
-from msg_analysis.inference.sequential_sums import LARGEST_LOGARITHM, EvidenceSums
+from msg_analysis.inference.received_values import ReceivedValues
+from msg_analysis.inference.residuals import received_residuals
 from msg_analysis.model.run import LoggedInputs
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.prediction import Prediction
@@ -41,13 +37,18 @@ MOST_BYTES = 4 * 2**20  # memory for the evidence on the system error; where tha
 
 @dataclass(frozen=True, slots=True)
 class AnyTime:
-    """What may be said of a running network at any time, however often one looks."""
+    """What may be said of a running network at any time."""
 
     half_width: float | None  # of the 95 % interval of the system error that holds at all times at once
     log_evidence: float | None = None  # None: not known, see ``supports``
     threshold: float = 1.0 / LEVEL
     crossed: int | None = None  # steps that had been seen when the evidence was first found above the threshold
     strongest: str | None = None  # what the strongest evidence is about
+
+    @property
+    def exceeded(self) -> bool:
+        """Whether the threshold was exceeded."""
+        return self.crossed is not None
 
     def to_json(self) -> dict[str, Any]:
         """The document; evidence that is too large for a number is None."""
@@ -56,7 +57,7 @@ class AnyTime:
             "evidence": math.exp(self.log_evidence) if known and self.log_evidence is not None else None,
             "log_evidence": self.log_evidence,
             "threshold": self.threshold,
-            "disagrees": self.crossed is not None,
+            "disagrees": self.exceeded,
             "strongest": self.strongest,
             "half_width": self.half_width,
         }
@@ -79,14 +80,13 @@ def supports(prediction: Prediction) -> bool:
 
 
 class EvidenceWatch:
-    """Sums of a run that goes on, and what they say when they are looked at; ValueError where ``supports`` says no."""
+    """Sums of a run that goes on, and what they show at any time; ValueError where ``supports`` says no."""
 
     def __init__(self, prediction: Prediction, replicas: int) -> None:
         if not supports(prediction):
             raise ValueError("too many agents for the evidence of this run")
         self.sums = EvidenceSums(prediction, replicas)
         self.count = 0  # steps that have been added
-        self._names = [graph.name for graph in prediction.experiment.graph_list]
         self._crossed: int | None = None
 
     @property
@@ -94,7 +94,7 @@ class EvidenceWatch:
         """Of the martingale difference of the system error in a step, by which its interval is tuned."""
         return self.sums.error.variance if self.sums.error is not None else None
 
-    def look(self, half_width: float | None) -> AnyTime:
+    def report(self, half_width: float | None) -> AnyTime:
         """The evidence now; ``half_width``: of the interval of the system error, which is passed on."""
         evidence = self.sums.evidence()
         if math.isnan(evidence):  # numbers too large to compute with: the law never gives one
@@ -104,14 +104,12 @@ class EvidenceWatch:
             self._crossed = self.count
         strongest = None
         if self._crossed is not None:
-            best = {kind: log_mean(logs, axis=1) for kind, logs in self.sums.families().items()}
-            kind = max(best, key=lambda kind: float(best[kind].max()))
-            strongest = question_words(self.sums.question(kind, int(best[kind].argmax())), self._names)
+            strongest = max(self.sums.strongest(self.sums.families()), key=lambda question: question[1])[0]
         return AnyTime(half_width, evidence, threshold, self._crossed, strongest)
 
 
 class RunningEvidence(EvidenceWatch):
-    """The evidence of a run in which all agents hear the states themselves, from its whole steps, as they come."""
+    """The evidence of a run in which all agents receive the states themselves, from its whole steps, as they come."""
 
     def __init__(self, prediction: Prediction, replicas: int) -> None:
         super().__init__(prediction, replicas)
@@ -173,7 +171,7 @@ KEPT_BYTES = 32 * 2**20  # of the newest steps
 LEAST_KEPT, MOST_KEPT = 256, 4096  # steps, besides those of the delay
 
 
-class HeardEvidence(EvidenceWatch):
+class ReceivedEvidence(EvidenceWatch):
     """The evidence of a run from its states with their logs, as they come, each once or more often."""
 
     def __init__(self, prediction: Prediction, replicas: int) -> None:
@@ -188,7 +186,7 @@ class HeardEvidence(EvidenceWatch):
         truth = experiment.truth
         each = 8 * m * (replicas * (2 if truth else 1) + step.most_neighbours + 1)
         self._kept = kept = experiment.noise.delay + int(np.clip(KEPT_BYTES // each, LEAST_KEPT, MOST_KEPT))
-        self._patience = (kept - experiment.noise.delay) // 2  # steps for which values that are not there are awaited
+        self._timeout = (kept - experiment.noise.delay) // 2  # steps for which values that are not there are awaited
         # Rings: what is known of step k is at the place k modulo their length.
         self._label = np.full(kept, -2, dtype=np.int64)
         self._done = np.zeros(kept, dtype=np.bool_)  # whether the step from here to the next one has been added
@@ -209,7 +207,7 @@ class HeardEvidence(EvidenceWatch):
         """Add whole steps."""
         logged = logged[np.argsort(logged.steps, kind="stable")]
         logged = logged[logged.steps <= self._end]
-        length = max(1, self._patience // 2)
+        length = max(1, self._timeout // 2)
         for first in range(0, len(logged.steps), length):
             part = logged[first : first + length]
             self._add_ready(int(part.steps[-1]))  # before anything of it is overwritten
@@ -217,7 +215,7 @@ class HeardEvidence(EvidenceWatch):
             self._add_ready(int(part.steps[-1]))
 
     def add_sojourn(self, first: int, last: int, graph: int) -> bool:
-        """In real time: take a sojourn of the network's graph, from 0, from step to step; False: it contradicts one."""
+        """In real time: take steps in which the network has a graph, from 0; False: they contradict earlier ones."""
         return self._path.add(first, last, graph)
 
     def _keep(self, part: LoggedStates) -> None:
@@ -242,7 +240,7 @@ class HeardEvidence(EvidenceWatch):
             after = (part + 1) % self._kept
             used = self._used[after]
             known = (used < 0) | (label[used % self._kept] == used)
-            ready: BoolArray = known.all(axis=(1, 2)) | (part < newest - self._patience)
+            ready: BoolArray = known.all(axis=(1, 2)) | (part < newest - self._timeout)
             self._add_steps(part[ready], known[ready].all(axis=2))
         if self._realtime:
             graphs, following, count = self._path.passed(min(self._newest, self._end) - 1)
@@ -256,7 +254,7 @@ class HeardEvidence(EvidenceWatch):
         place, after = steps % kept, (steps + 1) % kept
         graphs, used = self._graphs[after], self._used[after]
         now = self._states[place]
-        reception = HeardValues.by(
+        reception = ReceivedValues.by(
             step, graphs[:, 0], graphs, np.where(used < 0, used, used % kept), now, self._published
         )
         if not known.all():
@@ -266,7 +264,7 @@ class HeardEvidence(EvidenceWatch):
             agents = np.tile(np.arange(step.agents), len(steps))
             flat = np.repeat(steps + 1, step.agents), graphs.reshape(-1) + 1, agents
             lost = self._inputs.lost(*flat, used.reshape(len(agents), -1)).reshape(used.shape)
-        self.sums.add_heard(reception, heard_innovations(step, reception, self._states[after]), lost, self._largest)
+        self.sums.add_received(reception, received_residuals(step, reception, self._states[after]), lost, self._largest)
         self.sums.add_broadcast(self._published[place] - now)
         self._done[place] = True
         self.count += len(steps)
@@ -285,14 +283,14 @@ class HeardEvidence(EvidenceWatch):
 
 
 class NetworkPath:
-    """In real time: the graph of the network, sojourn by sojourn; agents may use it late."""
+    """In real time: the graph of the network, one holding time after the other; agents may use it late."""
 
     def __init__(self) -> None:
         self._ahead: dict[int, tuple[int, int]] = {}  # last step and graph, by first step
         self._now: tuple[int, int, int] | None = None  # first step that is not counted, last step, graph
 
     def add(self, first: int, last: int, graph: int) -> bool:
-        """See ``HeardEvidence.add_sojourn``."""
+        """See ``ReceivedEvidence.add_sojourn``."""
         if self._now is not None and first <= self._now[1]:
             return True  # it comes again
         return self._ahead.setdefault(first, (last, graph)) == (last, graph)

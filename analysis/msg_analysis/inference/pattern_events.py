@@ -4,8 +4,8 @@
 """The periods of a run in real time as linear maps between the states known at its sampling times.
 
 The state of the network at the sampling time K dt is a stack: the newest state of every agent; older ones that a later
-step still uses, because a message was slow, its reader late, or a newer one lost; in place of these, with noise on the
-air, the values as they were published, or received if they are received once and used again; and, if process noise is
+step still uses, because a message was slow, its reader late, or a newer one lost; in place of these, with reception
+noise, the values as they were published, or received if they arrive once and are used again; and, if process noise is
 correlated between agents, that of a step that some agents have made and others not yet. A period maps one stack to the
 next by a matrix and noise, which depend on the log alone. Without losses nearly all periods of a run are alike:
 matrices are computed once for each pattern.
@@ -19,9 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray, release
-from msg_analysis.inference.event_order import EventOrder
+from msg_analysis.inference.event_order import OWN, Entries, EventOrder, period_tables
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.period_tables import OWN, Entries, period_tables
 from msg_analysis.inference.received_values import neighbour_weights
 from msg_analysis.model.reception import neighbour_tables
 
@@ -163,19 +162,19 @@ class Periods:
         made = [0] * m
         rows: list[tuple[_Key, dict[_Key, float], float]] = []
         published = 2 * m if step.broadcast else 0
-        for agent, graph, lag, own, *heard in events.tolist():
+        for agent, graph, lag, own, *received in events.tolist():
             mine, law = (agent, own), self._law(graph, agent)
             terms = {mine: law.own}
             variance = 0.0
             for d, (sender, weight) in enumerate(law.inputs):
                 key, again = mine, 0
-                if heard[d] != OWN:
-                    key, again = (published + sender, heard[d]), heard[most + d]
+                if received[d] != OWN:
+                    key, again = (published + sender, received[d]), received[most + d]
                     if again:
-                        received = int(self._numbers.links[agent, sender]), heard[d]
+                        arrived = int(self._numbers.links[agent, sender]), received[d]
                         if again == 1:
-                            rows.append((received, {key: 1.0}, step.link**2))
-                        key = received
+                            rows.append((arrived, {key: 1.0}, step.link**2))
+                        key = arrived
                     else:
                         variance += (weight * step.link) ** 2
                 terms[key] = terms.get(key, 0.0) + weight

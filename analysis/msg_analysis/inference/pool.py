@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Several runs of one experiment, compared with its prediction together."""
+"""The comparison of one run with its prediction, or of several runs of one experiment together."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ import numpy as np
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.inference import verdict
 from msg_analysis.inference.comparison import Comparison, Member, Pool, first_difference
 from msg_analysis.inference.estimates import Estimate
-from msg_analysis.inference.evidence import Evidence
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.statistics import chi2_tail
+from msg_analysis.inference.verdict import MIN_STEPS, Evidence, compare_run, evaluate, without_numbers
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.prediction import Prediction, predict
@@ -40,7 +39,7 @@ def compare(*runs: Run | str | Path, level: float = 0.01) -> Comparison:
     Returns
     -------
     Comparison
-        ``verdict``, ``system_error``, ``node_errors``, ``covariance``, ``tests``, ``blame`` and more
+        ``verdict``, ``system_error``, ``node_errors``, ``covariance``, ``tests``, ``causes`` and more
 
     Raises
     ------
@@ -55,7 +54,7 @@ def compare(*runs: Run | str | Path, level: float = 0.01) -> Comparison:
     if not 0.0 < level <= 0.5:
         raise InputError(f"level: {level:g}: expected a probability above 0, at most 0.5")
     if len(runs) == 1:
-        return verdict.compare(_read(runs[0]), level=level)
+        return compare_run(_read(runs[0]), level=level)
     absent = [str(path) for path in runs if not isinstance(path, Run) and not Path(path).exists()]
     if absent:
         raise InputError(f"{', '.join(absent)}: not found: expected bags, {len(runs)} were given")
@@ -101,20 +100,20 @@ def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> C
     trajectory = dataclasses.replace(trajectory, completeness=account)
     pool = _pool(members) if total and total.decisive else Pool(tuple(members))
     if total is None:
-        comparison = verdict.without_numbers(trajectory, level, prediction, 0)
+        comparison = without_numbers(trajectory, level, prediction, 0)
     else:
-        comparison = verdict.judge(trajectory, prediction, total, level, [("runs alike", pool.p)])
+        comparison = evaluate(trajectory, prediction, total, level, pool.p)
     return dataclasses.replace(comparison, pool=pool)
 
 
 def _examine(name: str, run: Run, prediction: Prediction, level: float) -> tuple[Member, Evidence | None]:
     """One run by itself, with its prediction; no evidence where too little of it arrived."""
     observation = Observation.of(run, prediction)
-    if observation.steps < verdict.MIN_STEPS and not run.completeness.complete:
+    if observation.steps < MIN_STEPS and not run.completeness.complete:
         missing = Estimate(predicted=prediction.emulated.system_error)
         return Member(name, run.record, 0, run.completeness, missing, missing, "incomplete"), None
     evidence = Evidence.of(observation, level)
-    alone = verdict.judge(run, prediction, evidence, level)
+    alone = evaluate(run, prediction, evidence, level)
     tested = alone.given.system_error if alone.given else alone.system_error
     member = Member(name, run.record, evidence.steps, run.completeness, alone.system_error, tested, alone.verdict)
     return member, evidence

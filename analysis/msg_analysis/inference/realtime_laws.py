@@ -129,22 +129,13 @@ def pattern_means(
         series[first:last] = found @ (trace @ forms)
     total, covariance, variances = _follow(periods, _start(observation), lifted, trace)
     expected = frame.T @ (total / steps) @ frame
-    return TimeMeans(
-        second_moments=packed_symmetric.unpack(seen / steps, frame.shape[1]),
-        expected_moments=expected,
-        joint=kind == "joint",
-        measured=forms @ (seen / steps),
-        predicted=forms @ packed_symmetric.pack(expected),
-        covariance=covariance / (observation.replicas * steps**2),
-        nodes=nodes,
-        trace=trace,
-        system_series=series,
-        system_variances=variances / observation.replicas,
-    )
+    covariance /= observation.replicas * steps**2
+    both = series, variances / observation.replicas
+    return TimeMeans.of((forms, nodes, trace), seen / steps, expected, covariance, both, joint=kind == "joint")
 
 
 def means_in_lockstep(observation: Observation) -> TimeMeans | None:
-    """Time means of a run in lockstep, given the path of the graphs and which values were heard.
+    """Time means of a run in lockstep, given the path of the graphs and which values were received.
 
     None where that would take too long.
     """
@@ -248,7 +239,7 @@ class Laws:
     """The laws of a run in real time."""
 
     pattern: Law  # given the values and graphs that the agents logged as used; exact for any timing
-    sequential: Law  # no step is late, every value is heard at once
+    sequential: Law  # no step is late, every value is received at once
     continuous: Law  # the paper's
 
     @property
@@ -259,11 +250,7 @@ class Laws:
     @property
     def why(self) -> str:
         """The reasons of all three, in words."""
-        laws = {
-            "pattern": self.pattern,
-            "sequential": self.sequential,
-            "continuous": self.continuous,
-        }
+        laws = {"pattern": self.pattern, "sequential": self.sequential, "continuous": self.continuous}
         return " ".join(
             f"{LAW_NAMES[key].capitalize()} ({SUPPORT[law.supported]}): {law.why}." for key, law in laws.items()
         )
@@ -298,7 +285,7 @@ def measure_laws(observation: Observation, order: EventOrder, timing: Timing, le
     late = timing.missed_share > MAX_MISSED
     # Where agents keep values from step to step, the sequential law has no standard error of its own.
     untested = p is None and observation.prediction.system.readout is not None and pattern.supported
-    law = _sequential(error, 1.0 if untested else p, level, _departures(timing), effect, late)
+    law = _sequential(error, 1.0 if untested else p, level, _deviations(timing), effect, late)
     return means, Laws(pattern, law, _continuous(observation, error, level, late))
 
 
@@ -313,7 +300,7 @@ def _pattern(observation: Observation, means: TimeMeans, level: float) -> Law:
     return Law(error, False, f"the errors differ from {logged} ({_tested(error, p)}); {why}")
 
 
-def _departures(timing: Timing) -> list[str]:
+def _deviations(timing: Timing) -> list[str]:
     """Facts in the log that contradict the sequential law."""
     facts = []
     if timing.missed:
@@ -326,14 +313,14 @@ def _departures(timing: Timing) -> list[str]:
 
 
 def _sequential(
-    error: Estimate, p: float | None, level: float, departures: list[str], effect: float | None, late: bool
+    error: Estimate, p: float | None, level: float, deviations: list[str], effect: float | None, late: bool
 ) -> Law:
     why = "assumes that every step is on time and every message arrives at once"
-    if not departures:
+    if not deviations:
         why += ", as in this log"
     else:
-        first = ", ".join(departures[:-1])
-        why += ", but " + (f"{first} and " if first else "") + departures[-1]
+        first = ", ".join(deviations[:-1])
+        why += ", but " + (f"{first} and " if first else "") + deviations[-1]
         if effect is not None:
             why += f", which changes the system error by {_change(effect)}"
     if p is None:
@@ -342,7 +329,7 @@ def _sequential(
         return Law(error, False, f"{why}; the measured errors differ ({_tested(error, p)})")
     if late:
         return Law(error, False, why)
-    if not departures or (effect is not None and abs(effect) <= MAX_EFFECT):
+    if not deviations or (effect is not None and abs(effect) <= MAX_EFFECT):
         return Law(error, True, why)
     return Law(error, None, f"{why}; the run is too short to show a difference")
 

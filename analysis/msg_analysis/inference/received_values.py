@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What the agents heard in the steps of a run, with noise or loss on the air, and in real time.
+"""What the agents received in the steps of a run, with noise or loss of messages, and in real time.
 
 The log gives, for every step, what each agent used: which values of its neighbours, and in real time their steps and
-the graph. Given that, the innovations are normal and independent, with an exactly known covariance: process noise, by
+the graph. Given that, the residuals are normal and independent, with an exactly known covariance: process noise, by
 the graph that each agent used, plus the link noise of the received messages. Broadcast noise, losses and delays are
 part of what was used; they are tested, or reported, separately.
 
 Link noise of messages that are used more than once: what earlier steps say about it.
 
 The noise of a link belongs to the message: used again, because a newer one was lost or late, it is the same. So the
-innovations e_i of an agent are no longer independent, but those of the Kalman filter are: the noises of its newest
+residuals e_i of an agent are no longer independent, but those of the Kalman filter are: the noises of its newest
 messages are a Gaussian vector, of which every step observes one combination, w^T noise + process noise.
 """
 
@@ -41,8 +41,8 @@ def neighbour_weights(step: StepModel) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HeardValues:
-    """What was heard in a block of b steps."""
+class ReceivedValues:
+    """What was received in a block of b steps."""
 
     modes: IntArray  # (b,) graphs of the network
     graphs: IntArray  # (b, m) graphs that the agents used; in lockstep those of the network
@@ -52,10 +52,10 @@ class HeardValues:
     senders: IntArray  # (b, m, D) that neighbour
     weights: FloatArray  # (b, m, D) nominal weights of received values; 0 for others
     own: FloatArray  # (b, m) weight of an agent's own state, which also replaces values that did not arrive
-    link_variance: FloatArray  # (b, m) of the link noise in what each agent heard, unless it is partly known
+    link_variance: FloatArray  # (b, m) of the link noise in what each agent received, unless it is partly known
 
     @classmethod
-    def of(cls, observation: Observation, first: int, last: int) -> HeardValues:
+    def of(cls, observation: Observation, first: int, last: int) -> ReceivedValues:
         """Reception of the steps first..last-1."""
         step, modes, timers = observation.step, observation.modes[first:last], observation.timers
         if timers is None:
@@ -79,7 +79,7 @@ class HeardValues:
         used: IntArray,
         states: FloatArray,
         published: FloatArray,
-    ) -> HeardValues:
+    ) -> ReceivedValues:
         """Reception by what was used (b, m, D), at places in ``published``, -1: the own value; the rest as above."""
         tables, agents = neighbour_tables(step), np.arange(step.agents)
         weights = neighbour_weights(step)[graphs, agents]
@@ -96,7 +96,7 @@ class HeardValues:
             link_variance=step.link**2 * (weights**2).sum(axis=2),
         )
 
-    def part(self, first: int, last: int) -> HeardValues:
+    def part(self, first: int, last: int) -> ReceivedValues:
         """Of the steps first..last-1 of the block."""
         cut = slice(first, last)
         return replace(
@@ -111,7 +111,7 @@ class HeardValues:
             link_variance=self.link_variance[cut],
         )
 
-    def heard(self, at: IntArray, agents: IntArray, which: IntArray) -> FloatArray:
+    def received(self, at: IntArray, agents: IntArray, which: IntArray) -> FloatArray:
         """(k, a, R): what ``agents`` (a,) used of their neighbours ``which`` (a,) in the steps ``at`` (k,) of the
         block.
         """
@@ -123,7 +123,7 @@ class HeardValues:
         total = self.own[:, :, None] * self.states
         every, agents = np.arange(len(self.modes)), np.arange(self.states.shape[1])
         for d in range(self.weights.shape[2]):
-            total += self.weights[:, :, d, None] * self.heard(every, agents, np.full(len(agents), d))
+            total += self.weights[:, :, d, None] * self.received(every, agents, np.full(len(agents), d))
         return np.asarray(total)
 
     def patterns(self, order: IntArray | None = None) -> Iterator[tuple[IntArray, IntArray | None, IntArray]]:
@@ -158,7 +158,7 @@ def mode_links(step: Wiring, mode: int) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def full_reception_noise(observation: Observation) -> FloatArray:
-    """(n, m, m): covariance of the innovations of a step in which nothing is lost."""
+    """(n, m, m): covariance of the residuals of a step in which nothing is lost."""
     step = observation.step
     link = observation.prediction.experiment.noise.link**2 * (neighbour_weights(step) ** 2).sum(axis=2)
     process = step.noise_gain @ step.noise_gain.transpose(0, 2, 1)
@@ -172,11 +172,11 @@ def process_noise(step: StepModel, graphs: IntArray) -> FloatArray:
 
 
 class Equalizer:
-    """Transforms innovations of steps with different covariances to the covariance of a regular step.
+    """Transforms residuals of steps with different covariances to the covariance of a regular step.
 
     With N the covariance of a step and M that of a step of the network's graph in which all messages arrived and all
     agents knew the graph, M^1/2 N^-1/2 e has the covariance M. Where N and M differ in their number of noisy directions
-    (an agent without process noise received nothing), that is not possible: then only the total size of all innovations
+    (an agent without process noise received nothing), that is not possible: then only the total size of all residuals
     can be tested. ``full`` are the M of all graphs, (n, m, m).
     """
 
@@ -185,21 +185,21 @@ class Equalizer:
         self._roots = [_root(matrix, 0.5) for matrix in full]
         self._ranks = [rank for _, rank in self._roots]
         self.possible = True  # for every step so far
-        # Sum of e^T N^+ e, its degrees of freedom, and the largest innovation in directions without noise.
+        # Sum of e^T N^+ e, its degrees of freedom, and the largest residual in directions without noise.
         self.chi2, self.dof, self.quiet = 0.0, 0, 0.0
 
-    def equalize(self, innovations: FloatArray, reception: HeardValues) -> FloatArray:
-        """(b, m, R): transformed innovations (b, m, R) of the steps of a block."""
-        m = innovations.shape[1]
+    def equalize(self, residuals: FloatArray, reception: ReceivedValues) -> FloatArray:
+        """(b, m, R): transformed residuals (b, m, R) of the steps of a block."""
+        m = residuals.shape[1]
         keys = np.column_stack([reception.modes, reception.graphs, reception.link_variance])
         patterns, owner = np.unique(keys, axis=0, return_inverse=True)
         owner = owner.reshape(-1)
-        equal = np.empty_like(innovations)
+        equal = np.empty_like(residuals)
         order = np.argsort(owner, kind="stable")
         ends = np.searchsorted(owner[order], np.arange(len(patterns) + 1))
         for number, pattern in enumerate(patterns):
             at = order[ends[number] : ends[number + 1]]
-            mode, graphs, e = int(pattern[0]), pattern[1 : m + 1].astype(np.int64), innovations[at]
+            mode, graphs, e = int(pattern[0]), pattern[1 : m + 1].astype(np.int64), residuals[at]
             inverse, rank = _root(process_noise(self._step, graphs) + np.diag(pattern[m + 1 :]), -0.5)
             white = inverse @ e
             self.possible &= rank == self._ranks[mode]
@@ -217,7 +217,7 @@ class Equalizer:
         self.chi2, self.dof, self.quiet = self.chi2 + other.chi2, self.dof + other.dof, max(self.quiet, other.quiet)
 
     def p_size(self) -> float | None:
-        """Two-sided p-value of the total size of all innovations; None without noise."""
+        """Two-sided p-value of the total size of all residuals; None without noise."""
         if not self.dof:
             return None
         return float(min(1.0, 2.0 * min(chi2_tail(self.chi2, self.dof), chi2_below(self.chi2, self.dof))))
@@ -238,7 +238,7 @@ NEVER = -2
 
 
 class RepeatedNoise:
-    """Frees the innovations, block after block, of what earlier ones say about the noise in them.
+    """Frees the residuals, block after block, of what earlier ones say about the noise in them.
 
     Exact where the process noise of the agents is independent.
     """
@@ -248,7 +248,7 @@ class RepeatedNoise:
         m, replicas = step.agents, observation.replicas
         listens = step.listens()
         most = int(listens.sum(axis=1).max(initial=1)) or 1
-        places = np.cumsum(listens, axis=1) - 1  # (m, m) place of a sender among all that an agent ever hears
+        places = np.cumsum(listens, axis=1) - 1  # (m, m) place of a sender among all that an agent ever receives
         self._place = places[np.arange(m)[:, None], neighbour_tables(step).senders]  # (n, m, D)
         self._variance = step.link**2
         self._process = np.square(step.noise_gain).sum(axis=2)  # (n, m)
@@ -261,13 +261,13 @@ class RepeatedNoise:
         kept = observation.timers is not None or observation.used is not None
         return cls(observation) if observation.step.link and kept else None
 
-    def free(self, innovations: FloatArray, reception: HeardValues) -> tuple[FloatArray, FloatArray]:
-        """Innovations (b, m, R) less what is known of them, and the variance (b, m) of the link noise that is not."""
-        found, variances = np.empty_like(innovations), np.empty(reception.link_variance.shape)
-        agents = np.arange(innovations.shape[1])[:, None]
+    def free(self, residuals: FloatArray, reception: ReceivedValues) -> tuple[FloatArray, FloatArray]:
+        """Residuals (b, m, R) less what is known of them, and the variance (b, m) of the link noise that is not."""
+        found, variances = np.empty_like(residuals), np.empty(reception.link_variance.shape)
+        agents = np.arange(residuals.shape[1])[:, None]
         places = self._place[reception.graphs, agents.T]  # (b, m, D)
         process = self._process[reception.graphs, agents.T]
-        for k, e in enumerate(innovations):
+        for k, e in enumerate(residuals):
             there = reception.weights[k] != 0.0
             self._renew(reception.used[k], places[k], there)
             weights = np.zeros(self._message.shape)

@@ -1,33 +1,35 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Tests of the innovations e(k) = x(k+1) - W_g(k) x(k) - offset_g(k): what a step adds to its mean.
+"""Tests of one-step residuals (innovations) e(k) = x(k+1) - W_g(k) x(k) - offset_g(k): what a step adds to its mean.
 
 Under the model the e(k) are independent N(0, N_g(k)), for any path of the graphs; so these tests are exact or nearly
-so, and find what the time means hardly show. With noise or loss on the air, and in real time, the same holds given the
-values that the agents heard (see ``heard_values``), for any timing. See docs/statistics.md.
+so, and find what the time means hardly show. With noise or loss of messages, and in real time, the same holds given the
+values that the agents received (see ``heard_values``), for any timing. See docs/statistics.md.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 
 from msg_analysis.common.arrays import FloatArray, IntArray
-from msg_analysis.inference.diagnostics import Block, Departure, Finding, Law, Place, Question
-from msg_analysis.inference.e_values import EventEvidence, variance_evidence
-from msg_analysis.inference.gains import MAX_REGRESSORS, HeardRegression, StateRegression
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.received_values import NO_NOISE, Equalizer, HeardValues, RepeatedNoise, full_reception_noise
+from msg_analysis.inference.received_values import (
+    NO_NOISE,
+    Equalizer,
+    ReceivedValues,
+    RepeatedNoise,
+    full_reception_noise,
+)
+from msg_analysis.inference.regression import MAX_REGRESSORS, ReceivedRegression, StateRegression
 from msg_analysis.inference.statistics import (
     chi2_tail,
     covariance_statistic,
     direction_p,
-    log_normal_tail,
     quadratic_form,
 )
 from msg_analysis.model.step_model import StepModel
@@ -37,12 +39,12 @@ QUIET_ROUNDING = 1e-9  # relative size of what counts as rounding in directions 
 
 
 @dataclass(frozen=True, slots=True)
-class InnovationTests:
+class ResidualTests:
     """p-values; None where there is nothing to test."""
 
-    p_covariance: float | None  # of their covariance being N_g; 0 if anything moves in a direction without noise
-    p_whiteness: float | None  # correlation in time (lags 1..10) and between replicas
-    p_gain: float | None  # regression on what the agents heard: wrong gains, references, offsets
+    p_covariance: float | None = None  # of their covariance being N_g; 0 if anything moves in a direction without noise
+    p_whiteness: float | None = None  # correlation in time (lags 1..10) and between replicas
+    p_gain: float | None = None  # regression on what the agents received: wrong gains, references, offsets
     p_common_gain: float | None = None  # the same for one factor of all gains: ignored messages
     # (m,) measured over nominal variance; NaN where an agent has no noise in some graph
     ratios: tuple[float, ...] | None = None
@@ -58,18 +60,18 @@ class _Directions:
 
 
 class Follower(Protocol):
-    """What else is computed from the innovations of a run, in the same pass."""
+    """What else is computed from the residuals of a run, in the same pass."""
 
     @property
     def numbers_per_step(self) -> int:
         """Of temporary arrays."""
 
-    def add(self, first: int, last: int, heard: tuple[HeardValues, FloatArray] | None = None) -> None:
-        """The steps first..last-1, in order, with what was heard and the innovations; None: not computed yet."""
+    def add(self, first: int, last: int, received: tuple[ReceivedValues, FloatArray] | None = None) -> None:
+        """The steps first..last-1, in order, with what was received and the residuals; None: not computed yet."""
 
 
-class InnovationSums:
-    """Sums over the innovations of runs of one experiment: enough for the tests and for the diagnosis (``blame``).
+class ResidualSums:
+    """Sums over the residuals of runs of one experiment: enough for the tests and the search for causes.
 
     In real time, ``position`` is that of ``event_order.EventOrder``, (N, m). ``follower`` is given every step, too.
     """
@@ -86,7 +88,7 @@ class InnovationSums:
         # (n, m, m) nominal covariances
         self.noises: FloatArray = full_reception_noise(observation) if noise.on_air else step.noise
         self.replicas = observation.replicas
-        # Number of innovations, replicas counted, and sum of e e^T, by graph.
+        # Number of residuals, replicas counted, and sum of e e^T, by graph.
         self.samples, self.scatter = np.zeros(n, np.int64), np.zeros((n, m, m))
         self.still = np.zeros((n, m), np.int64)  # steps in which no replica of an agent changed
         self.quiet = self.largest = 0.0  # largest |e| in directions without noise; largest |x|
@@ -94,14 +96,14 @@ class InnovationSums:
         # Graphs may differ in the number of noisy directions; the strongest ones that all graphs have are iid N(0, I).
         self._whiteness = Whiteness(min(len(d.whitener) for d in self._directions))
         self._repeated = RepeatedNoise.of(observation)
-        # False where innovations depend on each other in a way that is not followed here.
+        # False where residuals depend on each other in a way that is not followed here.
         self.independent = self._repeated is None or not _correlated(step)
         varies = self._repeated is not None or (step.loss > 0.0 and noise.link > 0.0)
         if observation.timers and not varies:
             varies = bool((step.noise_gain != step.noise_gain[0]).any())
         self._equalizer = Equalizer(step, self.noises) if varies else None
-        regression: StateRegression | HeardRegression = (
-            HeardRegression(observation, most_regressors, position if _correlated(step) else None)
+        regression: StateRegression | ReceivedRegression = (
+            ReceivedRegression(observation, most_regressors, position if _correlated(step) else None)
             if noise.steps_only or observation.timers
             else StateRegression(observation, most_regressors)
         )
@@ -119,7 +121,7 @@ class InnovationSums:
         """(n,): steps of each graph."""
         return self.samples // self.replicas
 
-    def merge(self, other: InnovationSums) -> None:
+    def merge(self, other: ResidualSums) -> None:
         """Add the sums of another run of the same experiment, with another seed."""
         self.samples += other.samples
         self.scatter += other.scatter
@@ -132,10 +134,10 @@ class InnovationSums:
         self.covariance += other.covariance
         self.gram = None if self.gram is None or other.gram is None else self.gram + other.gram
 
-    def tests(self) -> InnovationTests:
-        """All tests of the innovations."""
+    def tests(self) -> ResidualTests:
+        """All tests of the residuals."""
         if not self.independent:
-            return InnovationTests(None, None, None)
+            return ResidualTests()
         ratios: tuple[float, ...] | None = None
         # Variances below NO_NOISE are allowed for: ten standard deviations.
         hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in self.noises))
@@ -149,10 +151,10 @@ class InnovationSums:
         chi2, dof = quadratic_form(self.score, self.covariance)
         p_gain = float(chi2_tail(chi2, dof)) if dof else None
         p_common_gain = self._common_gain_p() if dof else None
-        return InnovationTests(p_covariance, p_whiteness, p_gain, p_common_gain, ratios, int(self.samples.sum()))
+        return ResidualTests(p_covariance, p_whiteness, p_gain, p_common_gain, ratios, int(self.samples.sum()))
 
     def _ratios(self) -> tuple[float, ...]:
-        """(m,): see ``InnovationTests``."""
+        """(m,): see ``ResidualTests``."""
         seen = self.samples > 0
         noise = np.diagonal(self.noises, axis1=1, axis2=2)[seen]
         scatter = np.diagonal(self.scatter, axis1=1, axis2=2)[seen]
@@ -169,18 +171,18 @@ class InnovationSums:
         return direction_p(weights, self.score, self.covariance)
 
     def _add(
-        self, observation: Observation, regression: StateRegression | HeardRegression, follower: Follower | None
+        self, observation: Observation, regression: StateRegression | ReceivedRegression, follower: Follower | None
     ) -> None:
         """One pass over the run."""
         m = observation.step.agents
         numbers = max(observation.states[0].size, regression.numbers_per_step)
         if follower:
             numbers = max(numbers, follower.numbers_per_step)
-        for first, last in observation.blocks(numbers, "innovations"):
+        for first, last in observation.blocks(numbers, "residuals"):
             modes = observation.modes[first:last]
-            if isinstance(regression, HeardRegression):
-                reception = HeardValues.of(observation, first, last)
-                e = innovations(observation, first, last, reception)
+            if isinstance(regression, ReceivedRegression):
+                reception = ReceivedValues.of(observation, first, last)
+                e = residuals(observation, first, last, reception)
                 if follower:
                     follower.add(first, last, (reception, e))
                 if self._repeated:
@@ -191,9 +193,9 @@ class InnovationSums:
                     e = self._equalizer.equalize(e, reception)
                     self.quiet = max(self.quiet, self._equalizer.quiet)
             else:
-                e = innovations(observation, first, last)
+                e = residuals(observation, first, last)
                 if follower:
-                    follower.add(first, last, (HeardValues.of(observation, first, last), e))
+                    follower.add(first, last, (ReceivedValues.of(observation, first, last), e))
                 regression.add(modes, observation.states[first:last], e)
             states = observation.states[first : last + 1]
             self.largest = max(self.largest, float(np.abs(states[:-1]).max()))
@@ -226,23 +228,23 @@ class InnovationSums:
         return float(chi2_tail(statistic, dof)) if dof else None
 
 
-def innovations(observation: Observation, first: int, last: int, reception: HeardValues | None = None) -> FloatArray:
-    """(last - first, m, R): innovations e(k) of the steps first..last-1, given what was heard.
+def residuals(observation: Observation, first: int, last: int, reception: ReceivedValues | None = None) -> FloatArray:
+    """(last - first, m, R): residuals e(k) of the steps first..last-1, given what was received.
 
-    Without a ``reception`` of these steps, all agents heard the states themselves.
+    Without a ``reception`` of these steps, all agents received the states themselves.
     """
     step, now = observation.step, observation.states[first:last]
     after = observation.states[first + 1 : last + 1].copy()
     if reception is not None:
-        return heard_innovations(step, reception, after)
+        return received_residuals(step, reception, after)
     for mode in range(step.modes):
         at = np.flatnonzero(observation.modes[first:last] == mode)
         after[at] -= step.weights[mode] @ now[at] + step.offsets[mode][:, None]
     return after
 
 
-def heard_innovations(step: StepModel, reception: HeardValues, after: FloatArray) -> FloatArray:
-    """(b, m, R): innovations of steps, given what was heard in them, and the states after them (b, m, R)."""
+def received_residuals(step: StepModel, reception: ReceivedValues, after: FloatArray) -> FloatArray:
+    """(b, m, R): residuals of steps, given what was received in them, and the states after them (b, m, R)."""
     offsets = step.offsets[reception.graphs, np.arange(step.agents)]
     return np.asarray(after - reception.mean() - offsets[:, :, None])
 
@@ -349,65 +351,3 @@ class BroadcastSums:
         """p-value of published - state being N(0, s^2 I), s = ``noise.broadcast``."""
         statistic, dof = covariance_statistic(self.scatter, self.samples)
         return float(chi2_tail(statistic, dof))
-
-
-LARGE = 4.0  # standard deviations; smaller innovations have the evidence 0
-
-
-class LargestInnovation(Departure):
-    """Every innovation by itself, N(0, 1) after division by its standard deviation.
-
-    The test is that of the largest, with their number as a factor (Bonferroni). The evidence is the mean over all
-    innovations of a run of that of each one against a larger variance; those to come count 1. Half of the whole always
-    counts 1.
-    """
-
-    test = "innovations: largest"
-
-    def __init__(self, law: Law) -> None:
-        self._agents = np.flatnonzero(law.noisy)
-        self._evidence = EventEvidence(law.planned * law.replicas * len(self._agents))
-        self._samples = 0
-        self._largest, self._agent, self._place, self._runs = 0.0, 0, Place(0, 0), 1
-
-    def add(self, block: Block) -> FloatArray:
-        """Look at the innovations of a block."""
-        white, looks = block.white[:, self._agents], block.looks
-        if not white.size:
-            return np.empty((looks.count, 0, 1))
-        self._samples += white.size
-        sizes = np.abs(white)
-        large = sizes > LARGE
-        logarithms = variance_evidence(np.ones(int(large.sum())), sizes[large] ** 2)[:, 0]
-        seen, when = looks.lengths * white[0].size, looks.after(np.nonzero(large)[0])
-        at = int(np.argmax(sizes))
-        if not sizes.flat[at] <= abs(self._largest):  # also a NaN
-            step, place, _ = np.unravel_index(at, white.shape)
-            self._largest, self._agent = float(white.flat[at]), int(self._agents[place])
-            self._place = Place(block.first + int(step) + 1, block.first + int(step) + 1)
-        return self._evidence.add(seen, logarithms, when)[:, None, None]
-
-    def merge(self, other: Self) -> None:
-        """The larger one."""
-        self._evidence.merge(other._evidence)
-        self._samples += other._samples
-        if abs(other._largest) > abs(self._largest):
-            self._largest, self._agent, self._place = other._largest, other._agent, other._place.later(self._runs)
-        self._runs += other._runs
-
-    def finding(self) -> Finding | None:
-        """The largest."""
-        if not self._samples:
-            return None
-        log_p = math.log(2.0 * self._samples) + float(log_normal_tail(abs(self._largest)))
-        return Finding(
-            self.test, min(0.0, log_p), agent=self._agent, place=self._place, estimate=self._largest, expected=0.0
-        )
-
-    def evidence(self) -> FloatArray:
-        """(1, 1)."""
-        return np.array([[self._evidence.logarithm()]]) if self._evidence.planned else np.empty((0, 1))
-
-    def questions(self) -> list[Question]:
-        """One, about all agents."""
-        return [("largest innovation", ())]

@@ -256,7 +256,7 @@ class RunPlan:
                 )
         if not precision.any_time:
             notes.append(
-                "with noise, losses or delay on the air and in real time there is no interval that holds at all times"
+                "with noise, losses or delay of messages and in real time there is no interval that holds at all times"
             )
         return notes
 

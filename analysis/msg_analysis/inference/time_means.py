@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -54,9 +54,34 @@ class TimeMeans:
     switches: float = math.inf
     heavy: bool = False  # whether the law over all paths has infinite fourth moments, so that no standard error exists
 
+    @classmethod
+    def of(
+        cls,
+        kind: tuple[FloatArray, FloatArray, FloatArray],
+        seen: FloatArray,
+        expected: FloatArray,
+        covariance: FloatArray,
+        series: tuple[FloatArray, FloatArray],
+        **others: Any,
+    ) -> TimeMeans:
+        """Of ``forms_of``, the packed time mean (p,), its expectation (f, f), (q, q), and (N,) both series."""
+        forms, nodes, trace = kind
+        return cls(
+            second_moments=packed_symmetric.unpack(seen, len(expected)),
+            expected_moments=expected,
+            measured=forms @ seen,
+            predicted=forms @ packed_symmetric.pack(expected),
+            covariance=covariance,
+            nodes=nodes,
+            trace=trace,
+            system_series=series[0],
+            system_variances=series[1],
+            **others,
+        )
+
     @property
     def long_enough(self) -> bool:
-        """Whether the errors of such runs are nearly normal: many sojourns, none of which decides the variance."""
+        """Whether the errors of such runs are nearly normal: many holding times, none of which decides the variance."""
         if self.heavy:
             return False
         if math.isinf(self.switches):
@@ -223,18 +248,13 @@ def time_means(observation: Observation) -> TimeMeans:
         if isinstance(value, Value):
             covariance += value.spread(total) / observation.replicas
     seen = totals.sum(axis=0)[:p] / steps
-    expected = expected_mean(observation)
-    return TimeMeans(
-        second_moments=packed_symmetric.unpack(seen, system.dimension),
-        expected_moments=expected,
+    return TimeMeans.of(
+        (forms, nodes, trace),
+        seen,
+        expected_mean(observation),
+        covariance / steps**2,
+        (series, variances),
         joint=False,
-        measured=forms @ seen,
-        predicted=forms @ packed_symmetric.pack(expected),
-        covariance=covariance / steps**2,
-        nodes=nodes,
-        trace=trace,
-        system_series=series,
-        system_variances=variances,
         switches=_expected_switches(observation),
         heavy=observation.prediction.fourth_moment.finite is not True,
     )
@@ -250,18 +270,13 @@ def _without_errors(observation: Observation) -> TimeMeans:
         found = moments(observation, first, last, observation.states)
         seen += found.sum(axis=0)
         series[first:last] = found @ (trace @ forms)
-    expected = expected_mean(observation)
-    return TimeMeans(
-        second_moments=packed_symmetric.unpack(seen / steps, system.frame.shape[1]),
-        expected_moments=expected,
+    return TimeMeans.of(
+        (forms, nodes, trace),
+        seen / steps,
+        expected_mean(observation),
+        np.zeros((len(forms), len(forms))),
+        (series, np.zeros(steps)),
         joint=False,
-        measured=forms @ (seen / steps),
-        predicted=forms @ packed_symmetric.pack(expected),
-        covariance=np.zeros((len(forms), len(forms))),
-        nodes=nodes,
-        trace=trace,
-        system_series=series,
-        system_variances=np.zeros(steps),
         switches=0.0,
         heavy=observation.prediction.fourth_moment.finite is not True,
     )

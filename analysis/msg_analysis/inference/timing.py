@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.arithmetic.reproducible import StepClock
-from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
-from msg_analysis.inference.messages import UnheardMessages, unheard_messages
+from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray, column
+from msg_analysis.common.text import percent
 from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.statistics import binomial_interval
 from msg_analysis.model.phases import phases
 from msg_analysis.model.reception import MessagesUsed, neighbour_tables
 from msg_analysis.model.step_model import ideal_uses
@@ -112,10 +113,10 @@ class Timing:
     jitter_ms: Quantiles  # |time between two successive steps of an agent - period|
     staleness_ms: Quantiles  # age of the values at the time of use
     staleness_steps: Quantiles  # step of the new state - step of the value; 0 or 1 with ideal timers
-    uses: int  # neighbours' values that steps needed, those never heard or lost included
+    uses: int  # neighbours' values that steps needed, those never received or lost included
     ideal_uses: int  # uses of the value that ideal timers would have used, the own one for a lost one included
-    never_heard: int  # uses in which nothing had been heard yet of the neighbour
-    unheard: UnheardMessages
+    never_heard: int  # uses in which nothing had been received yet of the neighbour
+    lost_messages: LostMessages
     outdated_graphs: int  # steps made with another graph than the network's at that time
     histogram: tuple[FloatArray, AnyArray]  # of lateness: edges [ms] (BINS + 1,) and counts (BINS,); covers all values
     ages: tuple[FloatArray, AnyArray]  # the same of ``staleness_ms``
@@ -127,7 +128,7 @@ class Timing:
 
     @property
     def ideal_share(self) -> float:
-        """Of all uses, those that ideal timers would have made; 1 where no agent hears another."""
+        """Of all uses, those that ideal timers would have made; 1 where no agent receives another."""
         return self.ideal_uses / self.uses if self.uses else 1.0
 
     @property
@@ -147,7 +148,7 @@ class Timing:
             "staleness_steps": _document(self.staleness_steps),
             "ideal_uses": {"uses": self.uses, "ideal": self.ideal_uses, "share": self.ideal_share},
             "never_heard": self.never_heard,
-            "unheard": self.unheard.to_json(),
+            "unheard": self.lost_messages.to_json(),
             "outdated_graph": {"steps": self.outdated_graphs, "share": self.outdated_share},
             "histogram": {
                 "lateness_ms": edges.tolist(),
@@ -177,7 +178,7 @@ def measure_timing(observation: Observation) -> Timing:
         uses=uses,
         ideal_uses=ideal_uses,
         never_heard=never_heard,
-        unheard=unheard_messages(observation),
+        lost_messages=lost_messages(observation),
         outdated_graphs=outdated,
         histogram=_histogram(log.pieces(log.lateness)),
         ages=_histogram(log.pieces(log.ages)),
@@ -219,18 +220,18 @@ class _TimingLog:
 
     def ages(self, first: int, last: int) -> FloatArray:
         """(uses,) of the values that were used."""
-        heard, senders, used = self._heard(first, last)
+        received, senders, used = self._received(first, last)
         made = self._timers.made
         age = made[first + 1 : last + 1, :, None] - made[used, senders]
-        return np.asarray(age[heard] * self.milliseconds)
+        return np.asarray(age[received] * self.milliseconds)
 
     def ages_in_steps(self, first: int, last: int) -> IntArray:
         """The same in steps."""
-        heard, _, used = self._heard(first, last)
-        return np.asarray((np.arange(first + 1, last + 1)[:, None, None] - used)[heard])
+        received, _, used = self._received(first, last)
+        return np.asarray((np.arange(first + 1, last + 1)[:, None, None] - used)[received])
 
     def counts(self, first: int, last: int) -> IntArray:
-        """Missed deadlines, uses, those of ideal timers, and of what was never heard, steps with an outdated graph."""
+        """Missed deadlines, uses, those of ideal timers, of what never arrived, steps with an outdated graph."""
         used, graphs, modes = self._timers.used[first:last], self._timers.graphs[first:last], self._observation.modes
         there, ideal = self._there(graphs), self._ideal(first, last)
         never = there & (used < 0) & (ideal >= 0)
@@ -248,7 +249,7 @@ class _TimingLog:
         count = self._tables.count[graphs, np.arange(self._step.agents)]
         return np.asarray(np.arange(self._step.most_neighbours) < count[:, :, None])
 
-    def _heard(self, first: int, last: int) -> tuple[BoolArray, IntArray, IntArray]:
+    def _received(self, first: int, last: int) -> tuple[BoolArray, IntArray, IntArray]:
         """(b, m, D) each: of which neighbours a value was used, the neighbours, and the steps of the values."""
         used, graphs = self._timers.used[first:last], self._timers.graphs[first:last]
         senders = self._tables.senders[graphs, np.arange(self._step.agents)]
@@ -275,3 +276,112 @@ def _histogram(values: Pieces) -> tuple[FloatArray, AnyArray]:
 
 def _document(quantiles: Quantiles) -> dict[str, float | None]:
     return {"p50": quantiles.p50, "p95": quantiles.p95, "p99": quantiles.p99, "max": quantiles.max}
+
+
+SHOWN_LINKS = 20
+LEAST_EXCESS = 0.01  # smallest difference of shares that is put into words: a busy machine has a few late messages
+
+
+@dataclass(frozen=True, slots=True)
+class LostMessages:
+    """By directed link.
+
+    A message counts at the first step of its receiver after it was published and at the next one, if the link is
+    active in both and no newer message was published before the first: it was received in time if one of them used it.
+    With timers that keep their periods, and messages faster than a period, those that were not are the lost ones.
+    """
+
+    links: IntArray  # (L, 2) receiver and sender
+    messages: IntArray  # (L,) that could be decided
+    lost: IntArray  # (L,) of these
+    probability: FloatArray  # (L,) that the experiment loses a message
+    inflation: float  # variance of the number of losses over that of independent ones (bursts)
+
+    @property
+    def expected(self) -> FloatArray:
+        """(L,): messages that the experiment loses."""
+        return self.messages * self.probability
+
+    def share(self, which: Any = slice(None)) -> tuple[float, tuple[float, float], float]:
+        """Share of some links' messages, its 95 % interval, and what the experiment loses; 0 where there was none."""
+        messages, lost = int(self.messages[which].sum()), int(self.lost[which].sum())
+        if not messages:
+            return 0.0, (0.0, 1.0), 0.0
+        interval = binomial_interval(round(lost / self.inflation), max(round(messages / self.inflation), 1))
+        return lost / messages, interval, float(self.expected[which].sum()) / messages
+
+    def words(self) -> str | None:
+        """What differs from the experiment, without a full stop; None where nothing does."""
+        share, (low, high), expected = self.share()
+        if low <= expected <= high or abs(share - expected) < LEAST_EXCESS:
+            return None
+        text = (
+            f"{percent(share)} ({100 * low:.3g} to {100 * high:.3g} %) of the messages between agents did not arrive "
+            f"in time, while the experiment loses {percent(expected)}: "
+        )
+        text += "the network lost them or was late" if share > expected else "the experiment's losses were not made"
+        place = int(self._order[0])
+        worst = self.share(place)[0]
+        receiver, sender = (self.links[place] + 1).tolist()
+        return f"{text}; most different: {percent(worst)} of those from agent {sender} to agent {receiver}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON document: all links together, and those that differ most from the experiment."""
+        share, interval, expected = self.share()
+        rows = []
+        for place in self._order[:SHOWN_LINKS].tolist():
+            found, around, should = self.share(place)
+            receiver, sender = self.links[place].tolist()
+            row = {"sender": sender + 1, "receiver": receiver + 1, "messages": int(self.messages[place])}
+            row |= {"unheard": int(self.lost[place]), "share": found, "interval": list(around), "expected": should}
+            rows.append(row)
+        return {
+            "messages": int(self.messages.sum()),
+            "unheard": int(self.lost.sum()),
+            "share": share,
+            "interval": list(interval),
+            "expected": expected,
+            "words": self.words(),
+            "links": rows,
+        }
+
+    @property
+    def _order(self) -> IntArray:
+        """(L,): places of the links, those first that differ most, in standard errors."""
+        spread = np.sqrt(np.maximum(self.expected * (1.0 - self.probability), 1.0))
+        return np.argsort(-np.abs(self.lost - self.expected) / spread, kind="stable")
+
+
+def lost_messages(observation: Observation) -> LostMessages:
+    """The messages of a run in real time, see ``LostMessages``; with a delay, so many steps later."""
+    timers, step = observation.timers, observation.step
+    assert timers is not None
+    tables = neighbour_tables(step)
+    links = np.argwhere(step.listens())
+    messages, lost = np.zeros(len(links), np.int64), np.zeros(len(links), np.int64)
+    late = step.delay
+    steps = len(timers.graphs) - 1 - late  # that can be the first one after a message was published
+    for receiver in np.unique(links[:, 0]).tolist() if steps >= 1 else ():
+        graphs, made = column(timers.graphs, receiver), column(timers.made, receiver)
+        there = np.arange(step.most_neighbours) < tables.count[graphs, receiver][:, None]
+        senders, received = tables.senders[graphs, receiver], column(timers.used, receiver)
+        for number in np.flatnonzero(links[:, 0] == receiver).tolist():
+            sender = int(links[number, 1])
+            chosen = there & (senders == sender)  # (N, D): at most one of a step
+            active = chosen.any(axis=1)
+            used = np.where(chosen, received, -1).max(axis=1, initial=-1)
+            first, second = used[late : late + steps], used[late + 1 : late + 1 + steps]
+            newest = np.searchsorted(column(timers.made, sender), made[1 : steps + 1], side="left") - 1
+            newest = np.maximum(newest, first)  # of equal times, a value comes before the steps that use it
+            decided = active[late : late + steps] & active[late + 1 : late + 1 + steps]
+            decided &= np.diff(newest, prepend=newest[0]) > 0
+            decided[: observation.sure_messages] = False
+            messages[number] = decided.sum()
+            lost[number] = (decided & (first != newest) & (second != newest)).sum()
+    probability = step.losses[links[:, 0], links[:, 1]] if step.loss else np.zeros(len(links))
+    persistence = 0.0
+    if step.burst is not None and probability.any():
+        chance = float(probability.max())
+        persistence = 1.0 - 1.0 / step.burst - chance / (step.burst * (1.0 - chance))
+    inflation = (1.0 + persistence) / (1.0 - persistence)
+    return LostMessages(links, messages, lost, np.asarray(probability), inflation)

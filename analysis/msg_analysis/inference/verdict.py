@@ -1,40 +1,173 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Comparison of a run with its prediction, and the verdict."""
+"""Comparison of a run, or of several runs of one experiment, with the prediction, and the verdict."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.common.resources import blas_threads
 from msg_analysis.inference.candidates import Cause
-from msg_analysis.inference.causes import Accused, find_causes
-from msg_analysis.inference.comparison import Comparison, Test, trusted
+from msg_analysis.inference.comparison import Comparison, trusted
+from msg_analysis.inference.counts import LossTally, Transitions, loss_test, switching_test
+from msg_analysis.inference.e_values import log_mean
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates, rank_agents
-from msg_analysis.inference.evidence import Evidence
-from msg_analysis.inference.given_path import GivenPath
-from msg_analysis.inference.messages import loss_test
+from msg_analysis.inference.event_order import order_events
+from msg_analysis.inference.evidence_sums import AnyTimeEvidence, Watch, WatchedEvidence, any_time_evidence
+from msg_analysis.inference.given_path import GivenPath, means_given_path
 from msg_analysis.inference.observation import Measurement, Observation, spaced_steps
-from msg_analysis.inference.residuals import InnovationTests
-from msg_analysis.inference.sequential_sums import AnyTimeEvidence, any_time_evidence
-from msg_analysis.inference.statistics import batch_interval, holm, steps_to_half_width
-from msg_analysis.inference.switching import switching_test
-from msg_analysis.inference.time_means import TimeMeans
+from msg_analysis.inference.question import Search, Statistics
+from msg_analysis.inference.questions import causes_of, decide
+from msg_analysis.inference.realtime_laws import Laws, means_in_lockstep, measure_laws
+from msg_analysis.inference.residuals import BroadcastSums, ResidualSums
+from msg_analysis.inference.statistics import batch_interval, steps_to_half_width
+from msg_analysis.inference.time_means import TimeMeans, time_means
+from msg_analysis.inference.timing import Timing, measure_timing
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.prediction import Prediction, predict
 
+ANALYSES = 20, 80  # at the evidence over time, in short and in long runs: each takes as long as some hundred steps
+STEPS_PER_ANALYSIS = 100  # between these
+DECIDED_ANALYSES = 400  # where the evidence has decided when the run ended, and so decides the verdict
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Sums over the steps of runs; those of several runs of one experiment are added up."""
+
+    steps: int
+    means: TimeMeans  # time means, and their expectation over all paths of the graphs; in real time: given the log
+    decisive: bool  # whether the law that the means are compared with is exact
+    given: TimeMeans | None  # with their expectation given the path; None where it is not computed
+    residuals: ResidualSums
+    transitions: Transitions
+    loss: LossTally | None  # None without loss
+    broadcast: BroadcastSums | None  # None without broadcast noise
+    watched: WatchedEvidence  # what holds at any time
+    timing: Timing | None = None  # of one run in real time
+    laws: Laws | None = None  # of one run in real time
+
+    @property
+    def tested(self) -> TimeMeans | None:
+        """The errors next to the exact law that they are tested against; None where there is none.
+
+        In lockstep that given the path, which holds for every run, before that over all paths, which needs long runs;
+        but one with the errors of the agents before one without.
+        """
+        laws = [self.given, self.means if self.means.long_enough else None] if self.decisive else []
+        known = [law for law in laws if law]
+        return next((law for law in known if len(law.nodes)), known[0] if known else None)
+
+    @classmethod
+    def of(cls, observation: Observation, level: float, *, decided: bool = False) -> Evidence:
+        """Of one run, which ended when its evidence ``decided``; in real time, laws are tested at ``level``."""
+        analyses = spaced_steps(observation.steps, DECIDED_ANALYSES if decided else usual_analyses(observation.steps))
+        with blas_threads(observation.step.agents):
+            return cls._of(observation, level, analyses)
+
+    @classmethod
+    def _of(cls, observation: Observation, level: float, analyses: IntArray) -> Evidence:
+        laws, timing, position, given = None, None, None, None
+        if observation.timers:
+            timing, order = measure_timing(observation), order_events(observation)
+            position = order.position
+            means, laws = measure_laws(observation, order, timing, level)
+        else:
+            means = time_means(observation)
+            kept = observation.prediction.system.readout is not None
+            given = means_in_lockstep(observation) if kept else means_given_path(observation)
+        watch = Watch(observation, analyses)
+        residuals = ResidualSums(observation, position, watch)
+        return cls(
+            steps=observation.steps,
+            means=means,
+            decisive=laws is None or laws.measured_against == "pattern",
+            given=given,
+            residuals=residuals,
+            transitions=Transitions.of(observation.modes, observation.step.modes),
+            loss=LossTally.of(observation),
+            broadcast=BroadcastSums.of(observation),
+            watched=watch.result(),
+            timing=timing,
+            laws=laws,
+        )
+
+    def merged(self, other: Evidence) -> Evidence:
+        """The evidence of these and other runs of the same experiment; the sums of ``self`` are changed in place.
+
+        Time means are weighted with the numbers of steps, so that every step, and every martingale increment, counts
+        the same.
+        """
+        self.residuals.merge(other.residuals)
+        if self.loss and other.loss:
+            self.loss.merge(other.loss)
+        if self.broadcast and other.broadcast:
+            self.broadcast.merge(other.broadcast)
+        given = None
+        if self.given and other.given:
+            given = _merged_means(self.given, self.steps, other.given, other.steps)
+        return replace(
+            self,
+            steps=self.steps + other.steps,
+            means=_merged_means(self.means, self.steps, other.means, other.steps),
+            decisive=self.decisive and other.decisive,
+            given=given,
+            transitions=self.transitions.merged(other.transitions),
+            watched=self.watched.merged(other.watched),
+            timing=None,
+            laws=None,
+        )
+
+
+def usual_analyses(steps: int) -> int:
+    """At the evidence over time of a run with so many steps, at most."""
+    few, most = ANALYSES
+    return min(max(steps // STEPS_PER_ANALYSIS, few), most)
+
+
+def _merged_means(one: TimeMeans, steps: int, other: TimeMeans, more: int) -> TimeMeans:
+    a, b = steps / (steps + more), more / (steps + more)
+    if one.joint != other.joint or len(one.nodes) != len(other.nodes):
+        one, other = _coarser(one, other), _coarser(other, one)
+    return replace(
+        one,
+        second_moments=a * one.second_moments + b * other.second_moments,
+        expected_moments=a * one.expected_moments + b * other.expected_moments,
+        measured=a * one.measured + b * other.measured,
+        predicted=a * one.predicted + b * other.predicted,
+        covariance=a**2 * one.covariance + b**2 * other.covariance,
+        system_series=np.concatenate([one.system_series, other.system_series]),
+        system_variances=np.concatenate([one.system_variances, other.system_variances]),
+        switches=one.switches + other.switches,
+    )
+
+
+def _coarser(means: TimeMeans, other: TimeMeans) -> TimeMeans:
+    """Reduced to what both have: the node errors, or only the system error."""
+    combinations = means.nodes if len(means.nodes) and len(other.nodes) else means.trace[None]
+    count = len(combinations)
+    return replace(
+        means,
+        joint=False,
+        measured=combinations @ means.measured,
+        predicted=combinations @ means.predicted,
+        covariance=combinations @ means.covariance @ combinations.T,
+        nodes=np.eye(count) if count > 1 else np.empty((0, 1)),
+        trace=np.ones(count),
+    )
+
+
 MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
 
 
-def compare(trajectory: Run, *, level: float = 0.01) -> Comparison:
-    """Compare a run, or its complete beginning, with what theory predicts for it.
+def compare_run(trajectory: Run, *, level: float = 0.01) -> Comparison:
+    """Compare a run, or its complete beginning, with what theory predicts for it; see ``api.compare``.
 
     Every test assumes exactly the law that the record says was run; the probability of any false rejection in the
     family is at most ``level`` (Holm). A test with nothing to test (no noise, one graph, no loss) is left out. In real
@@ -64,45 +197,45 @@ def compare(trajectory: Run, *, level: float = 0.01) -> Comparison:
         return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
     until = trajectory.record.until
     decided = until is not None and until.decided
-    return judge(trajectory, prediction, Evidence.of(observation, level, decided=decided), level)
+    return evaluate(trajectory, prediction, Evidence.of(observation, level, decided=decided), level)
 
 
-def judge(
+def evaluate(
     trajectory: Run,
     prediction: Prediction,
     evidence: Evidence,
     level: float,
-    more: Sequence[tuple[str, float | None]] = (),
+    p_alike: float | None = None,
 ) -> Comparison:
-    """The verdict on the evidence of one run, or of several; ``more`` has names and p-values of further tests.
+    """The verdict on the evidence of one run, or of several, of which ``p_alike`` is the p-value of their being alike.
 
     Of several runs, ``trajectory`` is one with the completeness of all.
     """
     means, lockstep = evidence.means, prediction.experiment.run.pace == "lockstep"
     system_error, node_errors = _over_all_paths(means, prediction.system)
     covariance = _covariance(evidence, prediction.system)
-    innovations = evidence.innovations.tests()
-    switching = evidence.transitions.test(prediction.step.transition)
-    loss = evidence.loss.test() if evidence.loss else None
-    p_broadcast = evidence.broadcast.p_value() if evidence.broadcast else None
-    family = [
-        *_error_tests(evidence.exact, prediction.system),
-        ("covariance", covariance.p if evidence.decisive else None),
-        ("innovations: covariance", innovations.p_covariance),
-        ("innovations: whiteness", innovations.p_whiteness),
-        ("innovations: gains", innovations.p_gain),
-        ("innovations: common gain", innovations.p_common_gain),
-        ("switching", switching.p),
-        *((finding.test, math.exp(finding.log_p)) for finding in evidence.watched.findings()),
-        ("loss", loss.p if loss else None),
-        ("broadcast", p_broadcast),
-        *more,
-    ]
-    tests = _judge(family, level)
+    law = evidence.tested
+    tested_error, tested_nodes = estimates(law, prediction.system) if law else (None, [])
+    run = Statistics(
+        system_error=tested_error,
+        node_errors=tested_nodes,
+        corrected=", corrected" if law and law is evidence.given else "",
+        covariance=covariance if evidence.decisive else None,
+        residuals=evidence.residuals.tests(),
+        switching=evidence.transitions.test(prediction.step.transition),
+        loss=evidence.loss.test() if evidence.loss else None,
+        p_broadcast=evidence.broadcast.p_value() if evidence.broadcast else None,
+        findings=evidence.watched.sums.findings(),
+        p_alike=p_alike,
+    )
+    families = evidence.watched.sums.families()
+    logarithms = {name: float(log_mean(logs.reshape(-1))) for name, logs in families.items()}
+    tests = decide(run, level, logarithms)
     rejected = [test.name for test in tests if test.rejected]
-    blame: list[Cause] = []
+    causes: list[Cause] = []
     if rejected and trajectory.completeness.complete:
-        blame = find_causes(_accused(prediction, evidence), level, rejected)
+        sums = evidence.residuals, evidence.transitions, evidence.loss, evidence.broadcast
+        causes = causes_of(Search(prediction.experiment, *sums, run.findings, level), rejected)
     return Comparison(
         trajectory=trajectory,
         level=level,
@@ -110,33 +243,35 @@ def judge(
         system_error=system_error,
         node_errors=node_errors,
         covariance=covariance,
-        innovations=innovations,
-        switching=switching,
+        innovations=run.residuals,
+        switching=run.switching,
         continuous_error=prediction.continuous.system_error if prediction.continuous_moments else None,
         batch=batch_interval(means.system_series),
         tests=tests,
         running=_running(means, prediction.step.dt),
-        loss=loss,
-        p_broadcast=p_broadcast,
+        loss=run.loss,
+        p_broadcast=run.p_broadcast,
         timing=evidence.timing,
         laws=evidence.laws,
         given=GivenPath(means, evidence.given) if evidence.given else None,
         order=rank_agents(means, level) if means.long_enough else None,
-        blame=blame,
-        any_time=_any_time(trajectory.record, prediction, evidence, level),
+        causes=causes,
+        any_time=_any_time(trajectory.record, prediction, evidence, level, families),
         trust=trusted(prediction, means, given=evidence.given is not None) if lockstep else None,
     )
 
 
-def _any_time(record: RunRecord, prediction: Prediction, evidence: Evidence, level: float) -> AnyTimeEvidence:
+def _any_time(
+    record: RunRecord, prediction: Prediction, evidence: Evidence, level: float, families: dict[str, FloatArray]
+) -> AnyTimeEvidence:
     """The interval is tuned by what was known before the run, whatever step it ended at."""
-    means, names = evidence.means, [graph.name for graph in record.experiment.graph_list]
+    means = evidence.means
     variance = float(means.system_variances.sum()) if means.long_enough else None
     planned, error = float(record.planned_steps), evidence.watched.sums.error
     if record.until and error is not None:
         wanted = record.until.precision * prediction.emulated.system_error
         planned = min(planned, steps_to_half_width(error.variance, wanted))
-    return any_time_evidence(evidence.watched, level, names, variance, evidence.steps, planned)
+    return any_time_evidence(evidence.watched, level, families, variance, evidence.steps, planned)
 
 
 def _over_all_paths(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Estimate]]:
@@ -147,35 +282,11 @@ def _over_all_paths(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, lis
     return error.without_error(), [node.without_error() for node in nodes]
 
 
-def _error_tests(laws: Sequence[TimeMeans], system: JumpSystem) -> list[tuple[str, float | None]]:
-    """Names and p-values of the tests of the errors; ``laws`` in the order of preference."""
-    if not laws:
-        return []
-    system_error, nodes = estimates(next((law for law in laws if len(law.nodes)), laws[0]), system)
-    named = [(f"error of agent {i}", node.p) for i, node in enumerate(nodes, start=1)]
-    return [("system error", system_error.p), *named]
-
-
 def _covariance(evidence: Evidence, system: JumpSystem) -> CovarianceTest:
     """The second moments and their expectation over all paths, tested given the path."""
     shown = covariance_test(evidence.means, system)
     tested = covariance_test(evidence.given, system) if evidence.given else shown
     return replace(tested, measured=shown.measured, predicted=shown.predicted)
-
-
-def _accused(prediction: Prediction, evidence: Evidence) -> Accused:
-    experiment = prediction.experiment
-    return Accused(
-        names=[graph.name for graph in experiment.graph_list],
-        chain=experiment.chain,
-        dt=experiment.step_length,
-        reference=experiment.reference,
-        innovations=evidence.innovations,
-        transitions=evidence.transitions,
-        loss=evidence.loss,
-        broadcast=evidence.broadcast,
-        departures=evidence.watched.findings(),
-    )
 
 
 def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
@@ -185,9 +296,10 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
     if measurement.steps < MIN_STEPS and not trajectory.completeness.complete:
         enough = False
     series, covariance = measurement.system_series, measurement.covariance if enough else None
-    switching = switching_test(measurement.modes, measurement.step.transition) if enough else None
-    loss = loss_test(measurement) if enough else None
-    family = [("switching", switching.p if switching else None), ("loss", loss.p if loss else None)]
+    run = Statistics(
+        switching=switching_test(measurement.modes, measurement.step.transition) if enough else None,
+        loss=loss_test(measurement) if enough else None,
+    )
     nodes = [Estimate()] * agents if covariance is None else [Estimate(float(error)) for error in np.diag(covariance)]
     counts = spaced_steps(len(series)) if enough else np.empty(0, np.int64)
     return Comparison(
@@ -197,17 +309,15 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
         system_error=Estimate() if covariance is None else Estimate(float(np.trace(covariance))),
         node_errors=nodes,
         covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
-        innovations=InnovationTests(None, None, None),
-        switching=switching,
-        continuous_error=None,
+        switching=run.switching,
         batch=batch_interval(series) if enough else None,
-        tests=_judge(family, level),
+        tests=decide(run, level),
         running={
             "time": np.asarray((measurement.first + counts) * measurement.step.dt, dtype=float),
             "system_error": np.cumsum(series)[counts - 1] / counts if enough else np.empty(0),
             "standard_error": np.zeros(len(counts)),
         },
-        loss=loss,
+        loss=run.loss,
         unpredicted=unpredicted,
         transient=measurement.first if enough else None,
     )
@@ -223,20 +333,9 @@ def without_numbers(trajectory: Run, level: float, prediction: Prediction, steps
         system_error=Estimate(predicted=predicted.system_error),
         node_errors=[Estimate(predicted=float(error)) for error in predicted.node_errors],
         covariance=CovarianceTest(predicted=predicted.covariance),
-        innovations=InnovationTests(None, None, None),
-        switching=None,
         continuous_error=prediction.continuous.system_error if prediction.continuous_moments else None,
-        batch=None,
-        tests=[],
         running={key: np.empty(0) for key in ("time", "system_error", "standard_error")},
     )
-
-
-def _judge(family: list[tuple[str, float | None]], level: float) -> list[Test]:
-    # A NaN statistic (a log with numbers too large to compute with) counts as p = 0: the law never gives one.
-    tested = [(name, 0.0 if math.isnan(p) else p) for name, p in family if p is not None]
-    adjusted = holm(np.array([p for _, p in tested], dtype=float))
-    return [Test(name, p, float(a), bool(a < level)) for (name, p), a in zip(tested, adjusted, strict=True)]
 
 
 def _running(means: TimeMeans, dt: float) -> dict[str, FloatArray]:

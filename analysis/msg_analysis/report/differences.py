@@ -35,7 +35,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.problems import show
 from msg_analysis.inference.comparison import flat
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.model.run import Run
 from msg_analysis.report.comparison_text import agent_errors
 from msg_analysis.report.tables import fact_table, first_rows, number_table, print_table

@@ -25,7 +25,7 @@ from msg_analysis.common.arrays import BoolArray
 from msg_analysis.common.text import counted, percent
 
 if TYPE_CHECKING:
-    from msg_analysis.inference.messages import UnheardMessages
+    from msg_analysis.inference.timing import LostMessages
 
 
 MOST_Z = 5.0  # of the packets that a pair lost; by chance, any of 1000 pairs is beyond it in 0.06 % of all runs
@@ -33,7 +33,7 @@ SHOWN_PAIRS = 3
 
 
 def channel_findings(
-    channel: Mapping[str, Any], unheard: UnheardMessages | None = None, period_ms: float | None = None
+    channel: Mapping[str, Any], unheard: LostMessages | None = None, period_ms: float | None = None
 ) -> list[str]:
     """Sentences about ``channel``, as in the result of a run, and about the messages of its log in real time."""
     pairs = channel["pairs"]
@@ -75,7 +75,7 @@ def _unlike_the_file(pair: Mapping[str, Any]) -> str | None:
     )
 
 
-def _messages(channel: Mapping[str, Any], unheard: UnheardMessages) -> str:
+def _messages(channel: Mapping[str, Any], unheard: LostMessages) -> str:
     """Why messages were not heard in time: the losses of the experiment, those of the channel, and the rest."""
     host = {agent - 1: name for name, host in channel["hosts"].items() for agent in host["agents"]}
     losses = {(pair["sender"], pair["receiver"]): pair["loss"] for pair in channel["pairs"]}

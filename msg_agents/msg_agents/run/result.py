@@ -283,14 +283,14 @@ def conclude(result: RunResult, report: ReportWhen = "always") -> None:
     """
     if result.trajectory is None or result.bag is None:
         return
-    from msg_analysis.inference.verdict import compare
+    from msg_analysis.inference.pool import compare
 
     comparison = compare(result.trajectory)
     if result.channel is not None and comparison.timing is not None:
         from msg_agents.channel.process import channel_findings
 
         timing = comparison.timing
-        result.channel["findings"] = channel_findings(result.channel, timing.unheard, timing.period_ms)
+        result.channel["findings"] = channel_findings(result.channel, timing.lost_messages, timing.period_ms)
     if report == "always" or (report == "on-failure" and comparison.verdict != "agrees"):
         from msg_analysis.report.page import write_report
 

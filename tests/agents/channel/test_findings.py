@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from msg_agents.channel.process import channel_findings
-from msg_analysis.inference.messages import UnheardMessages
+from msg_analysis.inference.timing import LostMessages
 
 
 def pair(sender: str, receiver: str, **changes: Any) -> dict[str, Any]:
@@ -21,11 +21,11 @@ def channel(*pairs: dict[str, Any], overflowed: int = 0, late: float = 0.1) -> d
     return {"hosts": hosts, "pairs": list(rows), "overflowed": overflowed, "late_ms": {"mean": late, "max": 9.0}}
 
 
-def unheard(between_hosts: int, on_one_host: int = 0, probability: float = 0.0) -> UnheardMessages:
+def unheard(between_hosts: int, on_one_host: int = 0, probability: float = 0.0) -> LostMessages:
     """10,000 messages on each of the links 1 to 2 and 1 to 3."""
     links = np.array([[1, 0], [2, 0]])
     lost = np.array([on_one_host, between_hosts])
-    return UnheardMessages(links, np.array([10_000, 10_000]), lost, np.full(2, probability), 1.0)
+    return LostMessages(links, np.array([10_000, 10_000]), lost, np.full(2, probability), 1.0)
 
 
 def test_a_channel_that_does_what_its_file_says() -> None:

@@ -13,7 +13,7 @@ from msg_agents.watch.observer import BLOCK, CheckpointReader, RunObserver
 from msg_analysis.arithmetic.update_law import to_payload
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.online_steps import StateLog
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.pool import compare
 from msg_analysis.messages.messages import StateCodec
 from msg_analysis.messages.topics import agent_node_name
 from msg_analysis.model.reception import LOST, neighbour_tables

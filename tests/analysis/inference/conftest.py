@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from msg_analysis.inference import pool, verdict
+from msg_analysis.inference import verdict
 from msg_analysis.theory.prediction import predict
 
 SCRIPT = Path(__file__).parents[3] / "benchmarks" / "late_timers.py"
@@ -37,5 +37,4 @@ def predicted_once(monkeypatch):
             assert known[key].fourth_moment  # computed once, as what the copies keep
         return known[key].for_run(experiment)
 
-    for module in (verdict, pool):
-        monkeypatch.setattr(module, "predict", prediction)
+    monkeypatch.setattr(verdict, "predict", prediction)

@@ -98,9 +98,9 @@ def test_blame(case):
     result = compare(run(claimed | change, claimed))
     assert (result.verdict, result.exit_code) == ("disagrees", 1)
     special = [test for test in result.tests if "error" not in test.name and test.name != "covariance"]
-    assert min(special, key=lambda test: test.p).name.removeprefix("innovations: ") == found_by
-    first = result.blame[0]
-    assert (first.kind, first.agent, first.link, first.graph) == said, [cause.words for cause in result.blame]
+    assert min(special, key=lambda test: test.p).name.removeprefix("residuals: ") == found_by
+    first = result.causes[0]
+    assert (first.kind, first.agent, first.link, first.graph) == said, [cause.words for cause in result.causes]
     low, high = first.interval
     assert low < first.estimate < high
     assert abs(first.estimate - truth) < 2.05 * (high - low) / 2
@@ -111,7 +111,7 @@ def test_blame(case):
 def test_a_frozen_agent_is_the_only_cause():
     """What follows from it, in gains and noise, is not listed."""
     still = weaker(0.0, receiver=3) | noise(process=[1.0, 1.0, 0.0, 1.0])
-    (cause,) = compare(run(BASE | still, BASE)).blame
+    (cause,) = compare(run(BASE | still, BASE)).causes
     assert (cause.kind, cause.agent, cause.estimate, cause.p) == ("frozen", 3, 1.0, 0.0)
     assert cause.words == "agent 3 does not move in any of its steps, although it has noise"
 
@@ -119,14 +119,14 @@ def test_a_frozen_agent_is_the_only_cause():
 def test_an_agent_that_freezes_for_a_while():
     trajectory = run(BASE, BASE)
     trajectory.states[400:500, 1] = trajectory.states[400, 1]
-    first = compare(trajectory).blame[0]
+    first = compare(trajectory).causes[0]
     assert (first.kind, first.agent) == ("frozen", 2)
     assert first.estimate == pytest.approx(99 / 1000)
 
 
 def test_two_faults_are_both_found():
     both = noise(process=[1.0, 1.1, 1.0, 1.0]) | weaker(0.6, sender=2, receiver=3)
-    causes = compare(run(BASE | both, BASE)).blame
+    causes = compare(run(BASE | both, BASE)).causes
     assert {(cause.kind, cause.agent, cause.link) for cause in causes} == {("noise", 2, None), ("gain", None, (2, 3))}
 
 
@@ -136,7 +136,7 @@ def test_copied_noise_is_named():
     trajectory.record.start[:] = trajectory.record.start[:, :1]
     result = compare(trajectory)
     assert result.verdict == "disagrees"
-    assert any("is correlated" in cause.words or cause.kind != "unknown" for cause in result.blame)
+    assert any("is correlated" in cause.words or cause.kind != "unknown" for cause in result.causes)
 
 
 def test_a_forbidden_jump():
@@ -150,7 +150,7 @@ def test_a_forbidden_jump():
         "run": {"duration": 300, "replicas": 1, "seed": 2},
     }
     truth = discrete | {"switching": {"transition": [[0.5, 0.4, 0.1], [0.3, 0.4, 0.3], [0.0, 0.5, 0.5]]}}
-    causes = compare(run(truth, discrete)).blame
+    causes = compare(run(truth, discrete)).causes
     assert causes[0].graph == ["line", "star"]
     assert "excludes" in causes[0].words
 

@@ -84,7 +84,7 @@ def test_the_level_holds_where_a_few_sojourns_decide(case):
     results = [compare(simulate(experiment.with_run(seed=seed))) for seed in range(60)]
     assert_few_alarms(results)
     noisy = case in ("far", "rare")
-    assert all(("system error" in p_values(result)) == noisy for result in results)
+    assert all(("system error, corrected" in p_values(result)) == noisy for result in results)
     assert all(len(result.tests) == (18 if noisy else 1 if case == "without noise" else 10) for result in results)
 
 
@@ -97,7 +97,7 @@ def test_differences_that_are_only_rounding_are_no_evidence():
         run.states[:] = np.nextafter(run.states, random.choice([-np.inf, np.inf], run.states.shape))
         result = compare(run)
         assert result.verdict == "agrees"
-        assert "innovations: common gain" not in p_values(result)
+        assert "residuals: common gain" not in p_values(result)
 
 
 @pytest.mark.usefixtures("predicted_once")
@@ -116,7 +116,7 @@ def test_power_of_the_time_means():
     experiment = golden("line_ring", duration=100, replicas=8)
     result = compare(claimed(simulate(changed(experiment, noise={"process": 1.4})), experiment))
     assert result.system_error.z > 5
-    assert all(node.p_holm < 0.01 for node in result.node_errors)
+    assert all(node.p_adjusted < 0.01 for node in result.node_errors)
     assert result.covariance.p < 1e-6
 
 
@@ -136,7 +136,7 @@ def test_document(short_run):
     assert error["interval"][1] - error["measured"] == pytest.approx(1.959964 * error["standard_error"])
     nodes = document["node_errors"]
     assert sum(node["measured"] for node in nodes) == pytest.approx(error["measured"])
-    assert all(node["p_holm"] >= node["p"] for node in nodes)
+    assert all(node["p_adjusted"] >= node["p"] for node in nodes)
     y = short_run.states[:-1] - short_run.states[:-1].mean(axis=1, keepdims=True)
     np.testing.assert_allclose(
         document["covariance"]["measured"], np.einsum("kir,kjr->ij", y, y) / (500 * 2), atol=1e-12
@@ -217,7 +217,7 @@ def test_agents_that_are_where_no_noise_could_have_put_them():
     trajectory.states[100, 0] += 0.5
     result = compare(trajectory)
     assert result.verdict == "disagrees"
-    assert result.innovations.p_covariance == 0.0
+    assert result.residuals.p_covariance == 0.0
 
 
 @pytest.mark.filterwarnings("error")
@@ -230,7 +230,7 @@ def test_a_number_too_large_to_compute_with_disagrees(name, value):
     states[20, 1, 0] = value
     comparison = compare(dataclasses.replace(run, states=states))
     assert comparison.verdict == "disagrees"
-    assert "innovations: covariance" in {test.name for test in comparison.tests if test.rejected}
+    assert "residuals: covariance" in {test.name for test in comparison.tests if test.rejected}
     json.dumps(comparison.to_json(), allow_nan=False)
 
 
@@ -271,11 +271,11 @@ def test_noise_in_the_wrong_graph_is_found():
     swapped, told = (loud(*noise, duration=200) for noise in ((1.0, 0.3), (0.3, 1.0)))
     comparison = compare(claimed(simulate(swapped), told))
     assert comparison.verdict == "disagrees"
-    assert comparison.innovations.p_covariance < 1e-6
+    assert comparison.residuals.p_covariance < 1e-6
     noisy = np.array(SHARED)
     noisy[2, 2] = 1e-3
     comparison = compare(claimed(simulate(loud(noisy.tolist(), 1.0)), loud(SHARED, 1.0)))
-    assert comparison.innovations.p_covariance == 0.0
+    assert comparison.residuals.p_covariance == 0.0
     assert comparison.verdict == "disagrees"
 
 

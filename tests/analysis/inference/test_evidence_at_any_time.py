@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from experiments import Experiment, Observation, compare, five, observed, predict, simulate
-from msg_analysis.inference.evidence import Evidence, usual_looks
+from msg_analysis.inference.evidence_sums import EvidenceSums, WatchedEvidence, any_time_evidence
 from msg_analysis.inference.observation import spaced_steps
 from msg_analysis.inference.pool import compare_pooled
-from msg_analysis.inference.sequential_questions import ErrorMartingale, kind_weights
-from msg_analysis.inference.sequential_sums import EvidenceSums, WatchedEvidence, any_time_evidence
+from msg_analysis.inference.questions import QUESTIONS, evidence_weights
+from msg_analysis.inference.system_error import ErrorMartingale
+from msg_analysis.inference.verdict import Evidence, usual_analyses
 from msg_analysis.theory import packed_symmetric
 
 
@@ -123,8 +124,8 @@ WEAK = {"line": {"arcs": ARCS}, "ring": {"arcs": [*ARCS, [5, 1, 1.0], [1, 5, 1.0
 def test_faults_are_found_and_named(changes: dict[str, Any], words: str) -> None:
     observation = observed(five(duration=600.0, **changes), five(duration=600.0))
     looks = np.arange(100, observation.steps + 1, 100)
-    found = any_time_evidence(WatchedEvidence.of(observation, looks), 0.01, ["line", "ring"])
-    assert found.disagrees
+    found = any_time_evidence(WatchedEvidence.of(observation, looks), 0.01)
+    assert found.exceeded
     assert found.crossed is not None
     assert found.questions[0][0] == words
 
@@ -148,7 +149,7 @@ def test_what_never_moves_is_infinite_evidence() -> None:
     sums = EvidenceSums(same.prediction, 1)
     sums.add(same, 0, same.steps)
     assert sums.evidence() < 20.0
-    assert "noise" in sums.families()
+    assert "residuals: covariance" in sums.families()
 
 
 @pytest.mark.parametrize(
@@ -211,14 +212,12 @@ def test_runs_together_are_one_game() -> None:
 
 def test_questions_of_single_parts_keep_their_share() -> None:
     """Weights are fixed, of sum 1, and those of the main kinds do not depend on how many others there are."""
-    few = dict(zip(kinds := ["noise", "gains", "switching"], kind_weights(kinds), strict=True))
-    many = dict(zip(kinds := [*kinds, "pair", "system error"], kind_weights(kinds), strict=True))
-    assert few == pytest.approx({"noise": 0.375, "switching": 0.375, "gains": 0.25})
-    assert many == pytest.approx(
-        {"noise": 0.375, "switching": 0.375} | dict.fromkeys(["gains", "pair", "system error"], 1 / 12)
-    )
-    assert kind_weights(["loss"]) == pytest.approx([1.0])
-    assert kind_weights(["gains", "pair"]) == pytest.approx([0.5, 0.5])
+    assert evidence_weights([True, False, True]) == pytest.approx([0.375, 0.25, 0.375])
+    assert evidence_weights([True, False, True, False, False]) == pytest.approx([0.375, 1 / 12, 0.375, 1 / 12, 1 / 12])
+    assert evidence_weights([True]) == pytest.approx([1.0])
+    assert evidence_weights([False, False]) == pytest.approx([0.5, 0.5])
+    names = ["residuals: covariance", "residuals: gains", "switching", "loss"]
+    assert [question.name for question in QUESTIONS if question.main] == names
 
 
 @pytest.mark.parametrize(
@@ -235,7 +234,7 @@ def test_questions_of_single_parts_keep_their_share() -> None:
 def test_one_pass_for_the_tests_and_the_evidence(changes: dict[str, Any]) -> None:
     """In the pass of the innovations the evidence is the same as in a pass of its own."""
     observation = observed(five(duration=40.0, **changes))
-    looks = spaced_steps(observation.steps, usual_looks(observation.steps))
+    looks = spaced_steps(observation.steps, usual_analyses(observation.steps))
     shared, own = Evidence.of(observation, 0.01).watched, WatchedEvidence.of(observation, looks)
     assert shared.steps is not None
     assert own.steps is not None

@@ -8,9 +8,9 @@ import pytest
 from scipy import stats
 
 from experiments import observed, pieces
-from msg_analysis.inference.gains import regressors
-from msg_analysis.inference.residuals import InnovationSums, innovations
-from msg_analysis.inference.switching import simulate_counts, switching_test
+from msg_analysis.inference.counts import simulate_counts, switching_test
+from msg_analysis.inference.regression import regressors
+from msg_analysis.inference.residuals import ResidualSums, residuals
 
 
 def observe(**changes):
@@ -34,9 +34,9 @@ def all_innovations(observation):
 
 
 def test_innovations_are_the_noise_that_was_added(observation):
-    measured = innovations(observation, 0, observation.steps)
+    measured = residuals(observation, 0, observation.steps)
     np.testing.assert_allclose(measured, all_innovations(observation), atol=1e-13)
-    np.testing.assert_array_equal(innovations(observation, 7, 11), measured[7:11])
+    np.testing.assert_array_equal(residuals(observation, 7, 11), measured[7:11])
 
 
 def test_covariance_is_the_corrected_likelihood_ratio(observation):
@@ -48,7 +48,7 @@ def test_covariance_is_the_corrected_likelihood_ratio(observation):
     statistic = n * (np.trace(ratio) - np.log(np.linalg.det(ratio)) - p)
     corrected = statistic * (1 - (2 * p**2 + 3 * p - 1) / (6 * n * (p + 1)))
     expected = stats.chi2.sf(corrected, 6)
-    assert InnovationSums(observation).tests().p_covariance == pytest.approx(expected, rel=1e-9)
+    assert ResidualSums(observation).tests().p_covariance == pytest.approx(expected, rel=1e-9)
 
 
 def test_whiteness_is_the_portmanteau_sum(observation):
@@ -67,7 +67,7 @@ def test_whiteness_is_the_portmanteau_sum(observation):
         pairs = sum(w[k, a, r] * w[k, a, s] for k in range(steps) for r in range(replicas) for s in range(r))
         chi2 += pairs**2 / (steps * 3)
     expected = stats.chi2.sf(chi2, 10 * rank**2 + rank)
-    assert InnovationSums(observation).tests().p_whiteness == pytest.approx(expected, rel=1e-9)
+    assert ResidualSums(observation).tests().p_whiteness == pytest.approx(expected, rel=1e-9)
 
 
 def test_gain_is_the_score_test_written_out(observation):
@@ -87,12 +87,12 @@ def test_gain_is_the_score_test_written_out(observation):
                 for b, (j, _, _) in enumerate(regressors):
                     covariance[a, b] += step.noise[g][i, j] * phi[a] * phi[b]
     expected = stats.chi2.sf(score @ np.linalg.solve(covariance, score), 9)
-    assert InnovationSums(observation).tests().p_gain == pytest.approx(expected, rel=1e-8)
+    assert ResidualSums(observation).tests().p_gain == pytest.approx(expected, rel=1e-8)
 
 
 def test_blocks_change_nothing(observation):
-    whole = InnovationSums(observation).tests()
-    split = InnovationSums(dataclasses.replace(observation, block_numbers=40)).tests()
+    whole = ResidualSums(observation).tests()
+    split = ResidualSums(dataclasses.replace(observation, block_numbers=40)).tests()
     assert split.p_covariance == pytest.approx(whole.p_covariance, rel=1e-9)
     assert split.p_whiteness == pytest.approx(whole.p_whiteness, rel=1e-9)
     assert split.p_gain == pytest.approx(whole.p_gain, rel=1e-9)
@@ -105,39 +105,39 @@ def test_regressors_stay_few(observation, limit, count):
     assert len(terms) == count
     assert rows.shape == (count,)
     assert inputs.shape == (2, count, 4)
-    assert 0.0 < InnovationSums(observation, most_regressors=limit).tests().p_gain < 1.0
+    assert 0.0 < ResidualSums(observation, most_regressors=limit).tests().p_gain < 1.0
 
 
 def test_a_direction_without_noise_must_stand_still():
     quiet = observe(noise={"process": [1.0, 1.0, 0.0]})
-    assert InnovationSums(quiet).tests().p_covariance > 0.001
+    assert ResidualSums(quiet).tests().p_covariance > 0.001
     quiet.states[30, 2, 1] += 1e-4
-    assert InnovationSums(quiet).tests().p_covariance == 0.0
+    assert ResidualSums(quiet).tests().p_covariance == 0.0
 
 
 @pytest.mark.parametrize("tiny", [1e-4, 1e-6, 1e-9])
 def test_hardly_any_noise_is_no_alarm(tiny):
-    assert InnovationSums(observe(noise={"process": [1.0, 1.0, tiny]})).tests().p_covariance > 0.001
+    assert ResidualSums(observe(noise={"process": [1.0, 1.0, tiny]})).tests().p_covariance > 0.001
 
 
 def test_grounded_leaders_have_no_noise():
     leaders = {"agents": [1], "gain": float("inf"), "reference": 2.0}
     grounded = observe(leaders=leaders)
-    tests = InnovationSums(grounded).tests()
+    tests = ResidualSums(grounded).tests()
     assert min(tests.p_covariance, tests.p_whiteness, tests.p_gain) > 0.001
     grounded.states[:, 0] += 0.01
-    assert InnovationSums(grounded).tests().p_covariance == 0.0
+    assert ResidualSums(grounded).tests().p_covariance == 0.0
 
 
 def test_without_noise_there_is_nothing_to_test():
-    tests = InnovationSums(observe(noise={"process": 0.0})).tests()
+    tests = ResidualSums(observe(noise={"process": 0.0})).tests()
     assert (tests.p_covariance, tests.p_whiteness, tests.p_gain) == (None, None, None)
 
 
 def test_replicas_with_the_same_noise_are_found():
     copied = observe()
     copied.states[:] = copied.states[:, :, :1]
-    assert InnovationSums(copied).tests().p_whiteness < 1e-6
+    assert ResidualSums(copied).tests().p_whiteness < 1e-6
 
 
 def path(transition, steps, seed, first=0):

@@ -9,10 +9,10 @@ from p_values import assert_calibrated
 from scipy import stats
 
 from experiments import CORRELATED, TRACKING, Observation, compare, directed, observed, predict, simulate
-from msg_analysis.inference.gains import HeardRegression
-from msg_analysis.inference.messages import loss_test
-from msg_analysis.inference.received_values import HeardValues
-from msg_analysis.inference.residuals import BroadcastSums, InnovationSums, innovations
+from msg_analysis.inference.counts import loss_test
+from msg_analysis.inference.received_values import ReceivedValues
+from msg_analysis.inference.regression import ReceivedRegression
+from msg_analysis.inference.residuals import BroadcastSums, ResidualSums, residuals
 
 AIR = {"broadcast": 0.3, "link": 0.2, "loss": 0.2}
 SEEDS = range(40)
@@ -37,9 +37,9 @@ def test_calibration(case):
     """40 true runs of 400 steps."""
     results = [compare(simulate(CASES[case].with_run(seed=seed))) for seed in SEEDS]
     collected = {test.name for test in results[0].tests}
-    names = {"system error", "covariance", "innovations: covariance", "innovations: gains"}
+    names = {"system error", "covariance", "residuals: covariance", "residuals: gains"}
     assert names <= collected
-    assert ("innovations: whiteness" in collected) == (case != "no process noise")
+    assert ("residuals: whiteness" in collected) == (case != "no process noise")
     assert ("loss" in collected) == (case != "nothing lost")
     assert ("broadcast" in collected) == (case in ("all", "nothing lost", "correlated"))
     assert_calibrated(results)
@@ -64,7 +64,7 @@ def nominal(what):
 @pytest.mark.parametrize("what", [CASES["all"], CASES["correlated"]])
 def test_innovations_are_what_is_left_of_each_step(what):
     observation, trajectory, weights = observed(what), simulate(what), nominal(what)
-    found = innovations(observation, 0, 400, HeardValues.of(observation, 0, 400))
+    found = residuals(observation, 0, 400, ReceivedValues.of(observation, 0, 400))
     for k, g in enumerate(trajectory.modes):
         for i in range(3):
             rest = trajectory.states[k + 1, i] - weights[g][i, i] * trajectory.states[k, i]
@@ -80,11 +80,11 @@ def test_regression_against_a_loop(most):
     """Each difference of each graph; the pull of each agent in each graph; in both graphs together."""
     what = CASES["correlated"]
     observation, trajectory, weights = observed(what), simulate(what), nominal(what)
-    regression = HeardRegression(observation, most)
+    regression = ReceivedRegression(observation, most)
     for first, last in ((0, 150), (150, 400)):
-        reception = HeardValues.of(observation, first, last)
-        regression.add(reception, innovations(observation, first, last, reception))
-    e = innovations(observation, 0, 400, HeardValues.of(observation, 0, 400))
+        reception = ReceivedValues.of(observation, first, last)
+        regression.add(reception, residuals(observation, first, last, reception))
+    e = residuals(observation, 0, 400, ReceivedValues.of(observation, 0, 400))
     process = what.run.dt * np.array(CORRELATED) @ np.array(CORRELATED).T
     links = [(i, j) for g in (0, 1) for i in range(3) for j in range(3) if j != i and weights[g][i, j]]
     size = {400: 3 + len(links) + 2, 12: 9, 8: 6}[most]
@@ -131,9 +131,9 @@ def test_regression_against_a_loop(most):
 
 def test_blocks_change_nothing():
     observation = observed(CASES["correlated"])
-    whole = InnovationSums(observation).tests(), loss_test(observation), BroadcastSums(observation).p_value()
+    whole = ResidualSums(observation).tests(), loss_test(observation), BroadcastSums(observation).p_value()
     observation = dataclasses.replace(observation, block_numbers=70)
-    split = InnovationSums(observation).tests(), loss_test(observation), BroadcastSums(observation).p_value()
+    split = ResidualSums(observation).tests(), loss_test(observation), BroadcastSums(observation).p_value()
     for one, other in zip(whole[:2], split[:2], strict=True):
         for ours, theirs in zip(dataclasses.astuple(other), dataclasses.astuple(one), strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-9)
@@ -148,7 +148,7 @@ def test_agents_that_moved_without_having_heard_anything():
     assert compare(trajectory).verdict == "agrees"
     moved = trajectory.states.copy()
     moved[step + 1 :] += np.array([1e-4, 0.0, 0.0])[:, None]
-    result = InnovationSums(Observation.of(dataclasses.replace(trajectory, states=moved), predict(what))).tests()
+    result = ResidualSums(Observation.of(dataclasses.replace(trajectory, states=moved), predict(what))).tests()
     assert result.p_covariance == 0.0
 
 

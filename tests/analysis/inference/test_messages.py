@@ -15,12 +15,11 @@ from experiments import Observation, compare, line_ring, predict
 from msg_analysis.common import arrays
 from msg_analysis.common.arrays import in_file
 from msg_analysis.inference import pattern_events
-from msg_analysis.inference.event_order import newest_steps, order_events
-from msg_analysis.inference.messages import LossTally, loss_test
-from msg_analysis.inference.period_tables import period_tables
+from msg_analysis.inference.counts import LossTally, loss_test
+from msg_analysis.inference.event_order import newest_steps, order_events, period_tables
 from msg_analysis.inference.realtime_laws import means_in_lockstep, pattern_means
-from msg_analysis.inference.received_values import HeardValues, RepeatedNoise
-from msg_analysis.inference.residuals import innovations
+from msg_analysis.inference.received_values import ReceivedValues, RepeatedNoise
+from msg_analysis.inference.residuals import residuals
 
 AIR = {"broadcast": 0.4, "link": 0.6}
 LATE = {"late": 0.4, "latency": 0.5}
@@ -137,14 +136,14 @@ def test_innovations_are_freed_of_noise_that_is_known(case):
     """Against a Cholesky factor of the covariance of all innovations of an agent."""
     observation = observed(case, duration=12)
     step, steps = observation.step, observation.steps
-    reception = HeardValues.of(observation, 0, steps)
-    e = innovations(observation, 0, steps, reception)
+    reception = ReceivedValues.of(observation, 0, steps)
+    e = residuals(observation, 0, steps, reception)
     parts = []
     repeated = RepeatedNoise.of(observation)
     if repeated is None:
         pytest.skip("every message is used once")
     for first in range(0, steps, 7):  # in blocks
-        piece = HeardValues.of(observation, first, min(first + 7, steps))
+        piece = ReceivedValues.of(observation, first, min(first + 7, steps))
         parts.append(repeated.free(e[first : first + 7], piece))
     freed, variances = (np.concatenate(part) for part in zip(*parts, strict=True))
     for i in range(step.agents):
@@ -180,8 +179,8 @@ def test_right_runs_agree(case):
     )
     found = compare(observation)
     assert found.verdict == "agrees", [test for test in found.tests if test.rejected]
-    names = {test.name for test in found.tests}
-    assert {"system error", "covariance", "innovations: gains", "innovations: whiteness"} <= names
+    names = {test.name.removesuffix(", corrected") for test in found.tests}
+    assert {"system error", "covariance", "residuals: gains", "residuals: whiteness"} <= names
     assert found.system_error.predicted == pytest.approx(found.system_error.measured, rel=0.5)
 
 
@@ -266,7 +265,7 @@ def test_a_link_that_loses_more_is_named(on_loss, burst):
     actual = experiment(noise | {"loss": {"arcs": [links[0], [2, 3, 0.3], links[2]]}}, duration=400, start="zero")
     found = compare(message_run(claimed, 6, actual=actual))
     assert found.verdict == "disagrees"
-    first = next(cause for cause in found.blame if cause.kind == "loss")
+    first = next(cause for cause in found.causes if cause.kind == "loss")
     assert first.link == (2, 3)
     assert first.expected == pytest.approx(0.2)
     assert first.interval[0] < 0.3 < first.interval[1]

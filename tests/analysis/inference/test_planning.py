@@ -10,9 +10,9 @@ import scipy.stats
 
 from experiments import Observation, compare, predict, simulate
 from msg_analysis import Experiment, InputError, NotAvailableError
+from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.fault_power import Fault, FaultPower, StepInformation, fault_powers
 from msg_analysis.inference.sample_size import REPLICAS
-from msg_analysis.inference.sequential_sums import EvidenceSums
 from msg_analysis.inference.statistics import needed_noncentrality, noncentral_chi2_tail, simultaneous_half_width
 from msg_analysis.inference.time_means import time_means
 
@@ -104,7 +104,7 @@ def powers(experiment: Experiment, *faults: Fault) -> list[FaultPower]:
 
 def test_noise_is_the_divergence_of_normal_laws() -> None:
     (found,) = powers(line_ring(replicas=3), Fault("noise", 1.1))
-    assert found.tests == [StepInformation("innovations: covariance", 15, pytest.approx(3 * (0.1 - math.log(1.1))))]
+    assert found.tests == [StepInformation("residuals: covariance", 15, pytest.approx(3 * (0.1 - math.log(1.1))))]
     x = scipy.stats.chi2.isf(0.01 / 20, 15)
     assert found.level == pytest.approx(0.01 / 20)
     assert found.power(5000) == pytest.approx(scipy.stats.ncx2.sf(x, 15, 15000 * (0.1 - math.log(1.1))), rel=1e-6)
@@ -123,8 +123,8 @@ def test_gains_have_the_information_of_a_run() -> None:
     assert (found.agent, found.sender) in {(0, 4), (4, 0)}  # only the ring has this link
     by_name = {test.name: test for test in found.tests}
     measured = sums.total.link_information[0, 0, 4] + sums.total.link_information[0, 4, 0]
-    assert run.steps * by_name["innovations: gains"].noncentrality == pytest.approx(0.125 * measured, rel=0.05)
-    assert by_name["innovations: gains"].dof == 5 + 8 + 10
+    assert run.steps * by_name["residuals: gains"].noncentrality == pytest.approx(0.125 * measured, rel=0.05)
+    assert by_name["residuals: gains"].dof == 5 + 8 + 10
     x, ring = run.states[:-1], run.modes == 1
     line = 0.05 * (x[:, :-1] - x[:, 1:])
     pulls = np.zeros_like(x)
@@ -135,7 +135,7 @@ def test_gains_have_the_information_of_a_run() -> None:
     pulls[:, 4] -= closing
     shift = 0.5 * (closing * pulls[:, 0]).sum()
     expected = shift**2 / (pulls**2).sum() / 0.05
-    assert run.steps * by_name["innovations: common gain"].noncentrality == pytest.approx(expected, rel=0.05)
+    assert run.steps * by_name["residuals: common gain"].noncentrality == pytest.approx(expected, rel=0.05)
 
 
 def test_rates_have_the_divergence_of_the_chains() -> None:

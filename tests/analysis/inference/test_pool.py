@@ -9,11 +9,11 @@ from scipy import stats
 
 from experiments import claimed, compare, cut, observed, pieces, simulate
 from msg_analysis.errors import InputError
-from msg_analysis.inference.evidence import Evidence
+from msg_analysis.inference.counts import Transitions
 from msg_analysis.inference.pool import compare_pooled
-from msg_analysis.inference.residuals import innovations
+from msg_analysis.inference.residuals import residuals
 from msg_analysis.inference.statistics import quadratic_form
-from msg_analysis.inference.switching import Transitions
+from msg_analysis.inference.verdict import Evidence
 
 
 def law(process=(1.0, 0.5, 2.0), **air):
@@ -58,14 +58,14 @@ def test_innovations_are_added_up(three):
     """Covariance and gains of all innovations put one after the other."""
     pooled = compare_pooled(three)
     observations = [observed(run) for _, run in three]
-    e = np.concatenate([innovations(one, 0, one.steps) for one in observations])
+    e = np.concatenate([residuals(one, 0, one.steps) for one in observations])
     whitened = np.einsum("i,kir->kri", 1 / np.sqrt(np.diag(observations[0].step.noise[0])), e).reshape(-1, 3)
     n, scatter = len(whitened), whitened.T @ whitened / len(whitened)
     statistic = n * (np.trace(scatter) - np.log(np.linalg.det(scatter)) - 3) * (1 - 26 / (24 * n))
-    assert pooled.innovations.p_covariance == pytest.approx(stats.chi2.sf(statistic, 6), rel=1e-8)
-    sums = [Evidence.of(one, 0.01).innovations for one in observations]
+    assert pooled.residuals.p_covariance == pytest.approx(stats.chi2.sf(statistic, 6), rel=1e-8)
+    sums = [Evidence.of(one, 0.01).residuals for one in observations]
     chi2, dof = quadratic_form(sum(s.score for s in sums), sum(s.covariance for s in sums))
-    assert pooled.innovations.p_gain == pytest.approx(stats.chi2.sf(chi2, dof))
+    assert pooled.residuals.p_gain == pytest.approx(stats.chi2.sf(chi2, dof))
 
 
 def test_runs_alike_is_cochrans_q(three):
@@ -107,8 +107,8 @@ def test_a_fault_that_one_run_does_not_show():
     assert compare(found[0][1]).verdict == "agrees"
     pooled = compare_pooled(found)
     assert pooled.verdict == "disagrees"
-    assert (pooled.blame[0].kind, pooled.blame[0].agent) == ("noise", None)
-    assert pooled.blame[0].interval[0] < 1.05 < pooled.blame[0].interval[1]
+    assert (pooled.causes[0].kind, pooled.causes[0].agent) == ("noise", None)
+    assert pooled.causes[0].interval[0] < 1.05 < pooled.causes[0].interval[1]
 
 
 def test_paths_start_anew_in_every_run():
@@ -130,7 +130,7 @@ def test_incomplete_runs_are_named(three):
         ("stump", 0, False),
     ]
     assert pooled.steps == 549
-    assert pooled.blame == []
+    assert pooled.causes == []
     stumps = compare_pooled([(f"stump {i}", cut(run, 20)) for i, (_, run) in enumerate(three)])
     assert (stumps.verdict, stumps.system_error.measured) == ("incomplete", None)
     json.dumps(stumps.to_json(), allow_nan=False)

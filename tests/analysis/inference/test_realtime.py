@@ -12,9 +12,9 @@ from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK, Stream, normal
 from msg_analysis.common.text import percent
 from msg_analysis.errors import InputError
 from msg_analysis.inference.event_order import order_events
-from msg_analysis.inference.gains import HeardRegression
-from msg_analysis.inference.received_values import HeardValues, process_noise
-from msg_analysis.inference.residuals import InnovationSums, innovations
+from msg_analysis.inference.received_values import ReceivedValues, process_noise
+from msg_analysis.inference.regression import ReceivedRegression
+from msg_analysis.inference.residuals import ResidualSums, residuals
 from msg_analysis.inference.timing import measure_timing
 from msg_analysis.model.phases import phases
 
@@ -69,9 +69,9 @@ def test_innovations_are_the_noise_that_was_added(late_timers, case):
     assert (graphs != trajectory.modes[:, None]).mean() > 0.05
     assert (trajectory.used == -1).any()
     observation = observed(trajectory)
-    found = innovations(observation, 0, 400, HeardValues.of(observation, 0, 400))
+    found = residuals(observation, 0, 400, ReceivedValues.of(observation, 0, 400))
     np.testing.assert_allclose(found, drawn_noise(what, graphs), atol=1e-12)
-    part = innovations(observation, 120, 130, HeardValues.of(observation, 120, 130))
+    part = residuals(observation, 120, 130, ReceivedValues.of(observation, 120, 130))
     np.testing.assert_array_equal(part, found[120:130])
 
 
@@ -91,14 +91,14 @@ def test_noise_by_graph_is_tested_of_late_agents(late_timers):
 
 def noise_tests(run):
     seen = observed(run)
-    return InnovationSums(seen, order_events(seen).position).tests()
+    return ResidualSums(seen, order_events(seen).position).tests()
 
 
 def test_lockstep_is_the_same_with_or_without_a_log_of_it(late_timers):
     """A log that says that all of step k was used gives what is tested in lockstep."""
     what = experiment(run={"pace": "lockstep"}, noise={"process": CORRELATED})
     trajectory = simulate(what)
-    plain = InnovationSums(Observation.of(trajectory, predict(what))).tests()
+    plain = ResidualSums(Observation.of(trajectory, predict(what))).tests()
     model = predict(what).step
     used = np.full((400, 3, model.most_neighbours), -1)
     for k, g in enumerate(trajectory.modes):
@@ -110,7 +110,7 @@ def test_lockstep_is_the_same_with_or_without_a_log_of_it(late_timers):
         trajectory, record=dataclasses.replace(trajectory.record, experiment=what.with_run(pace="realtime")),
         agent_modes=graphs, used=used, made=made,
     )  # fmt: skip
-    found = InnovationSums(observed(logged)).tests()
+    found = ResidualSums(observed(logged)).tests()
     found, plain = dataclasses.asdict(found), dataclasses.asdict(plain)
     assert found.pop("ratios") == pytest.approx(plain.pop("ratios"), rel=1e-6)
     assert found == pytest.approx(plain, rel=1e-6)
@@ -121,11 +121,11 @@ def test_regression_frees_innovations_of_those_made_before(late_timers):
     what = CASES["noise by graph"]
     observation = observed(late_timers.run(what, **lateness(late_timers)))
     position, timers, step = order_events(observation).position, observation.timers, observation.step
-    regression = HeardRegression(observation, 400, position)
+    regression = ReceivedRegression(observation, 400, position)
     for first, last in ((0, 150), (150, 400)):
-        reception = HeardValues.of(observation, first, last)
-        regression.add(reception, innovations(observation, first, last, reception), first)
-    e = innovations(observation, 0, 400, HeardValues.of(observation, 0, 400))
+        reception = ReceivedValues.of(observation, first, last)
+        regression.add(reception, residuals(observation, first, last, reception), first)
+    e = residuals(observation, 0, 400, ReceivedValues.of(observation, 0, 400))
     places = {}
     for g in range(2):
         for i in range(3):
@@ -154,8 +154,8 @@ def test_regression_frees_innovations_of_those_made_before(late_timers):
 
 
 IN_DETAIL = [
-    f"innovations: {what}"
-    for what in ("noise by graph", "noise over time", "standing still", "largest", "lags to 100", "stale values")
+    f"residuals: {what}"
+    for what in ("noise by graph", "noise over time", "constant state", "largest", "lags to 100", "stale values")
 ]
 
 
@@ -166,7 +166,7 @@ def test_calibration(late_timers, case):
     runs = [late_timers.run(CASES[case].with_run(seed=seed), timing_seed=seed, **late) for seed in range(30)]
     results = [compare(run) for run in runs]
     names = ["system error", *(f"error of agent {i}" for i in (1, 2, 3)), "covariance"]
-    names += [f"innovations: {what}" for what in ("covariance", "whiteness", "gains", "common gain")]
+    names += [f"residuals: {what}" for what in ("covariance", "whiteness", "gains", "common gain")]
     # Noise that is correlated may be part of the values that are used: then no test of these.
     detail = IN_DETAIL[:-1] if case == "noise by graph" else IN_DETAIL
     assert [test.name for test in results[0].tests] == [*names, "switching", *detail]
@@ -219,8 +219,8 @@ def other_gain(factor):
 @pytest.mark.parametrize(
     ("truth", "found_by"),
     [
-        (other_gain(0.8), "innovations: gains"),
-        (lambda model: dataclasses.replace(model, noise_gain=1.1 * model.noise_gain), "innovations: covariance"),
+        (other_gain(0.8), "residuals: gains"),
+        (lambda model: dataclasses.replace(model, noise_gain=1.1 * model.noise_gain), "residuals: covariance"),
     ],
 )
 def test_power_on_a_late_machine(late_timers, truth, found_by):
@@ -242,7 +242,7 @@ def test_what_is_said_to_be_used_but_was_not(late_timers):
     used = np.where(trajectory.used >= 0, np.arange(4000)[:, None, None], -1)
     result = compare(dataclasses.replace(trajectory, used=used))
     assert result.verdict == "disagrees"
-    assert any(test.rejected and test.name.startswith("innovations") for test in result.tests)
+    assert any(test.rejected and test.name.startswith("residuals") for test in result.tests)
 
 
 def test_clocks_that_disagree_leave_the_innovations(late_timers):
@@ -252,7 +252,7 @@ def test_clocks_that_disagree_leave_the_innovations(late_timers):
     result = compare(dataclasses.replace(trajectory, made=made))
     assert result.verdict == "agrees"
     tests = [test.name for test in result.tests]
-    names = [f"innovations: {what}" for what in ("covariance", "whiteness", "gains", "common gain")]
+    names = [f"residuals: {what}" for what in ("covariance", "whiteness", "gains", "common gain")]
     assert tests == [*names, "switching", *IN_DETAIL]
     document = result.to_json()
     assert document["law"] == "sequential"

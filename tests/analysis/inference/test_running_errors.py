@@ -46,7 +46,7 @@ def errors_from_zero(experiment: Experiment, steps: int) -> list[float]:
 
 
 def numbers(*found: Estimate) -> np.ndarray:
-    rows = [[e.measured, e.predicted, e.standard_error, e.z, e.p, e.p_holm] for e in found]
+    rows = [[e.measured, e.predicted, e.standard_error, e.z, e.p, e.p_adjusted] for e in found]
     return np.array(rows, dtype=float)
 
 

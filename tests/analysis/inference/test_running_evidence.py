@@ -9,9 +9,9 @@ import pytest
 from experiments import Experiment, Observation, RunRecord, compare, five, predict, simulate
 from msg_analysis.inference import online_errors, online_evidence
 from msg_analysis.inference.estimates import Estimate
+from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.online_errors import LiveEstimate, LiveReport, precision_words, reached
-from msg_analysis.inference.online_evidence import AnyTime, HeardEvidence, RunningEvidence, supports
-from msg_analysis.inference.sequential_sums import EvidenceSums
+from msg_analysis.inference.online_evidence import AnyTime, ReceivedEvidence, RunningEvidence, supports
 from msg_analysis.inference.statistics import RunningBatches, simultaneous_half_width, steps_to_half_width
 from msg_analysis.model.run_record import Until
 
@@ -40,7 +40,7 @@ def test_is_the_sum_over_the_whole_run(pieces: int, missing: bool) -> None:
         )
         expected.add(part, 0, end - first - (end < 2000))
     assert seen.sums.total.counts.tolist() == expected.total.counts.tolist()
-    assert seen.look(None).log_evidence == pytest.approx(expected.evidence(), abs=1e-9)
+    assert seen.report(None).log_evidence == pytest.approx(expected.evidence(), abs=1e-9)
 
 
 def test_what_the_states_alone_do_not_give() -> None:
@@ -50,7 +50,7 @@ def test_what_the_states_alone_do_not_give() -> None:
         with pytest.raises(ValueError, match="do not give the evidence"):
             RunningEvidence(prediction, 2)
     with pytest.raises(ValueError, match="the states alone give the evidence"):
-        HeardEvidence(predict(experiment()), 2)
+        ReceivedEvidence(predict(experiment()), 2)
 
 
 @pytest.mark.parametrize("changes", [{}, {"noise": {"loss": 0.1}}], ids=["plain", "loss"])
@@ -75,7 +75,7 @@ def test_the_last_step_of_a_run_that_ends_early() -> None:
     observation = Observation.of(run, prediction)
     expected.add(Observation(prediction, observation.states[:1501], run.modes[:1500], run.states[0]), 0, 1500)
     assert seen.count == 1500
-    assert seen.look(None).log_evidence == pytest.approx(expected.evidence(), abs=1e-9)
+    assert seen.report(None).log_evidence == pytest.approx(expected.evidence(), abs=1e-9)
     later = np.arange(1500, 1600)
     seen.add(later, run.modes[later], run.states[later], run.states[later + 1])
     assert seen.count == 1500

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from experiments import claimed, directed, observed, predict, simulate
-from msg_analysis.inference.messages import unheard_messages
-from msg_analysis.inference.timing import measure_timing
+from msg_analysis.inference.timing import lost_messages, measure_timing
 from msg_analysis.model.reception import Losses
 
 
@@ -46,9 +45,9 @@ def by_hand(trajectory, receiver, sender):
 
 
 def test_with_ideal_timers_every_message_is_heard():
-    found = unheard_messages(observed(simulate(experiment())))
+    found = lost_messages(observed(simulate(experiment())))
     assert found.messages.min() > 500
-    assert found.unheard.sum() == 0
+    assert found.lost.sum() == 0
     assert found.words() is None
 
 
@@ -56,43 +55,43 @@ def test_with_ideal_timers_every_message_is_heard():
 def test_lost_messages_are_those_that_were_drawn(on_loss):
     """|z| < 4: false-alarm rate 6e-5 for each of the two."""
     trajectory = simulate(experiment(100, loss=0.2, on_loss=on_loss))
-    found = unheard_messages(observed(trajectory))
+    found = lost_messages(observed(trajectory))
     share, (low, high), expected = found.share()
     assert expected == pytest.approx(0.2)
     assert abs(share - 0.2) < 4 * np.sqrt(0.2 * 0.8 / found.messages.sum())
     assert low < share < high
     assert found.words() is None
-    for (receiver, sender), messages, unheard in zip(found.links.tolist(), found.messages, found.unheard, strict=True):
+    for (receiver, sender), messages, unheard in zip(found.links.tolist(), found.messages, found.lost, strict=True):
         assert (messages, unheard) == by_hand(trajectory, receiver, sender)
 
 
 def test_of_a_link_that_is_always_there_the_lost_ones_are_found():
     """Message by message, in the order of the twin's draws."""
     what = experiment(100, loss={"arcs": [[2, 3, 0.3]]}, on_loss="hold")
-    found = unheard_messages(observed(simulate(what)))
+    found = lost_messages(observed(simulate(what)))
     place = found.links.tolist().index([2, 1])
     lost = np.concatenate([Losses(what).block(2, 1, number) for number in range(4)])[:1000]
     # The first two and the last two may not be judged.
     assert found.messages[place] >= 996
-    assert abs(found.unheard[place] - lost.sum()) <= 4
-    assert found.unheard.sum() == found.unheard[place]
+    assert abs(found.lost[place] - lost.sum()) <= 4
+    assert found.lost.sum() == found.lost[place]
 
 
 @pytest.mark.parametrize("delay", [1, 2])
 def test_what_the_experiment_delays_is_not_late(delay):
-    found = unheard_messages(observed(simulate(experiment(40, delay=delay))))
+    found = lost_messages(observed(simulate(experiment(40, delay=delay))))
     assert found.messages.min() > 50
-    assert found.unheard.sum() == 0
+    assert found.lost.sum() == 0
 
 
 def test_other_losses_are_put_into_words():
     """That the experiment does not have, and that were not made."""
     trajectory = claimed(simulate(experiment(loss={"arcs": [[2, 3, 0.3]]}, on_loss="hold")), experiment())
-    words = unheard_messages(observed(trajectory)).words()
+    words = lost_messages(observed(trajectory)).words()
     assert "while the experiment loses 0 %: the network lost them or was late" in words
     assert words.endswith("% of those from agent 2 to agent 3")
     trajectory = claimed(simulate(experiment()), experiment(loss=0.2, on_loss="hold"))
-    words = unheard_messages(observed(trajectory)).words()
+    words = lost_messages(observed(trajectory)).words()
     assert words.startswith("0 % (0 to ")
     assert "while the experiment loses 20 %: the experiment's losses were not made" in words
 
@@ -101,9 +100,9 @@ def test_late_agents_and_messages(late_timers):
     """Receivers that are late have not missed what came twice in their period; slow messages are overtaken."""
     what = experiment(40)
     punctual = late_timers.run(what)
-    assert unheard_messages(observed(punctual)).unheard.sum() == 0
+    assert lost_messages(observed(punctual)).unheard.sum() == 0
     slow = late_timers.run(what, slow=late_timers.busy(0.5, 2.5), late=late_timers.busy(0.3, 1.5))
-    found = unheard_messages(observed(slow))
+    found = lost_messages(observed(slow))
     assert found.unheard.sum() > 0
     for (receiver, sender), messages, unheard in zip(found.links.tolist(), found.messages, found.unheard, strict=True):
         assert (messages, unheard) == by_hand(slow, receiver, sender)

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.experiment.spec import json_schema
 from msg_analysis.experiment.problems import ExperimentError
-from msg_analysis.experiment.spec import ExperimentSpec
+from msg_analysis.experiment.spec import ExperimentSpec, json_schema
 
 ROOT = Path(__file__).parents[3]
 EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"

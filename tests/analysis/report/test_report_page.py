@@ -16,10 +16,10 @@ import pytest
 from experiments import Completeness, Run, RunRecord, compare, late, line_ring, simulate
 from msg_analysis import Experiment, InputError
 from msg_analysis.inference.comparison import Comparison
-from msg_analysis.inference.comparison import Test as FamilyTest
+from msg_analysis.inference.counts import SwitchingTest
 from msg_analysis.inference.estimates import CovarianceTest, Estimate
-from msg_analysis.inference.residuals import InnovationTests
-from msg_analysis.inference.switching import SwitchingTest
+from msg_analysis.inference.question import Test as FamilyTest
+from msg_analysis.inference.residuals import ResidualTests
 from msg_analysis.report import page as report_page
 from msg_analysis.report.list_pages import render_runs, write_runs_page
 from msg_analysis.report.page import render, write_report
@@ -95,7 +95,7 @@ def _comparison(trajectory: Run) -> Comparison:
         system_error=Estimate(1.234567, 1.3, 0.05, -1.31, 0.19),
         node_errors=nodes,
         covariance=CovarianceTest(covariance, covariance * 1.01, 9.0, 10, 0.53),
-        innovations=InnovationTests(0.5, 0.5, None),
+        innovations=ResidualTests(0.5, 0.5, None),
         switching=SwitchingTest(np.array([[7, 1], [2, 9]]), np.array([[6.5, 1.5], [2.5, 8.5]]), 0.7),
         continuous_error=1.25,
         batch=(1.1, 1.4),

@@ -1,39 +1,110 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Diagnostics of the noise: by graph, and over time."""
+"""Questions about the size of the noise: in all steps, by graph, over time, and of single residuals."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Self
 
 import numpy as np
 
 from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.inference.candidates import Cause, Selected, numbers_text
 from msg_analysis.inference.dependence import LagSums, lag_evidence
-from msg_analysis.inference.diagnostics import Block, Departure, Finding, Law, Place, Question
 from msg_analysis.inference.e_values import (
     EndedWindows,
+    EventEvidence,
     WindowEvidence,
     Windows,
     log_mean,
     variance_constant,
     variance_evidence,
 )
-from msg_analysis.inference.statistics import log_chi2_below, log_chi2_tail, normal_score
+from msg_analysis.inference.question import (
+    Block,
+    Diagnostic,
+    Finding,
+    Law,
+    Place,
+    Question,
+    RunningSums,
+    Search,
+    Statistics,
+    Test,
+    one_test,
+)
+from msg_analysis.inference.statistics import log_chi2_below, log_chi2_tail, log_normal_tail, normal_score
 
 
-class NoiseByGraph(Departure):
-    """Squares of standardised innovations by graph and agent, and of all agents together where these are independent.
+class Noise(Question):
+    """Whether the covariance of the residuals is that of the noise."""
+
+    name = "residuals: covariance"
+    meaning = "the noise of some agents is larger, smaller, or correlated otherwise than in the file"
+    main = True
+
+    @classmethod
+    def tests(cls, run: Statistics) -> list[Test]:
+        """Of the whole covariance."""
+        return one_test(cls.name, run.residuals.p_covariance)
+
+    def evidence(self, sums: RunningSums) -> FloatArray:
+        """One row for each agent whose noise is known to be independent over time."""
+        agents = np.flatnonzero(self.law.noisy)
+        return variance_evidence(sums.samples[:, agents], sums.squares[:, agents])
+
+    def about(self, row: int) -> str:
+        """An agent."""
+        return f"noise of agent {np.flatnonzero(self.law.noisy)[row] + 1}"
+
+    @classmethod
+    def classes(cls, search: Search) -> int:
+        """Agents, graphs, agents in graphs, all."""
+        return len(search.any_noise.classes) if search.any_noise else 0
+
+    @classmethod
+    def causes(cls, search: Search) -> list[Cause]:
+        """Variances that explain the squares of the residuals."""
+        return [_noise_words(one, search.names) for one in search.select(search.noise)]
+
+
+def _noise_words(one: Selected, names: Sequence[str]) -> Cause:
+    part, what = one.part, one.what
+    agent = {"agent": what, "agent in graph": what[0] if part == "agent in graph" else None}.get(part)
+    graph = {"graph": what, "agent in graph": what[1] if part == "agent in graph" else None}.get(part)
+    name = None if graph is None else names[graph]
+    whose = "the noise variance of all agents" if agent is None else f"agent {agent + 1}'s noise variance"
+    where = "" if name is None else f" in graph {name}"
+    factor, interval = math.exp(one.estimate), (math.exp(one.interval[0]), math.exp(one.interval[1]))
+    words = f"{whose}{where} is {numbers_text(factor, interval)} times what the file says"
+    number = None if agent is None else agent + 1
+    return Cause("noise", words, number, None, name, factor, interval, 1.0, math.exp(one.log_p))
+
+
+def _noise_cause(found: Finding, names: Sequence[str], p: float) -> Cause:
+    """A noise variance in one graph, or in some steps."""
+    agent, graph = None if found.agent is None else found.agent + 1, None if found.graph is None else names[found.graph]
+    when = found.place.words if found.place else f"in graph {graph}"
+    value, interval = found.estimate or 0.0, found.interval
+    words = f"the noise variance of {found.whose} is {numbers_text(value, interval)} times what the file says {when}"
+    return Cause("noise", words, agent, None, graph, value, interval, found.expected, p, found.steps)
+
+
+class NoiseByGraph(Diagnostic):
+    """Squares of standardised residuals by graph and agent, and of all agents together where these are independent.
 
     Each sum is chi-square; the test is two-sided, with the number of sums as a factor (Bonferroni).
     """
 
-    test = "innovations: noise by graph"
+    name = "residuals: noise by graph"
+    meaning = "the size of the noise is wrong under some graph"
 
     def __init__(self, law: Law) -> None:
+        super().__init__(law)
         n, m = law.step.modes, law.step.agents
         self._agents, self._together = np.flatnonzero(law.noisy), law.apart and law.noisy.sum() > 1
         self._graphs = n
@@ -41,10 +112,10 @@ class NoiseByGraph(Departure):
 
     def add(self, block: Block) -> FloatArray:
         """Every agent by the graph that it used."""
-        size, looks = (block.white**2).sum(axis=2), block.looks
+        size, analyses = (block.white**2).sum(axis=2), block.analyses
         there = [block.reception.graphs == graph for graph in range(self._graphs)]
-        samples = np.stack([looks.counts(each) for each in there], axis=1) * block.white.shape[2]  # (T, n, m)
-        squares = np.stack([looks.sums(size * each) for each in there], axis=1)
+        samples = np.stack([analyses.counts(each) for each in there], axis=1) * block.white.shape[2]  # (T, n, m)
+        squares = np.stack([analyses.sums(size * each) for each in there], axis=1)
         samples, squares = self.samples + samples.cumsum(axis=0), self.squares + squares.cumsum(axis=0)
         self.samples, self.squares = samples[-1], squares[-1]
         return self._evidence(samples, squares)
@@ -68,7 +139,6 @@ class NoiseByGraph(Departure):
         graph, agent = self._cell(row)
         ratio = float(squares[row] / samples[row])
         return Finding(
-            self.test,
             min(0.0, log_p + math.log(2.0 * len(cells))),
             agent=agent,
             graph=graph,
@@ -77,7 +147,7 @@ class NoiseByGraph(Departure):
             expected=1.0,
         )
 
-    def evidence(self) -> FloatArray:
+    def logarithms(self) -> FloatArray:
         """(cells, K)."""
         return self._evidence(self.samples, self.squares)
 
@@ -87,13 +157,10 @@ class NoiseByGraph(Departure):
             return np.empty((*samples.shape[:-2], 0, 1))
         return variance_evidence(self._rows(samples.astype(float)), self._rows(squares))
 
-    def questions(self) -> list[Question]:
+    def about(self, row: int) -> str:
         """Noise of an agent, or of all, in a graph."""
-        cells = [self._cell(row) for row in range(len(self._rows(self.squares)))]
-        return [
-            (f"noise of {'all agents' if agent is None else f'agent {agent + 1}'} in graph {{}}", (graph,))
-            for graph, agent in cells
-        ]
+        graph, agent = self._cell(row)
+        return f"noise of {'all agents' if agent is None else f'agent {agent + 1}'} in graph {self.law.graphs[graph]}"
 
     def _rows(self, sums: FloatArray) -> FloatArray:
         """(..., cells): sums (..., n, m) of every cell, graph by graph the agents, then all of them."""
@@ -107,12 +174,17 @@ class NoiseByGraph(Departure):
         graph, place = divmod(row, len(self._agents) + bool(self._together))
         return graph, int(self._agents[place]) if place < len(self._agents) else None
 
+    @classmethod
+    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+        """A variance in one graph."""
+        return _noise_cause(found, names, p)
+
 
 SHARE = 0.1  # of the logarithm of the p-value
 
 
-class NoiseOverTime(Departure):
-    """Squares of standardised innovations in windows of 1, 2, 4, ... steps, by agent and of all where independent.
+class NoiseOverTime(Diagnostic):
+    """Squares of standardised residuals in windows of 1, 2, 4, ... steps, by agent and of all where independent.
 
     The sum over a window is chi-square. The law of the largest and the smallest is bounded by the union over windows:
     every length has the same share of the level, and within it every window and agent (weighted Bonferroni).
@@ -122,9 +194,11 @@ class NoiseOverTime(Departure):
     chi-square distribution function, which are exactly N(0, 1). Windows and lags have half of the level each.
     """
 
-    test = "innovations: noise over time"
+    name = "residuals: noise over time"
+    meaning = "the size of the noise is wrong in a part of the run, or changes with time"
 
     def __init__(self, law: Law) -> None:
+        super().__init__(law)
         self._agents, self._together = np.flatnonzero(law.noisy), law.apart and law.noisy.sum() > 1
         columns = len(self._agents) + bool(self._together)
         self._columns = columns
@@ -147,18 +221,18 @@ class NoiseOverTime(Departure):
 
     def add(self, block: Block) -> FloatArray:
         """The windows that end in the block."""
-        looks = block.looks
+        analyses = block.analyses
         if not self._columns:
-            return np.empty((looks.count, 0, 1))
+            return np.empty((analyses.count, 0, 1))
         squares = (block.white[:, self._agents] ** 2).sum(axis=2)
         if self._together:
             squares = np.column_stack([squares, squares.sum(axis=1)])
-        lags = lag_evidence(*self._lags.add(normal_score(squares, self._numbers)[:, :, None], looks))
+        lags = lag_evidence(*self._lags.add(normal_score(squares, self._numbers)[:, :, None], analyses))
         ended = self._windows.add(squares)
         self._keep(ended)
         numbers, constant = (np.repeat(each[ended.levels], ended.counts, axis=0) for each in (self._sizes, self._known))
         mixed = log_mean(variance_evidence(numbers, ended.sums, constant), axis=-1)
-        windows = self._evidence.add(ended, mixed, looks)
+        windows = self._evidence.add(ended, mixed, analyses)
         return np.concatenate([windows, _mean_over_lags(lags)], axis=1)[:, :, None]
 
     def _keep(self, ended: EndedWindows) -> None:
@@ -232,7 +306,6 @@ class NoiseOverTime(Departure):
         if lag is None:
             return None
         return Finding(
-            self.test,
             lag.log_p,
             agent=self._agent(lag.column),
             span=(lag.steps, lag.steps),
@@ -257,7 +330,6 @@ class NoiseOverTime(Departure):
         first, numbers = int(self._first[side, level, column]) + 1, int(self._numbers[column] << level)
         ratio = float(self._extreme[side, level, column] / numbers)
         return Finding(
-            self.test,
             log_p,
             agent=self._agent(column),
             place=Place(first, first + (1 << level) - 1, int(self._run[side, level, column])),
@@ -266,20 +338,101 @@ class NoiseOverTime(Departure):
             expected=1.0,
         )
 
-    def evidence(self) -> FloatArray:
+    def logarithms(self) -> FloatArray:
         """(2 (agents + 1), 1): windows, then lags, of each agent and of all together."""
         lags = lag_evidence(self._lags.score, self._lags.information)
         return np.concatenate([self._evidence.logarithms(), _mean_over_lags(lags)])[:, None]
 
-    def questions(self) -> list[Question]:
+    def about(self, row: int) -> str:
         """Noise of an agent, or of all, over time, and next to its own."""
-        whose = [*(f"agent {agent + 1}" for agent in self._agents.tolist()), "all agents"][: self._columns]
-        return [
-            *((f"noise of {who} over time", ()) for who in whose),
-            *((f"size of the noise of {who} and of its own earlier noise", ()) for who in whose),
-        ]
+        lags, column = divmod(row, self._columns)
+        agent = self._agent(column)
+        who = "all agents" if agent is None else f"agent {agent + 1}"
+        return f"size of the noise of {who} and of its own earlier noise" if lags else f"noise of {who} over time"
+
+    @classmethod
+    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+        """A variance in some steps, or one that depends on its own past."""
+        if found.span is None:
+            return _noise_cause(found, names, p)
+        value, interval = found.estimate or 0.0, found.interval
+        words = (
+            f"the size of the noise of {found.whose} has correlation {numbers_text(value, interval)} with its own "
+            f"{found.span[0]} steps before, not 0: its variance changes in time"
+        )
+        agent = None if found.agent is None else found.agent + 1
+        return Cause("noise", words, agent, None, None, value, interval, found.expected, p)
 
 
 def _mean_over_lags(evidence: FloatArray) -> FloatArray:
     """(..., columns): of evidence (..., columns, lags, K)."""
     return log_mean(evidence.reshape(*evidence.shape[:-2], math.prod(evidence.shape[-2:])), axis=-1)
+
+
+LARGE = 4.0  # standard deviations; smaller residuals have the evidence 0
+
+
+class LargestResidual(Diagnostic):
+    """Every residual by itself, N(0, 1) after division by its standard deviation.
+
+    The test is that of the largest, with their number as a factor (Bonferroni). The evidence is the mean over all
+    residuals of a run of that of each one against a larger variance; those to come count 1. Half of the whole always
+    counts 1.
+    """
+
+    name = "residuals: largest"
+    meaning = "a single step is much larger than the noise"
+    subject = "largest residual"
+
+    def __init__(self, law: Law) -> None:
+        super().__init__(law)
+        self._agents = np.flatnonzero(law.noisy)
+        self._evidence = EventEvidence(law.planned * law.replicas * len(self._agents))
+        self._samples = 0
+        self._largest, self._agent, self._place, self._runs = 0.0, 0, Place(0, 0), 1
+
+    def add(self, block: Block) -> FloatArray:
+        """Add the residuals of a block."""
+        white, analyses = block.white[:, self._agents], block.analyses
+        if not white.size:
+            return np.empty((analyses.count, 0, 1))
+        self._samples += white.size
+        sizes = np.abs(white)
+        large = sizes > LARGE
+        logarithms = variance_evidence(np.ones(int(large.sum())), sizes[large] ** 2)[:, 0]
+        seen, when = analyses.lengths * white[0].size, analyses.after(np.nonzero(large)[0])
+        at = int(np.argmax(sizes))
+        if not sizes.flat[at] <= abs(self._largest):  # also a NaN
+            step, place, _ = np.unravel_index(at, white.shape)
+            self._largest, self._agent = float(white.flat[at]), int(self._agents[place])
+            self._place = Place(block.first + int(step) + 1, block.first + int(step) + 1)
+        return self._evidence.add(seen, logarithms, when)[:, None, None]
+
+    def merge(self, other: Self) -> None:
+        """The larger one."""
+        self._evidence.merge(other._evidence)
+        self._samples += other._samples
+        if abs(other._largest) > abs(self._largest):
+            self._largest, self._agent, self._place = other._largest, other._agent, other._place.later(self._runs)
+        self._runs += other._runs
+
+    def finding(self) -> Finding | None:
+        """The largest."""
+        if not self._samples:
+            return None
+        log_p = math.log(2.0 * self._samples) + float(log_normal_tail(abs(self._largest)))
+        return Finding(min(0.0, log_p), agent=self._agent, place=self._place, estimate=self._largest, expected=0.0)
+
+    def logarithms(self) -> FloatArray:
+        """(1, 1)."""
+        return np.array([[self._evidence.logarithm()]]) if self._evidence.planned else np.empty((0, 1))
+
+    @classmethod
+    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+        """An agent in a step."""
+        assert found.place is not None
+        assert found.agent is not None
+        del names
+        value = found.estimate or 0.0
+        words = f"{found.whose}'s noise is {value:.3g} standard deviations {found.place.words}"
+        return Cause("outlier", words, found.agent + 1, None, None, value, None, found.expected, p, found.steps)

@@ -12,7 +12,7 @@ import numpy as np
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.received_values import HeardValues, mode_links, process_noise
+from msg_analysis.inference.received_values import ReceivedValues, mode_links, process_noise
 from msg_analysis.model.reception import neighbour_tables
 from msg_analysis.model.step_model import StepModel
 
@@ -22,7 +22,7 @@ WEIGHT_ROUNDING = 1e-12  # relative to the sum of an agent's weights
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One regressor of the innovations of an agent."""
+    """One regressor of the residuals of an agent."""
 
     # "link": x_j - x_i; "lead": x_i - reference; "pull": the whole pull on the agent
     kind: Literal["constant", "link", "lead", "pull"]
@@ -33,7 +33,7 @@ class Term:
 
 
 class StateRegression:
-    """Score test: the innovations of row i do not depend on what row i of W_g uses; at most ``most`` terms K.
+    """Score test: the residuals of row i do not depend on what row i of W_g uses; at most ``most`` terms K.
 
     The scores U_a = sum_k e_i(a)(k) phi_a(k) are martingales, and Cov(U_a, U_b) = sum_k (N_g)_i(a)i(b) phi_a phi_b
     given the inputs; so U^T Cov^+ U is chi-square with rank(Cov) degrees of freedom, for correlated noise too. All
@@ -53,14 +53,14 @@ class StateRegression:
         """Size of the largest temporary array, per step; 0: not limiting."""
         return 0
 
-    def add(self, modes: IntArray, states: FloatArray, innovations: FloatArray) -> None:
-        """Add a block of steps: graphs (b,) from 0, states x(k) and innovations (b, m, R)."""
+    def add(self, modes: IntArray, states: FloatArray, residuals: FloatArray) -> None:
+        """Add a block of steps: graphs (b,) from 0, states x(k) and residuals (b, m, R)."""
         m = self._step.agents
         z = np.ones((len(modes), m + 1, states.shape[2]))
         z[:, :m] = states - (states.mean(axis=1, keepdims=True) if self._centred else self._step.reference)
         for mode in range(self._step.modes):
             at = np.flatnonzero(modes == mode)
-            flat_e = innovations[at].transpose(1, 0, 2).reshape(m, -1)
+            flat_e = residuals[at].transpose(1, 0, 2).reshape(m, -1)
             flat_z = z[at].transpose(1, 0, 2).reshape(m + 1, -1)
             self._scores[mode] += flat_e @ flat_z.T
             self._inputs[mode] += flat_z @ flat_z.T
@@ -85,7 +85,7 @@ class StateRegression:
 
 
 def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[Term]]:
-    """Regressors of the innovations: phi_a(k) = inputs[g, a] . z(k) for row rows[a].
+    """Regressors of the residuals: phi_a(k) = inputs[g, a] . z(k) for row rows[a].
 
     One for every graph and difference x_j - x_i that row i uses, for every graph and leader (x_i - reference), and for
     every agent (1, which finds a wrong reference or offset). Where these are more than ``most``: the whole pull (W_g x
@@ -106,8 +106,8 @@ def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[T
     n, m = step.modes, step.agents
     terms = [Term("constant", i) for i in range(m)]
     sums = step.weights.sum(axis=2)
-    heard = int(step.links.sum(where=~np.eye(m, dtype=np.bool_)))
-    if m + heard + int((np.abs(1.0 - sums) > WEIGHT_ROUNDING).sum()) <= most:
+    received = int(step.links.sum(where=~np.eye(m, dtype=np.bool_)))
+    if m + received + int((np.abs(1.0 - sums) > WEIGHT_ROUNDING).sum()) <= most:
         for mode in range(n):
             for i in range(m):
                 for j in step.neighbours(mode, i).tolist():
@@ -133,18 +133,18 @@ def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[T
     return np.array([term.agent for term in terms]), inputs, terms
 
 
-class HeardRegression:
-    """Score test: innovations do not depend on what the agents heard, with the weights it was used with.
+class ReceivedRegression:
+    """Score test: residuals do not depend on what the agents received, with the weights it was used with.
 
     As ``gain_regression.StateRegression``, but row i uses the differences y_j - x_i of the received values, y_j as
-    published, and the covariance of the innovations is that of each step. In real time the agents make a step one after
+    published, and the covariance of the residuals is that of each step. In real time the agents make a step one after
     the other. With correlated noise, a value that is used may contain a part of the noise of the same step; so each
-    innovation is first freed of what those made earlier in the step say about it (``position``, needed only then).
+    residual is first freed of what those made earlier in the step say about it (``position``, needed only then).
 
     Parameters
     ----------
     observation
-        of a run with noise or loss on the air, or in real time
+        of a run with noise or loss of messages, or in real time
     most
         largest number of regressors K; beyond it, fewer kinds of them are tested
     position
@@ -190,7 +190,7 @@ class HeardRegression:
         return self._score, self._covariance
 
     def gram(self) -> FloatArray | None:
-        """See ``StateRegression.gram``; None where innovations are freed of earlier ones."""
+        """See ``StateRegression.gram``; None where residuals are freed of earlier ones."""
         return None if self._position is not None else self._gram
 
     @property
@@ -208,13 +208,13 @@ class HeardRegression:
             found += [Term("lead", i, mode, None, float(self._pull[mode, i])) for i in leaders]
         return found
 
-    def add(self, reception: HeardValues, innovations: FloatArray, first: int = 0) -> None:
-        """Add a block of steps, beginning with step ``first``, and their innovations (b, m, R)."""
+    def add(self, reception: ReceivedValues, residuals: FloatArray, first: int = 0) -> None:
+        """Add a block of steps, beginning with step ``first``, and their residuals (b, m, R)."""
         order = None
         if self._position is not None:
-            order = np.argsort(self._position[first : first + len(innovations)], axis=1)
+            order = np.argsort(self._position[first : first + len(residuals)], axis=1)
         for graphs, agents, at in reception.patterns(order):
-            e, process = innovations[at], process_noise(self._step, graphs)
+            e, process = residuals[at], process_noise(self._step, graphs)
             if agents is not None:
                 e, process = _freed(e, process, agents)
             places, rows, phi = self._regressors(reception, at, graphs)
@@ -230,7 +230,7 @@ class HeardRegression:
                 self._covariance[block] += (rows[:, None] == rows) * (flat @ flat.T)
 
     def _regressors(
-        self, reception: HeardValues, at: IntArray, graphs: IntArray
+        self, reception: ReceivedValues, at: IntArray, graphs: IntArray
     ) -> tuple[IntArray, IntArray, FloatArray]:
         """Places (a,), rows (a,) and values (len(at), a, R): constants of all agents, then what their rows use."""
         m = self._step.agents
@@ -239,7 +239,7 @@ class HeardRegression:
         deviation = x - self._step.reference
         ones = np.ones((len(at), m, x.shape[2]))
         receivers, which = np.nonzero(np.arange(self._step.most_neighbours) < self._count(graphs)[:, None])
-        differences = reception.heard(at, receivers, which) - x[:, receivers]
+        differences = reception.received(at, receivers, which) - x[:, receivers]
         weights = reception.weights[at[:, None], receivers, which][:, :, None]
         if self._each:
             leaders = np.flatnonzero(self._lead_place[graphs, agents] >= 0)
@@ -261,7 +261,7 @@ class HeardRegression:
 
 
 def _freed(e: FloatArray, process: FloatArray, agents: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Innovations less what those of agents earlier in the order say about them; and their covariance (m, m)."""
+    """Residuals less what those of agents earlier in the order say about them; and their covariance (m, m)."""
     free = np.eye(len(agents))
     for number, i in enumerate(agents.tolist()):
         before = agents[:number]

@@ -6,28 +6,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
-from msg_analysis.inference.all_diagnostics import Departures
 from msg_analysis.inference.dependence import LAGS
-from msg_analysis.inference.diagnostics import Block, Finding, Law
-from msg_analysis.inference.e_values import Looks, log_mean
+from msg_analysis.inference.e_values import Analyses, log_mean, log_means, log_sum
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.received_values import NO_NOISE, HeardValues, process_noise
-from msg_analysis.inference.residuals import QUIET_ROUNDING, innovations
-from msg_analysis.inference.sequential_questions import (
-    ErrorMartingale,
-    LawQuestions,
-    Question,
-    RunningSums,
-    question_words,
-)
+from msg_analysis.inference.question import Block, Diagnostic, Finding, Law, RunningSums
+from msg_analysis.inference.questions import QUESTIONS, evidence_weights
+from msg_analysis.inference.received_values import NO_NOISE, ReceivedValues, process_noise
+from msg_analysis.inference.residuals import QUIET_ROUNDING, residuals
 from msg_analysis.inference.statistics import simultaneous_half_width
+from msg_analysis.inference.system_error import ErrorMartingale
 from msg_analysis.inference.time_means import moments
 from msg_analysis.model.reception import neighbour_tables
 from msg_analysis.theory.prediction import Prediction
@@ -38,12 +32,11 @@ FARTHEST = 1e4
 
 
 class EvidenceSums:
-    """Sums for the families of questions, each of which counts the same in the evidence on the whole law:
+    """Sums for the evidence of all questions.
 
-    "noise" of an agent, "gain" of a link or of a leader's pull, "gains" of all at once, "pair" of noises, "switching"
-    away from a graph, "loss" of a link, "broadcast" noise of an agent, "system error". Given its past and, on the air
-    and in real time, what was heard, each is exact; the system error only in lockstep without noise or loss on the air.
-    With ``in_detail``, the kinds of ``departures`` are added, which take as much time as all others together.
+    Given its past and, with reception noise and in real time, what was received, each is exact; the system error only
+    in lockstep without noise or loss of messages. With ``in_detail``, the diagnostics are asked, too, which take as
+    much time as all others together.
     """
 
     def __init__(self, prediction: Prediction, replicas: int, *, in_detail: bool = False) -> None:
@@ -51,7 +44,7 @@ class EvidenceSums:
         noise, m = experiment.noise, step.agents
         self._step, self._noise = step, noise
         real_time = experiment.run.pace == "realtime"
-        self.plain = not (noise.on_air or noise.delay or real_time)  # all agents hear the states themselves
+        self.plain = not (noise.on_air or noise.delay or real_time)  # all agents receive the states themselves
         # A message that is used twice has the same noise both times.
         self._independent = independent = not (noise.link and (step.holds or real_time))
         self._process = np.array([process_noise(step, np.full(m, g)) for g in range(step.modes)])  # (n, m, m)
@@ -68,121 +61,121 @@ class EvidenceSums:
         paired = usable[first] & usable[second] & (len(first) <= MOST_PAIRS) & (not correlated)
         independent_losses = step.burst is None and not real_time
         self.error = ErrorMartingale.of(prediction, replicas) if self.plain else None
-        self._asked = LawQuestions(
-            transition=step.transition,
-            losses=step.losses,
-            noisy=np.flatnonzero(noisy),
-            links=np.argwhere((step.listens() | np.diag(pull)) & usable[:, None]),
+        self._law = law = Law(
+            step=step,
+            graphs=[graph.name for graph in experiment.graph_list],
+            planned=experiment.steps,
+            replicas=replicas,
+            noisy=noisy,
+            apart=bool(usable.any()) and not correlated,
+            links=np.argwhere(step.listens() & usable[:, None]),
+            plain=self.plain,
+            gains=np.argwhere((step.listens() | np.diag(pull)) & usable[:, None]),
             pairs=np.column_stack([first[paired], second[paired]]),
-            common=bool(usable.any()) and not correlated,
             lossy=np.argwhere(step.listens() & (step.losses > 0.0) & independent_losses),
-            error=self.error is not None and len(self.error.rates) > 0,
         )
+        asked = [kind for kind in QUESTIONS if in_detail or not issubclass(kind, Diagnostic)]
+        self.questions = {kind.name: kind(law) for kind in asked}
+        self.diagnostics = [each for each in self.questions.values() if isinstance(each, Diagnostic)]
         self.total = self._zeros(1)
-        self.departures: Departures | None = None
-        if in_detail:
-            heard = np.argwhere(step.listens() & usable[:, None])
-            law = Law(step, experiment.steps, replicas, noisy, self._asked.common, heard, self.plain)
-            self.departures = Departures(law)
 
     @property
-    def numbers_per_look(self) -> int:
-        """Of temporary arrays, when a run is looked at."""
+    def numbers_per_analysis(self) -> int:
+        """Of temporary arrays, of one interim analysis."""
         m, n = self._step.agents, self._step.modes
-        lags = 10 * LAGS * (m + 1) if self.departures else 0
+        lags = 10 * LAGS * (m + 1) if self.diagnostics else 0
         return 8 * m**2 + n**2 + lags
 
     def add(
-        self, observation: Observation, first: int, last: int, heard: tuple[HeardValues, FloatArray] | None = None
+        self, observation: Observation, first: int, last: int, received: tuple[ReceivedValues, FloatArray] | None = None
     ) -> None:
         """Add the steps first..last-1 of a run, which follow those that were added before.
 
-        ``heard``: what was heard in them, and their innovations (b, m, R), where these are known.
+        ``received``: what was received in them, and their residuals (b, m, R), where these are known.
         """
-        self._add(observation, first, last, Looks.at_the_end(last - first), heard)
+        self._add(observation, first, last, Analyses.at_the_end(last - first), received)
 
-    def look(
+    def analyse(
         self,
         observation: Observation,
         first: int,
         last: int,
-        looks: Looks,
-        heard: tuple[HeardValues, FloatArray] | None = None,
+        analyses: Analyses,
+        received: tuple[ReceivedValues, FloatArray] | None = None,
     ) -> FloatArray:
-        """Add steps as ``add`` does: (T,) logs of the evidence against the whole law after each look."""
-        running, departures = self._add(observation, first, last, looks, heard)
-        return self._asked.log_evidence(running, self._asked.families(running) | departures)
+        """Add steps as ``add`` does: (T,) logs of the evidence against the whole law after each analysis."""
+        running, known = self._add(observation, first, last, analyses, received)
+        return self._log_evidence(running, self._families(running, known))
 
     def _add(
         self,
         observation: Observation,
         first: int,
         last: int,
-        looks: Looks,
-        heard: tuple[HeardValues, FloatArray] | None,
+        analyses: Analyses,
+        received: tuple[ReceivedValues, FloatArray] | None,
     ) -> tuple[RunningSums, dict[str, FloatArray]]:
-        """The sums and the evidence of departures after each look."""
-        # One look needs no copies of what may be large.
-        parts = self.total if looks.count == 1 else self._zeros(looks.count)
-        departures: dict[str, FloatArray] = {}
+        """The sums and the evidence of the diagnostics after each analysis."""
+        # One analysis needs no copies of what may be large.
+        parts = self.total if analyses.count == 1 else self._zeros(analyses.count)
+        found: dict[str, FloatArray] = {}
         quadratic = self._quadratic and self._near(observation.states[first : last + 1])
         if quadratic:
-            self._add_quadratic(parts, looks, observation, first, last)
-        if self.departures or not quadratic:
-            block = self._block(parts, looks, observation, first, last, heard)
+            self._add_quadratic(parts, analyses, observation, first, last)
+        if self.diagnostics or not quadratic:
+            block = self._block(parts, analyses, observation, first, last, received)
             if not quadratic:
                 lost = None if observation.lost is None else observation.lost[first:last]
-                self._add_heard(parts, looks, block.reception, block.white, block.scale, lost)
-            if self.departures:
-                departures = self.departures.add(block)
+                self._add_received(parts, analyses, block.reception, block.white, block.scale, lost)
+            found = {each.name: each.add(block) for each in self.diagnostics}
         graphs = observation.modes[first : last + 1]
         now, following = graphs[:-1], graphs[1:]
-        look = looks.after(np.arange(len(now)))
-        self._add_transitions(parts, look, now, following)
+        analysis = analyses.after(np.arange(len(now)))
+        self._add_transitions(parts, analysis, now, following)
         if observation.published is not None:
-            self._add_broadcast(parts, looks, observation.published[first:last] - observation.states[first:last])
+            self._add_broadcast(parts, analyses, observation.published[first:last] - observation.states[first:last])
         if self.error is not None and len(now):
             a = np.ones((len(graphs), self.error.numbers))
             a[:, :-1] = moments(observation, first, first + len(graphs), observation.states)
             steps = np.zeros((last - first, len(self.error.rates)))
             steps[: len(now)] = self.error.steps(now, following, a[:-1], a[1:])
-            parts.error += looks.sums(steps)
-        if looks.count == 1:
-            return self.total, departures
-        running = self.total.then(parts)
-        self.total = running.last()
-        return running, departures
+            parts.error += analyses.sums(steps)
+        running = self.total
+        if analyses.count > 1:
+            running = self.total.then(parts)
+            self.total = running.last()
+        return running, found
 
-    def _zeros(self, looks: int) -> RunningSums:
+    def _zeros(self, analyses: int) -> RunningSums:
         rates = 0 if self.error is None else len(self.error.rates)
-        return RunningSums.zeros(looks, self._step.agents, self._step.modes, rates)
+        return RunningSums.zeros(analyses, self._step.agents, self._step.modes, rates)
 
     def add_transitions(self, graphs: IntArray, following: IntArray) -> None:
         """Add steps of the switching: graphs (k,) and those of the next step (k,)."""
         self._add_transitions(self.total, np.zeros_like(graphs), graphs, following)
 
-    def _add_transitions(self, parts: RunningSums, look: IntArray, graphs: IntArray, following: IntArray) -> None:
+    def _add_transitions(self, parts: RunningSums, analysis: IntArray, graphs: IntArray, following: IntArray) -> None:
         modes, shape = self._step.modes, parts.counts.shape
-        place = (look * modes + graphs) * modes + following
+        place = (analysis * modes + graphs) * modes + following
         parts.counts += np.bincount(place, minlength=parts.counts.size).reshape(shape)
 
     def add_broadcast(self, added: FloatArray) -> None:
         """Add what was published minus the states (b, m, R)."""
-        self._add_broadcast(self.total, Looks.at_the_end(len(added)), added)
+        self._add_broadcast(self.total, Analyses.at_the_end(len(added)), added)
 
-    def _add_broadcast(self, parts: RunningSums, looks: Looks, added: FloatArray) -> None:
+    def _add_broadcast(self, parts: RunningSums, analyses: Analyses, added: FloatArray) -> None:
         if self._noise.broadcast:
-            parts.broadcast_samples += looks.lengths * added.shape[2]
-            parts.broadcast_squares += looks.sums((added**2).sum(axis=2)) / self._noise.broadcast**2
+            parts.broadcast_samples += analyses.lengths * added.shape[2]
+            parts.broadcast_squares += analyses.sums((added**2).sum(axis=2)) / self._noise.broadcast**2
 
-    def add_heard(self, reception: HeardValues, e: FloatArray, lost: BoolArray | None, largest: float) -> None:
-        """Add steps by what was heard, in any order: their innovations (b, m, R), the lost messages (b, m, D), if any.
+    def add_received(self, reception: ReceivedValues, e: FloatArray, lost: BoolArray | None, largest: float) -> None:
+        """Add steps by what was received, in any order: their residuals (b, m, R), the lost messages (b, m, D), if any.
 
         Of a step with an infinite ``link_variance``, the agent is left out. ``largest``: size of the largest state.
         """
-        looks = Looks.at_the_end(len(e))
-        scale = self._scales(self.total, looks, reception, e, largest)
-        self._add_heard(self.total, looks, reception, e / scale[:, :, None], scale, lost)
+        analyses = Analyses.at_the_end(len(e))
+        scale = self._scales(self.total, analyses, reception, e, largest)
+        self._add_received(self.total, analyses, reception, e / scale[:, :, None], scale, lost)
 
     def _near(self, states: FloatArray) -> bool:
         """Whether states are so near to each other, or to the reference, that squares lose nothing that counts."""
@@ -190,8 +183,10 @@ class EvidenceSums:
         smallest = math.sqrt(float(np.diagonal(self._process, axis1=1, axis2=2).min()))
         return float(np.abs(states - centre).max()) <= FARTHEST * smallest
 
-    def _add_quadratic(self, parts: RunningSums, looks: Looks, observation: Observation, first: int, last: int) -> None:
-        """Noise, gains and pairs where all agents hear the states themselves, and all have noise.
+    def _add_quadratic(
+        self, parts: RunningSums, analyses: Analyses, observation: Observation, first: int, last: int
+    ) -> None:
+        """Noise, gains and pairs where all agents receive the states themselves, and all have noise.
 
         Every sum is then a quadratic form in z = (x(k) - c, x(k+1) - c, 1), so that for each graph the sum of z z^T is
         enough; c, the reference or the mean of x(k), keeps the numbers small.
@@ -200,7 +195,7 @@ class EvidenceSums:
         states, modes = observation.states[first : last + 1], observation.modes[first:last]
         pull = step.nominal.sum(axis=2) - 1.0  # (n, m)
         pulled = bool(self._pulled.any())
-        parts.samples += observation.replicas * looks.lengths[:, None]
+        parts.samples += observation.replicas * analyses.lengths[:, None]
         diagonal = np.arange(m)
         for mode in np.unique(modes).tolist():
             at = np.flatnonzero(modes == mode)
@@ -209,12 +204,12 @@ class EvidenceSums:
             z = np.ones((2 * m + 1, len(at), observation.replicas))
             z[:m], z[m:-1] = (now - centre).transpose(1, 0, 2), (after - centre).transpose(1, 0, 2)
             flat = z.reshape(2 * m + 1, -1)
-            bounds = np.searchsorted(at, np.append(0, looks.ends)) * observation.replicas
-            there = np.flatnonzero(np.diff(bounds))  # looks before which steps have this graph
-            between = [flat[:, bounds[look] : bounds[look + 1]] for look in there.tolist()]
+            bounds = np.searchsorted(at, np.append(0, analyses.ends)) * observation.replicas
+            there = np.flatnonzero(np.diff(bounds))  # analyses before which steps have this graph
+            between = [flat[:, bounds[analysis] : bounds[analysis + 1]] for analysis in there.tolist()]
             gram = np.array([each @ each.T for each in between])
             deviation = np.sqrt(np.diagonal(self._process[mode]))[:, None]
-            # White innovations and the effects of links, as rows that are multiplied with z.
+            # White residuals and the effects of links, as rows that are multiplied with z.
             offset = step.offsets[mode] + (pull[mode] * step.reference if pulled else 0.0)
             white = np.column_stack([-step.nominal[mode], np.eye(m), -offset]) / deviation
             weights = step.nominal[mode] * ~np.eye(m, dtype=bool) / deviation
@@ -229,10 +224,10 @@ class EvidenceSums:
             information[:, diagonal, diagonal] += own**2 * size
             parts.link_score[there] += score
             parts.link_information[there] += information
-            if len(self._asked.pairs):
+            if len(self._law.pairs):
                 parts.pair_score[there] += products
                 parts.pair_information[there] += squares[:, None, :]
-            if self._asked.common:
+            if self._law.apart:
                 common = weights + np.diag(own - weights.sum(axis=1))
                 parts.common_score[there] += (common * seen).sum(axis=(1, 2))
                 parts.common_information[there] += ((common @ now_now) * common).sum(axis=(1, 2))
@@ -240,96 +235,121 @@ class EvidenceSums:
     def _block(
         self,
         parts: RunningSums,
-        looks: Looks,
+        analyses: Analyses,
         observation: Observation,
         first: int,
         last: int,
-        heard: tuple[HeardValues, FloatArray] | None,
+        received: tuple[ReceivedValues, FloatArray] | None,
     ) -> Block:
-        """The steps, with their innovations over the standard deviations, by what was heard."""
-        reception = heard[0] if heard else HeardValues.of(observation, first, last)
-        e = heard[1] if heard else innovations(observation, first, last, reception)
-        scale = self._scales(parts, looks, reception, e, observation.largest)
+        """The steps, with their residuals over the standard deviations, by what was received."""
+        reception = received[0] if received else ReceivedValues.of(observation, first, last)
+        e = received[1] if received else residuals(observation, first, last, reception)
+        scale = self._scales(parts, analyses, reception, e, observation.largest)
         graphs, after = observation.modes[first : last + 1], observation.states[first + 1 : last + 1]
-        return Block(first, graphs, e / scale[:, :, None], scale, after, reception, looks)
+        return Block(first, graphs, e / scale[:, :, None], scale, after, reception, analyses)
 
     def _scales(
-        self, parts: RunningSums, looks: Looks, reception: HeardValues, e: FloatArray, largest: float
+        self, parts: RunningSums, analyses: Analyses, reception: ReceivedValues, e: FloatArray, largest: float
     ) -> FloatArray:
-        """(b, m): standard deviations of innovations; infinite without noise, where nothing may move."""
+        """(b, m): standard deviations of residuals; infinite without noise, where nothing may move."""
         agents = np.arange(self._step.agents)
         variances = np.diagonal(self._process, axis1=1, axis2=2)[reception.graphs, agents] + reception.link_variance
         still = variances <= self._floor
         if self._independent and still.any():
             moved = (np.abs(e) > QUIET_ROUNDING * largest).any(axis=2) & still
-            parts.impossible += looks.counts(np.asarray(moved.any(axis=1)))
+            parts.impossible += analyses.counts(np.asarray(moved.any(axis=1)))
         return np.asarray(np.sqrt(np.where(still, np.inf, variances)))
 
-    def _add_heard(
+    def _add_received(
         self,
         parts: RunningSums,
-        looks: Looks,
-        reception: HeardValues,
+        analyses: Analyses,
+        reception: ReceivedValues,
         white: FloatArray,
         scale: FloatArray,
         lost: BoolArray | None,
     ) -> None:
         """Noise, pairs, and of gains and losses the regressors, over the standard deviation of the noise."""
-        parts.samples += looks.counts(np.where(np.isinf(scale), 0, white.shape[2]))
-        parts.squares += looks.sums((white**2).sum(axis=2))
-        if len(self._asked.pairs):
-            for look, (begin, end) in enumerate(zip(looks.begins.tolist(), looks.ends.tolist(), strict=True)):
+        parts.samples += analyses.counts(np.where(np.isinf(scale), 0, white.shape[2]))
+        parts.squares += analyses.sums((white**2).sum(axis=2))
+        if len(self._law.pairs):
+            for analysis, (begin, end) in enumerate(zip(analyses.begins.tolist(), analyses.ends.tolist(), strict=True)):
                 flat = white[begin:end].transpose(1, 0, 2).reshape(len(white[0]), -1)
                 products = flat @ flat.T
-                parts.pair_score[look] += products
-                parts.pair_information[look] += np.diag(products)[None, :]
+                parts.pair_score[analysis] += products
+                parts.pair_information[analysis] += np.diag(products)[None, :]
         step, scale = self._step, scale[:, :, None]
         agents, every = np.arange(step.agents), np.arange(len(white))
         count = neighbour_tables(step).count[reception.graphs, agents]  # (b, m)
         pull = (step.nominal.sum(axis=2) - 1.0)[reception.graphs, agents]
         common = pull[:, :, None] * (reception.states - step.reference) / scale
-        parts.link_score[:, agents, agents] += looks.sums((common * white).sum(axis=2))
-        parts.link_information[:, agents, agents] += looks.sums((common**2).sum(axis=2))
+        parts.link_score[:, agents, agents] += analyses.sums((common * white).sum(axis=2))
+        parts.link_information[:, agents, agents] += analyses.sums((common**2).sum(axis=2))
         m = step.agents
-        receivers = (looks.after(every)[:, None] * m + agents) * m  # places of rows of (T, m, m) in one dimension
+        receivers = (analyses.after(every)[:, None] * m + agents) * m  # places of rows of (T, m, m) in one dimension
         for d in range(step.most_neighbours):
             there = count > d
             weights = reception.weights[:, :, d]
-            difference = reception.heard(every, agents, np.full(m, d)) - reception.states
+            difference = reception.received(every, agents, np.full(m, d)) - reception.states
             part = np.where(weights != 0.0, weights, 0.0)[:, :, None] * difference / scale
             common += part
             place = (receivers + reception.senders[:, :, d])[there]  # in one dimension: many times as fast
             np.add.at(parts.link_score.reshape(-1), place, (part * white).sum(axis=2)[there])
             np.add.at(parts.link_information.reshape(-1), place, (part**2).sum(axis=2)[there])
-            if lost is not None and len(self._asked.lossy):
+            if lost is not None and len(self._law.lossy):
                 np.add.at(parts.messages.reshape(-1), place, 1)
                 np.add.at(parts.lost.reshape(-1), place, lost[:, :, d][there])
-        if self._asked.common:
-            parts.common_score += looks.sums((common * white).sum(axis=(1, 2)))
-            parts.common_information += looks.sums((common**2).sum(axis=(1, 2)))
+        if self._law.apart:
+            parts.common_score += analyses.sums((common * white).sum(axis=(1, 2)))
+            parts.common_information += analyses.sums((common**2).sum(axis=(1, 2)))
 
     def merge(self, other: EvidenceSums) -> None:
         """Add the sums of another run of the same experiment, with another seed."""
         self.total.merge(other.total)
-        if self.departures and other.departures:
-            self.departures.merge(other.departures)
+        for mine, its in zip(self.diagnostics, other.diagnostics, strict=True):
+            mine.merge(its)
 
     def families(self) -> dict[str, FloatArray]:
-        """For each kind the evidence on its questions, logarithms (questions, alternatives)."""
-        found = {kind: logarithms[0] for kind, logarithms in self._asked.families(self.total).items()}
-        return found | self.departures.families() if self.departures else found
+        """By name of the question, the evidence so far, logarithms (rows, alternatives)."""
+        return {name: logarithms[0] for name, logarithms in self._families(self.total, {}).items()}
 
-    def question(self, kind: str, row: int) -> Question:
-        """What a row of ``families`` is about."""
-        return self._asked.question(kind, row)
+    def _families(self, sums: RunningSums, known: dict[str, FloatArray]) -> dict[str, FloatArray]:
+        """By name of the question, where it has evidence, logarithms (T, rows, alternatives); some are ``known``."""
+        each = {
+            name: known[name] if name in known else question.evidence(sums) for name, question in self.questions.items()
+        }
+        return {name: logarithms for name, logarithms in each.items() if logarithms.size}
+
+    def weights(self, names: Iterable[str]) -> FloatArray:
+        """Of questions with these names in the evidence."""
+        return evidence_weights([self.questions[name].main for name in names])
+
+    def strongest(self, families: dict[str, FloatArray]) -> list[tuple[str, float]]:
+        """For each question its row with the most evidence, in words, and its logarithm."""
+        found = []
+        for name, logarithms in families.items():
+            each = log_mean(logarithms, axis=1)
+            best = int(np.argmax(each))
+            found.append((self.questions[name].about(best), float(each[best])))
+        return found
+
+    def findings(self) -> dict[str, Finding]:
+        """By name of the diagnostic, its clearest deviation, of those with something to test."""
+        return {each.name: found for each in self.diagnostics if (found := each.finding())}
 
     def evidence(self, families: dict[str, FloatArray] | None = None) -> float:
-        """Log of the evidence against the whole law: the weighted mean over the kinds of the mean over questions.
+        """Log of the evidence against the whole law; ``families``: where they are known."""
+        families = self.families() if families is None else families
+        return float(self._log_evidence(self.total, {name: found[None] for name, found in families.items()})[0])
 
-        ``families``: where they are known.
-        """
-        families = {kind: logarithms[None] for kind, logarithms in (families or self.families()).items()}
-        return float(self._asked.log_evidence(self.total, families)[0])
+    def _log_evidence(self, sums: RunningSums, families: dict[str, FloatArray]) -> FloatArray:
+        """(T,): the weighted mean over the questions of the mean over their rows, after each analysis."""
+        total = np.zeros(len(sums.impossible))
+        if families:
+            total = log_sum(log_means(list(families.values())) + np.log(self.weights(families)), axis=1)
+        never = sums.lost[:, self._step.losses == 0.0].any(axis=1)
+        total[never | (sums.impossible > 0)] = np.inf
+        return total
 
 
 LARGEST_LOGARITHM = 700.0  # evidence beyond is not shown as a number: floating point ends there
@@ -345,16 +365,12 @@ class WatchedEvidence:
     logarithms: FloatArray | None  # (T,) of the evidence after them
 
     @classmethod
-    def of(cls, observation: Observation, looks: IntArray) -> WatchedEvidence:
-        """Of a run, at the numbers of steps ``looks`` (T,), ascending, the last of which is all steps."""
-        watch = Watch(observation, looks)
+    def of(cls, observation: Observation, analyses: IntArray) -> WatchedEvidence:
+        """Of a run, at the numbers of steps ``analyses`` (T,), ascending, the last of which is all steps."""
+        watch = Watch(observation, analyses)
         for first, last in observation.blocks(watch.numbers_per_step, "evidence"):
             watch.add(first, last)
         return watch.result()
-
-    def findings(self) -> list[Finding]:
-        """The clearest departure of each kind that is tested."""
-        return self.sums.departures.findings() if self.sums.departures else []
 
     def merged(self, other: WatchedEvidence) -> WatchedEvidence:
         """Of these and other runs of the same experiment; the sums of ``self`` are changed in place."""
@@ -363,14 +379,14 @@ class WatchedEvidence:
 
 
 class Watch:
-    """Adds the steps of a run in order, and looks at the evidence after the numbers of steps ``looks`` (T,)."""
+    """Adds the steps of a run in order, and takes the evidence after the numbers of steps ``analyses`` (T,)."""
 
-    def __init__(self, observation: Observation, looks: IntArray) -> None:
-        self._observation, self._looks = observation, looks
+    def __init__(self, observation: Observation, analyses: IntArray) -> None:
+        self._observation, self._analyses = observation, analyses
         self._sums = EvidenceSums(observation.prediction, observation.replicas, in_detail=True)
-        self._logarithms = np.empty(len(looks))
-        self._looked = 0
-        self._most = max(1, BLOCK_NUMBERS // self._sums.numbers_per_look)  # looks in one pass
+        self._logarithms = np.empty(len(analyses))
+        self._done = 0
+        self._most = max(1, BLOCK_NUMBERS // self._sums.numbers_per_analysis)  # analyses in one pass
 
     @property
     def numbers_per_step(self) -> int:
@@ -379,29 +395,32 @@ class Watch:
         numbers = (4 + step.most_neighbours) * self._observation.states[0].size + step.agents**2
         return int(numbers if error is None else max(numbers, error.numbers * (1 + len(error.rates))))
 
-    def add(self, first: int, last: int, heard: tuple[HeardValues, FloatArray] | None = None) -> None:
-        """Add the steps first..last-1; ``heard`` as of ``EvidenceSums.add``."""
+    def add(self, first: int, last: int, received: tuple[ReceivedValues, FloatArray] | None = None) -> None:
+        """Add the steps first..last-1; ``received`` as of ``EvidenceSums.add``."""
         begin = first
         while first < last:
-            ends = self._looks[self._looked : self._looked + self._most]
+            ends = self._analyses[self._done : self._done + self._most]
             ends = ends[ends <= last]
-            looked = self._looked + len(ends)
+            done = self._done + len(ends)
             if len(ends) < self._most and (not len(ends) or ends[-1] < last):
                 ends = np.append(ends, last)
             until = int(ends[-1])
-            known = heard and (heard[0].part(first - begin, until - begin), heard[1][first - begin : until - begin])
-            found = self._sums.look(self._observation, first, until, Looks(ends - first), known)
-            self._logarithms[self._looked : looked] = found[: looked - self._looked]
-            first, self._looked = until, looked
+            known = received and (
+                received[0].part(first - begin, until - begin),
+                received[1][first - begin : until - begin],
+            )
+            found = self._sums.analyse(self._observation, first, until, Analyses(ends - first), known)
+            self._logarithms[self._done : done] = found[: done - self._done]
+            first, self._done = until, done
 
     def result(self) -> WatchedEvidence:
         """After all steps."""
-        return WatchedEvidence(self._sums, self._observation.step.dt, self._looks, self._logarithms)
+        return WatchedEvidence(self._sums, self._observation.step.dt, self._analyses, self._logarithms)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnyTimeEvidence:
-    """What may be said at any time, however often one looks.
+    """What may be said at any time.
 
     While the run follows the law, the evidence ever passes ``threshold`` with probability at most 1 / threshold.
     """
@@ -415,8 +434,8 @@ class AnyTimeEvidence:
     half_width: float | None  # of the 95 % interval of the system error that holds at all times at once
 
     @property
-    def disagrees(self) -> bool:
-        """Whether the threshold is passed, or was."""
+    def exceeded(self) -> bool:
+        """Whether the threshold is exceeded, or was."""
         return self.crossed is not None or self.log_evidence >= math.log(self.threshold)
 
     def to_json(self) -> dict[str, Any]:
@@ -426,7 +445,7 @@ class AnyTimeEvidence:
             "evidence": math.exp(self.log_evidence) if small else None,
             "log_evidence": self.log_evidence,
             "threshold": self.threshold,
-            "disagrees": self.disagrees,
+            "disagrees": self.exceeded,
             "crossed_at": self.crossed,
             "questions": [{"about": words, "log_evidence": log} for words, log in self.questions],
             "half_width": self.half_width,
@@ -436,24 +455,15 @@ class AnyTimeEvidence:
 def any_time_evidence(
     watched: WatchedEvidence,
     level: float,
-    graphs: Sequence[str],
+    families: dict[str, FloatArray] | None = None,
     variance: float | None = None,
     steps: int | None = None,
     planned: float | None = None,
 ) -> AnyTimeEvidence:
-    """The evidence in words and numbers.
+    """The evidence of one run or several in words and numbers.
 
-    Parameters
-    ----------
-    watched
-        of one run or several
-    level
-        probability that the threshold 1 / level is ever passed by a run that follows its law, at most
-    graphs
-        their names
-    variance, steps, planned
-        sum of Var(D_k) of the system error over so many steps, and the number of steps at which its interval is to be
-        narrowest, chosen before the run; None where it is not known
+    ``variance``: sum of Var(D_k) of the system error over so many ``steps``; ``planned``: the number of steps at which
+    its interval is to be narrowest, chosen before the run. ``families`` are those of the sums, where they are known.
     """
     threshold, sums = 1.0 / level, watched.sums
     time, crossed = None, None
@@ -461,13 +471,7 @@ def any_time_evidence(
         time = np.asarray(watched.steps * watched.dt, dtype=float)
         over = np.flatnonzero(watched.logarithms >= math.log(threshold))
         crossed = float(time[over[0]]) if len(over) else None
-    questions, families = [], sums.families()
-    for kind, logarithms in families.items():
-        each = log_mean(logarithms, axis=1)
-        best = int(np.argmax(each))
-        words = sums.departures.question(kind, best, graphs) if sums.departures else None
-        words = words or question_words(sums.question(kind, best), graphs)
-        questions.append((words, float(each[best])))
+    families = sums.families() if families is None else families
     half_width = None
     if variance and steps and planned and sums.error is not None:
         half_width = float(simultaneous_half_width(variance, sums.error.variance * planned)) / steps
@@ -477,6 +481,6 @@ def any_time_evidence(
         crossed=crossed,
         time=time,
         log_curve=watched.logarithms,
-        questions=sorted(questions, key=lambda entry: -entry[1]),
+        questions=sorted(sums.strongest(families), key=lambda entry: -entry[1]),
         half_width=half_width,
     )

@@ -1,0 +1,126 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The list of all questions about a run: the verdict, the evidence at any time, the live view and the causes walk it.
+
+How to add one is in docs/statistics.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.inference.candidates import Cause
+from msg_analysis.inference.dependence import ConstantState, LongLags, Whiteness
+from msg_analysis.inference.graphs import HoldingTimes, SwappedGraphs, Switching
+from msg_analysis.inference.messages import Broadcast, CommonGain, Gains, Losses, StaleValues
+from msg_analysis.inference.noise import LargestResidual, Noise, NoiseByGraph, NoiseOverTime
+from msg_analysis.inference.question import Diagnostic, Question, Search, Statistics, Test
+from msg_analysis.inference.statistics import holm
+from msg_analysis.inference.system_error import AgentMeanErrors, Covariance, RunsAlike, SystemMeanError
+
+QUESTIONS: tuple[type[Question], ...] = (
+    SystemMeanError,
+    AgentMeanErrors,
+    Covariance,
+    Noise,
+    Whiteness,
+    Gains,
+    CommonGain,
+    Switching,
+    HoldingTimes,
+    NoiseByGraph,
+    NoiseOverTime,
+    ConstantState,
+    LargestResidual,
+    LongLags,
+    StaleValues,
+    SwappedGraphs,
+    Losses,
+    Broadcast,
+    RunsAlike,
+)
+
+MAIN_SHARE = 0.75  # of the main questions together in the mean of the evidence, however many others there are
+
+
+def evidence_weights(main: Sequence[bool]) -> FloatArray:
+    """Weights of sum 1 of questions in the evidence: fixed before the run, since they depend on the law only."""
+    count = sum(main)
+    each = MAIN_SHARE / max(count, 1), (1.0 - MAIN_SHARE) / max(len(main) - count, 1)
+    weights = np.array([each[0] if one else each[1] for one in main])
+    return np.asarray(weights / weights.sum())
+
+
+def decide(run: Statistics, level: float, evidence: dict[str, float] | None = None) -> list[Test]:
+    """The family of tests, decided at ``level`` (Holm); ``evidence``: logarithms by name of the question."""
+    found = [(question, test) for question in QUESTIONS for test in question.tests(run)]
+    # A NaN statistic (a log with numbers too large to compute with) counts as p = 0: the law never gives one.
+    p = [0.0 if math.isnan(test.p) else test.p for _, test in found]
+    return [
+        Test(
+            name=test.name,
+            p=alone,
+            p_adjusted=float(adjusted),
+            rejected=bool(adjusted < level),
+            estimate=test.estimate,
+            log_evidence=(evidence or {}).get(question.name),
+            meaning=question.meaning,
+        )
+        for (question, test), alone, adjusted in zip(found, p, holm(np.array(p, dtype=float)), strict=True)
+    ]
+
+
+def causes_of(search: Search, rejected: Sequence[str]) -> list[Cause]:
+    """What is wrong with runs that disagree: agents with a constant state first, then by p-value; never empty.
+
+    The level of the search bounds the probability of finding a cause where nothing is wrong. Where nothing is found,
+    one cause of kind "unknown" names the ``rejected`` tests.
+    """
+    # The classes of all questions count before anything is selected.
+    search.families = sum(question.classes(search) for question in QUESTIONS)
+    found = [cause for question in QUESTIONS for cause in question.causes(search)]
+    found += [cause for chain in (True, False) for cause in _clearest(search, found, about_chain=chain)]
+    if not found:
+        return [_unknown(rejected)]
+    return sorted(found, key=lambda cause: (cause.kind != "frozen", cause.p or 0.0))
+
+
+ABOUT_THE_CHAIN = ("switching", "sojourns")  # kinds of causes
+
+
+def _clearest(search: Search, others: Sequence[Cause], *, about_chain: bool) -> list[Cause]:
+    """The clearest finding of the diagnostics, where it is clearer than all ``others``, which concern the whole run.
+
+    One fault has many effects, so only one finding about the steps is a cause, and one about the graphs.
+    """
+    findings = [
+        (search.findings[question.name], question)
+        for question in QUESTIONS
+        if issubclass(question, Diagnostic) and question.about_chain == about_chain and question.name in search.findings
+    ]
+    if not findings:
+        return []
+    best, question = min(findings, key=lambda one: one[0].log_p)
+    log_p = best.log_p + math.log(search.families)
+    rivals = [cause.p or 0.0 for cause in others if (cause.kind in ABOUT_THE_CHAIN) == about_chain]
+    if log_p < math.log(search.level) and math.exp(log_p) < min(rivals, default=1.0):
+        return [question.cause(best, search.names, math.exp(log_p))]
+    return []
+
+
+def _unknown(rejected: Sequence[str]) -> Cause:
+    names = ", ".join(rejected)
+    if list(rejected) == [Whiteness.name]:
+        words = "the noise of successive steps or of replicas is correlated: random numbers are used twice"
+    elif all(name.startswith((SystemMeanError.name, Covariance.name)) for name in rejected) or all(
+        name.startswith(AgentMeanErrors.name) for name in rejected
+    ):
+        words = f"the steps follow the law, but the errors differ: chance, or another start than in the file ({names})"
+    else:
+        words = f"no single cause that is searched for explains the rejected tests ({names})"
+    return Cause("unknown", words)
