@@ -19,14 +19,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from msg_agents.discovery.profiles import (
-    INTRODUCED_PROFILE,
     LOOPBACK_PROFILE,
     PROFILE_VARIABLES,
+    RELAYED_PROFILE,
     UDP_PROFILE,
     domains_for,
     has_fast_dds_3,
 )
-from msg_agents.discovery.relay import Introducer
+from msg_agents.discovery.relay import DiscoveryRelay
 from msg_agents.discovery.rtps import free_domain, require_loopback
 from msg_analysis.common.resources import SINGLE_THREAD
 from msg_analysis.common.version import ros_distribution
@@ -253,41 +253,41 @@ ROS_LOGS = "ros"  # folder for nodes that have no other place for the log files 
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class RunEnvironment:
     """Of one run."""
 
     domain: int
     environment: dict[str, str]
-    introducer: Introducer | None  # None: the processes look for each other, by the user's profile for example
+    introducer: DiscoveryRelay | None  # None: the processes look for each other, by the user's profile for example
 
 
 @contextmanager
-def surroundings(
+def run_environment(
     folder: Path,  # of the run
     domain: int | None,  # None: a free one
     changes: Mapping[str, str],  # of the environment
     participants: int,  # of the run
-) -> Iterator[Surroundings]:
+) -> Iterator[RunEnvironment]:
     """Provide them for a run; InputError: no domain is free, or processes could not meet."""
     with ExitStack() as stack:
         if domain is None:
             domain = stack.enter_context(free_domain(domains_for(participants)))
-        environment = node_environment(domain, INTRODUCED_PROFILE) | dict(changes)
+        environment = node_environment(domain, RELAYED_PROFILE) | dict(changes)
         introducer = None
-        if will_introduce(changes):
+        if uses_relay(changes):
             require_loopback()
             try:
-                introducer = stack.enter_context(Introducer(domain))
+                introducer = stack.enter_context(DiscoveryRelay(domain))
             except OSError:  # many others are in this domain
                 environment = node_environment(domain) | dict(changes)
         require_discovery(environment)
         require_shared_memory()
         environment |= other_logs(folder / ROS_LOGS)
-        yield Surroundings(domain, environment, introducer)
+        yield RunEnvironment(domain, environment, introducer)
 
 
-def will_introduce(changes: Mapping[str, str]) -> bool:
+def uses_relay(changes: Mapping[str, str]) -> bool:
     """Whether the middleware will follow our profile: not if that of the user, or of several hosts, is used."""
-    environment = node_environment(0, INTRODUCED_PROFILE) | dict(changes)
-    ours = environment.get(PROFILE_VARIABLES[-1]) == str(INTRODUCED_PROFILE)
+    environment = node_environment(0, RELAYED_PROFILE) | dict(changes)
+    ours = environment.get(PROFILE_VARIABLES[-1]) == str(RELAYED_PROFILE)
     return ours and environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")

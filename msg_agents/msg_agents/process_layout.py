@@ -41,14 +41,14 @@ SMALL = 8
 """Of ``processes: auto``: up to so many agents, each has a process of its own; beyond, there is one process per so many
 agents, but not more than the machine has cores."""
 MOST_PROCESSES = 200
-"""Agent processes that ``Introducer`` introduces to each other, which with switcher, recorder and the user's own tools
+"""Agent processes that ``DiscoveryRelay`` introduces to each other, which with switcher, recorder and the user's own tools
 fill the ports of two ROS domains."""
 MOST_UNAIDED = 90
 """Agent processes that look for each other: Fast DDS finds ``MOST_PARTICIPANTS``, of which some are for others."""
 
 
 @dataclass(frozen=True, slots=True)
-class ProcessPlan:
+class ProcessSpec:
     """One process of a network."""
 
     name: str
@@ -123,7 +123,7 @@ def discovery_timeout(agents: int, processes: int) -> float:
     return max(DISCOVERY_TIMEOUT, 2.0 * processes + 0.1 * agents)
 
 
-def plan_network(
+def lay_out_network(
     experiment: Experiment,
     run_file: Path,  # run record, read by every node
     bag: Path | None,  # directory to record to; None: no recorder
@@ -136,7 +136,7 @@ def plan_network(
     readers: Sequence[str] = (),  # nodes that the user starts, and that must read the topics before the run starts
     most: int = MOST_UNAIDED,
     hosts: Sequence[Sequence[int]] = (),  # agents of each host of a channel: a process is on one; empty: no channel
-) -> list[ProcessPlan]:
+) -> list[ProcessSpec]:
     """The processes of a run, in the order in which to start them; with ``share``, those of this host only.
 
     InputError: more than ``most`` processes with agents.
@@ -167,17 +167,17 @@ def plan_network(
         files: tuple[str, ...] = ("--compression", storage.compression)
         if storage.split_size is not None:
             files += ("--split-size", repr(storage.split_size / MEGABYTE))
-        plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag), *files, *common)))
+        plans.append(ProcessSpec(RECORDER, ("recorder", str(run_file), "--out", str(bag), *files, *common)))
     for agents in groups:
         numbers = [part for agent in agents for part in ("--agent", str(agent + 1))]
         arguments = ("agent", str(run_file), *numbers, *options)
-        plans.append(ProcessPlan(process_name(agents), arguments, agents, resumes))
+        plans.append(ProcessSpec(process_name(agents), arguments, agents, resumes))
     if home:
-        plans.append(ProcessPlan(SWITCHER, ("switcher", str(run_file), *options), resumes=resumes))
+        plans.append(ProcessSpec(SWITCHER, ("switcher", str(run_file), *options), resumes=resumes))
     return plans
 
 
-def partners(plans: Sequence[ProcessPlan], listens: BoolArray) -> dict[str, set[str]]:
+def partners(plans: Sequence[ProcessSpec], listens: BoolArray) -> dict[str, set[str]]:
     """The processes that each process exchanges messages with; processes go by their first nodes.
 
     ``listens``: (m, m), whether agent i ever listens to agent j. Recorder and switcher have to do with all.
@@ -193,10 +193,10 @@ def partners(plans: Sequence[ProcessPlan], listens: BoolArray) -> dict[str, set[
     return found
 
 
-def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) -> dict[str, int]:
+def place(plans: Sequence[ProcessSpec], cores: Sequence[int], first: int = 0) -> dict[str, int]:
     """A core for each agent process by name, where they and the recorder outnumber two or more cores; else empty.
 
-    ``plans``: in the order of ``plan_network``, so that neighbours share a core. ``first``: index of the first core.
+    ``plans``: in the order of ``lay_out_network``, so that neighbours share a core. ``first``: index of the first core.
     """
     # In lockstep every message wakes the process that receives it. To wake it on another core costs an interrupt there,
     # and without pinning the scheduler spreads communicating processes over the cores: with two cores, the demo network
@@ -214,7 +214,7 @@ def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) ->
     return {name: cores[(first + int(middle / total * len(cores))) % len(cores)] for name, middle in middles.items()}
 
 
-def keep_to(process: int, core: int) -> None:
+def pin_to_core(process: int, core: int) -> None:
     """Pin a process that has just been started, and its children, to a core; errors are ignored."""
     try:
         os.sched_setaffinity(process, {core})
@@ -222,7 +222,7 @@ def keep_to(process: int, core: int) -> None:
         return
 
 
-VISITORS = 8  # participants on a host besides those of the run, such as tools that watch it
+SPARE_PARTICIPANTS = 8  # participants on a host besides those of the run, such as tools that watch it
 _RANGE = re.compile(r"([0-9]+)-([0-9]+)")
 
 
@@ -331,7 +331,7 @@ class Hosts:
     def participants(self, experiment: Experiment) -> int:
         """How many participants to look for on each host: more than run on any."""
         most = max(wanted_processes(experiment, len(agents)) for agents in self.agents.values())
-        return min(most + 2 + VISITORS, MOST_PARTICIPANTS)
+        return min(most + 2 + SPARE_PARTICIPANTS, MOST_PARTICIPANTS)
 
     def profile(self, experiment: Experiment) -> str:
         """The Fast DDS profile with which the processes of all hosts find each other."""

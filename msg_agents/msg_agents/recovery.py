@@ -65,8 +65,8 @@ class StopFiles:
         return None
 
 
-MOST_KEPT, LEAST_KEPT, ROOM = RESEND_LIMIT, 256, 1 << 24
-"""States kept of each agent: as many as fit into ROOM bytes, from LEAST_KEPT to MOST_KEPT. Where possible, more than
+MOST_KEPT, LEAST_STATES, ROOM = RESEND_LIMIT, 256, 1 << 24
+"""States kept of each agent: as many as fit into ROOM bytes, from LEAST_STATES to MOST_KEPT. Where possible, more than
 the 5,000 that the middleware keeps of a writer for slow readers; always more steps than agents may be apart."""
 
 # Length of the entry and step + 1; 0 from before the entry is written until it is whole.
@@ -86,7 +86,7 @@ def entry_size(record: RunRecord) -> int:
 def room_for(size: int) -> int:
     """Size of the checkpoint file of an agent whose longest entry has ``size`` bytes."""
     slot = size + MARK.size
-    return slot * max(LEAST_KEPT, min(MOST_KEPT, ROOM // slot))
+    return slot * max(LEAST_STATES, min(MOST_KEPT, ROOM // slot))
 
 
 class Checkpoint:

@@ -24,7 +24,7 @@ from typing import Any
 
 import pytest
 import yaml
-from left_processes import describe, last_words
+from left_processes import describe, last_line
 from started_processes import started_processes
 
 pytest.importorskip("rclpy")
@@ -265,7 +265,7 @@ def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network
         print(describe([process.pid for process in left], [path for path in network.traces if path.is_dir()]))
         for process in left:
             process.kill()
-        print(last_words(network.commands))
+        print(last_line(network.commands))
     assert not left, "processes outlived the test"
     traces = {path for path in network.traces if path.exists()}
     if traces:  # some names are common to all domains: a process of another test may have such a file by now

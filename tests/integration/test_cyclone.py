@@ -19,8 +19,8 @@ pytest.importorskip("cyclonedds")
 
 from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment
-from msg_agents.process_layout import plan_network
-from msg_agents.run.fork_server import NodeServer
+from msg_agents.process_layout import lay_out_network
+from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.supervisor import Supervisor
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.model.run import Run
@@ -146,10 +146,10 @@ def test_an_agent(network: Any, noise: dict[str, Any]) -> None:
     with free_domain() as domain:
         environment = node_environment(domain)
         with (
-            NodeServer(environment, directory / "fork_server.log") as server,
+            ForkServer(environment, directory / "fork_server.log") as server,
             Supervisor(directory, environment, fork_server=server) as nodes,
         ):
-            nodes.start([plan for plan in plan_network(record.experiment, file, bag) if plan.name != "agent_3"])
+            nodes.start([plan for plan in lay_out_network(record.experiment, file, bag) if plan.name != "agent_3"])
             foreign = subprocess.run(
                 [sys.executable, str(AGENT), str(file), "3"],
                 env=os.environ | {"ROS_DOMAIN_ID": str(domain), "CYCLONEDDS_URI": UNICAST},

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from visitor import assert_delivery
 
-from msg_agents.discovery.profiles import FIRST_INTRODUCED
+from msg_agents.discovery.profiles import FIRST_RELAYED
 from msg_agents.discovery.rtps import discovery_port, free_domain
 from msg_agents.environment import node_environment
 from msg_analysis.twin.check import check
@@ -41,13 +41,13 @@ def domain() -> Iterator[int]:
 
 
 def visits(stack: ExitStack, when: str, domain: int) -> dict[str, subprocess.Popen[str]]:
-    """Visitors in each kind of surroundings, by the names of their nodes."""
-    surroundings = {
+    """Visitors in each kind of run_environment, by the names of their nodes."""
+    run_environment = {
         "our_profile": node_environment(domain),
         "range_of_ros": os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
     }
     found = {}
-    for kind, environment in surroundings.items():
+    for kind, environment in run_environment.items():
         command = [sys.executable, "-P", "-c", VISITOR, f"visitor_{when}_{kind}", *NODES]
         visitor = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
         found[command[4]] = stack.enter_context(visitor)
@@ -88,7 +88,7 @@ def test_a_domain_without_room_for_introductions(network: Any, domain: int) -> N
     """
     what = network.experiment(run={"processes": "one_per_agent"})
     with ExitStack() as stack:
-        for number in range(FIRST_INTRODUCED):
+        for number in range(FIRST_RELAYED):
             other = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             other.bind(("127.0.0.1", discovery_port(domain, number)))
         result = network.run(what, domain=domain)

@@ -32,7 +32,7 @@ def describe(pids: Sequence[int], folders: Iterable[Path]) -> str:
     return "\n".join(lines)
 
 
-def last_words(commands: Iterable[subprocess.Popen[str]]) -> str:
+def last_line(commands: Iterable[subprocess.Popen[str]]) -> str:
     """What commands that have been killed had printed and nobody has read."""
     lines = []
     for command in commands:

@@ -170,7 +170,7 @@ class LinkSettings:
     queue: int = 100  # packets that wait for the one that is being sent; those that find it full are dropped
 
 
-class Fate(Enum):
+class PacketOutcome(Enum):
     """What became of a packet."""
 
     PASSED = auto()
@@ -193,17 +193,17 @@ class Link:
         self._latest = -inf  # when the newest packet arrives
         self.waited = 0  # packets that found another one being sent
 
-    def carry(self, size: int, now: float) -> tuple[Fate, float]:
+    def carry(self, size: int, now: float) -> tuple[PacketOutcome, float]:
         """Take a packet of so many bytes at time ``now`` [s]: what becomes of it, and when it arrives [s]."""
         lost, jitter = self._draw()
         sent = self._send(size, now)
         if sent is None:
-            return Fate.DROPPED, now
+            return PacketOutcome.DROPPED, now
         if lost:
-            return Fate.LOST, now
+            return PacketOutcome.LOST, now
         settings = self._settings
         self._latest = max(self._latest, sent + settings.delay + settings.jitter * (2 * jitter - 1))
-        return Fate.PASSED, self._latest
+        return PacketOutcome.PASSED, self._latest
 
     def skip(self) -> None:
         """Leave out a packet, which has a number like all others."""
@@ -324,9 +324,9 @@ class Forwarder:
             return
         fate, due = link.carry(len(packet), now)
         counts.queued = link.waited
-        if fate is Fate.LOST:
+        if fate is PacketOutcome.LOST:
             counts.lost += 1
-        elif fate is Fate.DROPPED:
+        elif fate is PacketOutcome.DROPPED:
             counts.dropped += 1
         elif due <= now and not self._waiting:
             self._pass(receiver, packet, due)

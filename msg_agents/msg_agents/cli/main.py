@@ -220,7 +220,7 @@ def run(
 
         channel = Channel.load(channel_file, what)
     with page(web, web_host) as served:
-        with RunView(what, served, tells_domain=not as_json) as view:
+        with RunView(what, served, prints_domain=not as_json) as view:
             if served is not None:
                 announce(served, web_host, view.note)
             result = run_network(
@@ -311,7 +311,7 @@ def host(
     host compares the record with the theory, as `msg-agents run` does; the others end with the run.
     """
     from msg_agents.process_layout import Hosts, this_host
-    from msg_agents.run.folder import workshop
+    from msg_agents.run.folder import temporary_directory
     from msg_agents.run.runner import run_network
     from msg_agents.watch.panel import RunView
     from msg_analysis.common.text import agent_name
@@ -326,7 +326,7 @@ def host(
         return
     share = places.share(name or this_host(), discovery_timeout=discovery_timeout, patience=patience)
     mine = show([agent_name(agent + 1, what.names) if what.names else agent + 1 for agent in share.agents])
-    with workshop() as folder, RunView(what) as view:
+    with temporary_directory() as folder, RunView(what) as view:
         also = " and the recorder" if share.home else ""
         view.note(f"this host runs agents {mine}{also} in ROS_DOMAIN_ID {places.domain}")
         result = run_network(

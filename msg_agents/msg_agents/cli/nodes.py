@@ -18,7 +18,7 @@ from click.shell_completion import CompletionItem
 
 from msg_agents.cli.entry_points import RosCommand
 from msg_agents.environment import DISCOVERY_TIMEOUT
-from msg_agents.run.lifeline import hold_pipe
+from msg_agents.run.lifeline import exit_with_pipe
 from msg_analysis.cli.console import examples
 from msg_analysis.cli.options import (
     PATH,
@@ -283,7 +283,7 @@ def _run_nodes(
 
         enter(namespace)
     if lifeline is not None:
-        hold_pipe(lifeline)
+        exit_with_pipe(lifeline)
     from msg_agents.nodes.process import run_nodes
 
     executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")

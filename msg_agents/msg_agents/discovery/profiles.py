@@ -24,9 +24,9 @@ PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES
 _PLACE = Path(__file__).parent / ("fast_dds_3" if has_fast_dds_3(ros_distribution()) else "")
 LOOPBACK_PROFILE = _PLACE / "loopback.xml"
 MOST_PARTICIPANTS = 100  # that find each other in a domain on one machine: maxInitialPeersRange of loopback.xml
-INTRODUCED_PROFILE = _PLACE / "introduced.xml"
-FIRST_INTRODUCED = 32  # participantID of introduced.xml; the numbers below are left to all others
-MOST_INTRODUCED = 206  # participants that are introduced to each other: they fill the ports of two domains
+RELAYED_PROFILE = _PLACE / "introduced.xml"
+FIRST_RELAYED = 32  # participantID of introduced.xml; the numbers below are left to all others
+MOST_RELAYED = 206  # participants that are introduced to each other: they fill the ports of two domains
 NUMBERS_OF_DOMAIN = 119  # of participants whose ports are those of their domain; from there on, of the next one
 UDP_PROFILE = Path(__file__).with_name("udp.xml")
 
@@ -49,7 +49,7 @@ def has_profile_for(topic: str) -> bool:
 
 def domains_for(participants: int) -> int:
     """How many domains in a row have the ports of so many participants that are introduced to each other."""
-    return -(-(FIRST_INTRODUCED + participants) // NUMBERS_OF_DOMAIN)
+    return -(-(FIRST_RELAYED + participants) // NUMBERS_OF_DOMAIN)
 
 
 def profile_for_hosts(

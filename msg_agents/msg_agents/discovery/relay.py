@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
-from msg_agents.discovery.profiles import FIRST_INTRODUCED
+from msg_agents.discovery.profiles import FIRST_RELAYED
 from msg_agents.discovery.rtps import (
     FAST_DDS,
     LOOPBACK,
@@ -45,7 +45,7 @@ MOST_KNOWN = 1000  # participants
 LARGEST = 1 << 16  # bytes of a datagram
 
 
-def write_introduction(descriptor: int, name: str, prefix: bytes) -> None:
+def report_ready(descriptor: int, name: str, prefix: bytes) -> None:
     """Tell the introducer, once, that a process is ready: the name of its first node, and the prefix of its GUIDs.
 
     Without a prefix it stays a stranger, who is introduced to all.
@@ -72,10 +72,10 @@ class _Known:
     passed: float = float("-inf")  # when it was last passed on [s]
 
 
-class Introducer:
+class DiscoveryRelay:
     """A thread that introduces processes to each other; to be used with ``with``, which takes a port for visitors.
 
-    ``descriptor``: where processes write their introductions (``write_introduction``). OSError: no port is left, or no
+    ``descriptor``: where processes write their introductions (``report_ready``). OSError: no port is left, or no
     descriptor.
     """
 
@@ -104,11 +104,11 @@ class Introducer:
         return self
 
     def _bind(self) -> None:
-        for participant in range(FIRST_INTRODUCED):
+        for participant in range(FIRST_RELAYED):
             try:
                 self._socket.bind((LOOPBACK, discovery_port(self._domain, participant)))
             except OSError:
-                if participant == FIRST_INTRODUCED - 1:
+                if participant == FIRST_RELAYED - 1:
                     raise
             else:
                 return
@@ -160,7 +160,7 @@ class Introducer:
             announce_here(message, self._domain)
 
     def _tell_visitors(self, datagram: bytes) -> None:
-        for participant in range(FIRST_INTRODUCED):
+        for participant in range(FIRST_RELAYED):
             with contextlib.suppress(OSError):  # nobody has that number
                 self._socket.sendto(datagram, (LOOPBACK, discovery_port(self._domain, participant)))
 
@@ -192,7 +192,7 @@ class Introducer:
 
     def _has_number_of_run(self, announcement: Announcement) -> bool:
         """Whether it comes from a Fast DDS participant with a number like those of the run."""
-        numbered = announcement.port >= discovery_port(self._domain, FIRST_INTRODUCED)
+        numbered = announcement.port >= discovery_port(self._domain, FIRST_RELAYED)
         return numbered and announcement.vendor == FAST_DDS
 
     def _visits(self, known: _Known) -> bool:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from msg_agents.discovery.profiles import FIRST_INTRODUCED, MOST_INTRODUCED
+from msg_agents.discovery.profiles import FIRST_RELAYED, MOST_RELAYED
 from msg_analysis.errors import InputError
 
 DOMAINS = range(1, 102)
@@ -130,7 +130,7 @@ def multicast_port(domain: int) -> int:
 
 def discovery_ports(domain: int) -> range:
     """Those of all participants that there can be; the last domain has fewer."""
-    first, end = discovery_port(domain, 0), discovery_port(domain, FIRST_INTRODUCED + MOST_INTRODUCED)
+    first, end = discovery_port(domain, 0), discovery_port(domain, FIRST_RELAYED + MOST_RELAYED)
     return range(first, min(end, 1 << 16), 2)
 
 

@@ -48,7 +48,7 @@ class Group(Protocol):
     def record_state(self, message: bytes) -> None:
         """See AgentGroup."""
 
-    def record_truth(self, message: bytes) -> None:
+    def record_exact_state(self, message: bytes) -> None:
         """See AgentGroup."""
 
     def record_contradiction(self, message: bytes, state: bytes) -> None:
@@ -63,13 +63,13 @@ class Group(Protocol):
     def report(self, agent: int, step: int) -> None:
         """See AgentGroup."""
 
-    def ask_again(self, agent: int, step: int) -> None:
+    def request_states(self, agent: int, step: int) -> None:
         """See AgentGroup."""
 
     def reached(self) -> frozenset[str]:
         """See AgentGroup."""
 
-    def hears_all(self) -> bool:
+    def batches_discovered(self) -> bool:
         """See AgentGroup."""
 
     def fail(self, error: Exception) -> None:
@@ -84,7 +84,7 @@ class Agent(NetworkNode):
     """
 
     hears: Qos | None = None  # of its subscriptions to the states of others; None: that of the topic
-    hears_batches = False  # whether it may hear them by the batches of their processes instead
+    reads_batches = False  # whether it may hear them by the batches of their processes instead
 
     def __init__(
         self,
@@ -93,7 +93,7 @@ class Agent(NetworkNode):
         model: Wiring,
         agent: int,  # index from 0
         peers: Sequence[int],  # every other agent that it hears or is heard by at any time, ascending
-        colleagues: Collection[int],  # agents of its process, itself included
+        local_agents: Collection[int],  # agents of its process, itself included
         readers: Sequence[str],  # other nodes that must read the states before the run starts
         checkpoints: Path | None,  # directory of the published states, from which it resumes after a restart
         group: Group,
@@ -113,7 +113,7 @@ class Agent(NetworkNode):
         self._group = group
         self._inputs = [self._law.neighbours(mode) for mode in range(model.modes)]
         self._peers = list(peers)
-        near = set(peers).intersection(colleagues)
+        near = set(peers).intersection(local_agents)
         self.far = [j for j in peers if j not in near]
         self._near = [j for j in peers if j in near]
         self._listeners: list[Callable[[int, int, int, bytes, bytes], str | None]] = []
@@ -152,11 +152,11 @@ class Agent(NetworkNode):
             "start": self._law.step,
         }
 
-    def connect(self, colleagues: Mapping[int, Agent]) -> None:
+    def connect(self, local_agents: Mapping[int, Agent]) -> None:
         """Connect to the peers in this process (by index) by direct calls."""
-        self._listeners = [colleagues[j].hear for j in self._near]
+        self._listeners = [local_agents[j].hear for j in self._near]
 
-    def subscribe_to_far(self) -> None:
+    def subscribe_to_remote(self) -> None:
         """Connect to the peers in other processes by their topics."""
         for j in self.far:
             self._far_states.append(self.subscribe(topics.STATE, self._receiver(j), agent=j, qos=self.hears))
@@ -167,7 +167,7 @@ class Agent(NetworkNode):
     def discovered_all(self) -> bool:
         """See NetworkNode. One that comes back will ask for messages at once, so it must be ready for them."""
         if self.resumed and not (
-            all(states.get_publisher_count() for states in self._far_states) and self._group.hears_all()
+            all(states.get_publisher_count() for states in self._far_states) and self._group.batches_discovered()
         ):
             return False
         expected = self._awaited() + self._others
@@ -198,7 +198,7 @@ class Agent(NetworkNode):
         if self._published.found:
             # All that is kept, for the recorder and for readers outside the run; peers have what is older.
             self._repeat(0, heard_since=0 if self.has_other_readers(self._states) else self._missed_since())
-            self._ask_again(self.far)
+            self._request_states(self.far)
         if not self._law.step:
             self._publish_state(0)
         self._report()
@@ -208,7 +208,7 @@ class Agent(NetworkNode):
         if self._group.missing_recorder():
             return False
         self._repeat(0, heard_since=self._missed_since())
-        self._ask_again(self.far)
+        self._request_states(self.far)
         return True
 
     def _take_over(self) -> bytes | None:
@@ -250,7 +250,7 @@ class Agent(NetworkNode):
         if self._truth is not None:
             if heard:
                 self.publish(self._truth, message)
-            self._group.record_truth(message)
+            self._group.record_exact_state(message)
             message, state = with_state(message, value, len(state)), value
         if heard:
             self.publish(self._states, message)
@@ -266,7 +266,7 @@ class Agent(NetworkNode):
         """See NetworkNode. It goes on from a state that an earlier process published."""
         return self._resumed is not None
 
-    def send_again(self, since: int) -> None:
+    def resend(self, since: int) -> None:
         """Repeat the states from step ``since`` on, for a peer that may have missed them, once all readers are there.
 
         One that has come back, and asks, may not have been matched yet. Requests are latched, and may be old. In a
@@ -302,11 +302,11 @@ class Agent(NetworkNode):
             self._send(step, frame[2], frame[3], message, value, heard=step >= heard_since)
         self._group.send_batches()
 
-    def _ask_again(self, agents: Sequence[int]) -> None:
+    def _request_states(self, agents: Sequence[int]) -> None:
         """Ask those of these agents that are in other processes for states that may have been missed."""
         for j in agents:
             if j not in self._near:
-                self._group.ask_again(j, self._missed_since())
+                self._group.request_states(j, self._missed_since())
 
     def _missed_since(self) -> int:
         """The first step whose state a peer may still need after a restart, of this agent or of itself."""

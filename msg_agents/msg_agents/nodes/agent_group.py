@@ -94,7 +94,7 @@ class Listener:
     refuse: Callable[[str, str], None]  # see ``NetworkNode.refuse``
 
 
-def hears_most(far: int, others: int) -> bool:
+def reads_most(far: int, others: int) -> bool:
     """Whether a process that hears ``far`` of ``others`` agents in other processes is to read the batches of all.
 
     It then reads at most twice as many states as it needs, in as many messages as there are processes.
@@ -123,7 +123,7 @@ class BatchLinks:
 
     def listen(self, listeners: Mapping[int, Sequence[Listener]]) -> bool:
         """Hear these agents (indices from 0) by batches, if that pays; otherwise False."""
-        if not hears_most(len(listeners), len(self._others)):
+        if not reads_most(len(listeners), len(self._others)):
             return False
         self._listeners = listeners
         self._subscription = self._host.subscribe(STATES, self._receive)
@@ -145,7 +145,7 @@ class BatchLinks:
             return frozenset()
         return frozenset(agent_node_name(i) for i in self._others if self._runs_in(i, processes))
 
-    def hears_all(self) -> bool:
+    def batches_discovered(self) -> bool:
         """Whether all processes that are to be heard by batches, if any, have been discovered."""
         if self._subscription is None:
             return True
@@ -224,7 +224,7 @@ class AgentGroup:
                 model=model,
                 agent=i,
                 peers=[int(j) for j in exchanges[i].nonzero()[0]],
-                colleagues=agents,
+                local_agents=agents,
                 readers=readers,
                 checkpoints=checkpoints,
                 group=self,
@@ -255,9 +255,9 @@ class AgentGroup:
             agent.connect(self._agents)
             for j in agent.far:
                 listeners.setdefault(j, []).append(Listener(agent.hear, agent.refuse))
-        if not (self._host.hears_batches and self._links.listen(listeners)):
+        if not (self._host.reads_batches and self._links.listen(listeners)):
             for agent in self.nodes:
-                agent.subscribe_to_far()
+                agent.subscribe_to_remote()
 
     def _end_turns(self) -> None:
         if self._links.heard and not self._sending:  # other processes wait for these states
@@ -280,7 +280,7 @@ class AgentGroup:
         """Send a state as other agents hear it to the recorder."""
         self._states.add(message)
 
-    def record_truth(self, message: bytes) -> None:
+    def record_exact_state(self, message: bytes) -> None:
         """Send the exact state, where that is another one."""
         assert self._truths is not None
         self._truths.add(message)
@@ -309,7 +309,7 @@ class AgentGroup:
         """Tell the switcher which step an agent (index from 0) has reached."""
         self._host.publish(self._progress, self._host.progress(topics.PROGRESS, agent + 1, step))
 
-    def ask_again(self, agent: int, step: int) -> None:
+    def request_states(self, agent: int, step: int) -> None:
         """Ask an agent of another process (index from 0) for its states from a step on, once for all that hear it."""
         if not self._asked:
             self._defer(self._send_requests)
@@ -319,7 +319,7 @@ class AgentGroup:
         asked, self._asked = self._asked, {}
         if self._resend is None:  # rarely needed; latched, so a late discovery only takes its time
             self._resend = self._host.publisher_of(topics.RESEND)
-        if hears_most(len(asked), self._host.record.experiment.agents - len(self.nodes)):
+        if reads_most(len(asked), self._host.record.experiment.agents - len(self.nodes)):
             self._host.publish(self._resend, self._host.progress(topics.RESEND, NOT_AN_AGENT, min(asked.values())))
             return
         for agent, step in asked.items():
@@ -329,9 +329,9 @@ class AgentGroup:
         """Names of the agents of other processes that hear those of this one by batches."""
         return self._links.reached()
 
-    def hears_all(self) -> bool:
+    def batches_discovered(self) -> bool:
         """Whether all processes that this one hears by batches have been discovered."""
-        return self._links.hears_all()
+        return self._links.batches_discovered()
 
     def _receive_resend(self, data: bytes) -> None:
         request = self._host.decode_progress(data, topics.RESEND)
@@ -339,7 +339,7 @@ class AgentGroup:
             return
         for agent in self.nodes:
             if request.agent in (NOT_AN_AGENT, agent.number):
-                agent.send_again(request.step)
+                agent.resend(request.step)
 
     def _receive_stop(self, data: bytes) -> None:
         stop = self._host.decode_progress(data, topics.STOP)

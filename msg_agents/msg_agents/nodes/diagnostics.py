@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 from msg_agents.nodes.ros import LeanNode, every, until_shutdown
-from msg_agents.run.result import write_account
+from msg_agents.run.result import write_status
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.topics import DIAGNOSTICS
 
@@ -76,4 +76,4 @@ class HealthReporter:
         """Write the status file atomically, if there is one."""
         if self._account is not None:
             refused = [(node.get_name(), *what, count) for node in self._nodes for what, count in node.refused.items()]
-            write_account(self._account, refused, self._waiting)
+            write_status(self._account, refused, self._waiting)

@@ -11,7 +11,7 @@ from typing import Any
 from msg_agents.nodes.agent import Agent
 from msg_agents.nodes.diagnostics import Health
 from msg_agents.nodes.ros import after
-from msg_agents.stepping.state_receiver import LookBackSynchronizer
+from msg_agents.stepping.state_receiver import DelayedSynchronizer
 from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, Synchronizer
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.protocols import ProtocolError
@@ -23,7 +23,7 @@ from msg_analysis.model.reception import AgentAir
 class LockstepAgent(Agent):
     """Connects topics, synchronizer and law; options as in Agent."""
 
-    hears_batches = True
+    reads_batches = True
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -33,7 +33,7 @@ class LockstepAgent(Agent):
         self._synchronizer: Synchronizer[bytes]
         if air and air.looks_back:
             self._require_kept_values(air)
-            self._synchronizer = LookBackSynchronizer(needed=air.needed, delay=air.delay, **options)
+            self._synchronizer = DelayedSynchronizer(needed=air.needed, delay=air.delay, **options)
         else:
             self._synchronizer = Synchronizer(**options)
 
@@ -75,7 +75,7 @@ class LockstepAgent(Agent):
             )  # the others have started without this one
         elif overdue:
             self.get_logger().warning(f"no step for {stall.stalled:.0f} s at step {step}: waiting for {waiting}")
-            self._ask_again(self._synchronizer.lacking())
+            self._request_states(self._synchronizer.lacking())
         return Health(f"at step {step}, waiting for {waiting}", waiting=True, values=values | {"waiting for": waiting})
 
     def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:  # noqa: ARG002

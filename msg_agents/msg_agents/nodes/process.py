@@ -23,7 +23,7 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from msg_agents.discovery.relay import write_introduction
+from msg_agents.discovery.relay import report_ready
 from msg_agents.discovery.rtps import PREFIX_SIZE, remove_participant
 from msg_agents.environment import discovery_scope
 from msg_agents.nodes.base import ACK_TIMEOUT, NetworkNode, PeerPresence, exit_after
@@ -83,7 +83,7 @@ def run_nodes(
     throughput: bool = True,  # see ``prefer_throughput``
     use_sim_time: bool = False,
     account: Path | None = None,  # status file, written once a second and at the end
-    introduction: int | None = None,  # descriptor for what ``Introducer`` wants to know
+    introduction: int | None = None,  # descriptor for what ``DiscoveryRelay`` wants to know
     patience: float | None = None,  # s, see ``PeerPresence``; None: no limit
 ) -> bool:
     """Run nodes until each has done its part; False if the process was told to stop (SIGINT, SIGTERM) before.
@@ -118,7 +118,7 @@ def run_nodes(
         nodes = make_nodes()
         if introduction is not None:
             prefix = own_prefix(nodes[0])
-            write_introduction(introduction, nodes[0].get_name(), prefix)
+            report_ready(introduction, nodes[0].get_name(), prefix)
         reporter = HealthReporter(nodes, account)
         presence = None if patience is None else PeerPresence(nodes, patience)
         spinner = make_executor(executor)

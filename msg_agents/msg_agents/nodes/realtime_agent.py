@@ -14,7 +14,7 @@ from msg_agents.nodes.agent import Agent
 from msg_agents.nodes.diagnostics import CLOCK_BOUND, Health
 from msg_agents.nodes.ros import DueTimer
 from msg_agents.nodes.switcher import EPOCH_DELAY
-from msg_agents.stepping.newest_values import CLOCK_MARGIN, NewestOnAir, NewestValues, Schedule
+from msg_agents.stepping.newest_values import CLOCK_MARGIN, NewestReceived, NewestValues, Schedule
 from msg_agents.stepping.synchronizer import NOTHING
 from msg_analysis.arithmetic.step_clock import SECOND
 from msg_analysis.experiment.protocols import ProtocolError
@@ -49,7 +49,7 @@ class RealtimeAgent(Agent):
         self._newest: NewestValues[Value]
         if air and (air.loss or air.delay):
             holds = experiment.noise.holds
-            self._newest = NewestOnAir(delay=air.delay, lost=air.lost, holds=holds, **options)
+            self._newest = NewestReceived(delay=air.delay, lost=air.lost, holds=holds, **options)
         else:
             self._newest = NewestValues(**options)
         self._made = stamp_ns(self._resumed) if self._resumed else 0  # simulated time [ns] of the newest state

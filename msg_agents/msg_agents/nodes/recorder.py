@@ -80,7 +80,7 @@ class Recorder(NetworkNode):
 
     def health(self) -> Health:
         """Number of recorded messages. One that has everything says so again, as agents that stand do."""
-        self._tell_if_complete()
+        self._report_if_complete()
         values = {"messages": str(self.bag.messages), "topics without their last message": str(len(self._awaiting))}
         return Health(f"{self.bag.messages} messages recorded", values=values)
 
@@ -162,7 +162,7 @@ class Recorder(NetworkNode):
         for kind, newest in zip(self._kinds, self._newest, strict=True):
             there += [kind.names[agent] for agent in np.flatnonzero(newest >= self._last).tolist()]
         self._awaiting.difference_update(there)
-        self._tell_if_complete()
+        self._report_if_complete()
 
     def _record_experiment(self, data: bytes) -> None:
         known = self._root + topics.EXPERIMENT.name not in self._awaiting
@@ -190,9 +190,9 @@ class Recorder(NetworkNode):
     def _received_last(self, topic: str) -> None:
         if topic in self._awaiting:
             self._awaiting.remove(topic)
-            self._tell_if_complete()
+            self._report_if_complete()
 
-    def _tell_if_complete(self) -> None:
+    def _report_if_complete(self) -> None:
         if not self._awaiting:
             self.publish(self._progress, self.progress(topics.PROGRESS, NOT_AN_AGENT, self._last))
 

@@ -28,7 +28,7 @@ YOUTH = 60.0  # s; younger folders may belong to a run that has not locked its o
 
 
 @contextmanager
-def workshop(room: int | None = None) -> Iterator[Path]:
+def temporary_directory(room: int | None = None) -> Iterator[Path]:
     """A folder that is removed at the end; those that killed runs left behind are removed first.
 
     A lock, which ends with its process, marks folders in use. ``room``: bytes that will be mapped into memory; the

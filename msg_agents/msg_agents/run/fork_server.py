@@ -103,7 +103,7 @@ class NodeStart:
     core: int | None  # to which it keeps
 
 
-class NodeServer:
+class ForkServer:
     """The fork server of a network, as seen by the process that runs it: a context, at whose end the server is gone.
 
     It imports while its user goes on; the first fork waits for that. It leaves no process behind but those that it has

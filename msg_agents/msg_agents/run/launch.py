@@ -21,9 +21,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from msg_agents.process_layout import RECORDER, ProcessPlan, plan_network
+from msg_agents.process_layout import RECORDER, ProcessSpec, lay_out_network
 from msg_agents.replay import parse_rate
-from msg_agents.run.folder import load_with_overrides, make_bag_directory, workshop
+from msg_agents.run.folder import load_with_overrides, make_bag_directory, temporary_directory
 from msg_agents.run.supervisor import failure_of
 from msg_analysis.bags.mcap_chunks import MEGABYTE, SMALLEST_SPLIT, Storage
 from msg_analysis.common.files import REPORT_FILE
@@ -183,15 +183,15 @@ class LaunchedProcesses:
         self.namespace = namespace.strip()
         self._stack = ExitStack()
         # Its lock is the lifeline of the processes: SIGTERM ends launch without a word to them.
-        self._folder = self._stack.enter_context(workshop())
+        self._folder = self._stack.enter_context(temporary_directory())
         atexit.register(self.close)
-        self.processes: list[ProcessPlan] = []
+        self.processes: list[ProcessSpec] = []
         self.reason: str | None = None  # why these processes have failed
         self._interruption: str | None = None  # why launch has stopped them
         self._running: set[str] = set()
         self._stopped: set[str] = set()
 
-    def _plan(self, processes: Sequence[ProcessPlan]) -> None:
+    def _plan(self, processes: Sequence[ProcessSpec]) -> None:
         lifeline = ("--lifeline-lock", str(self._folder))
         self.processes = [replace(plan, arguments=plan.arguments + lifeline) for plan in processes]
         self._running = {plan.name for plan in processes}
@@ -253,12 +253,12 @@ class LaunchedNetwork(LaunchedProcesses):
         self._run_file = self._folder / "run.json"
         self._run_file.write_text(new_record(experiment).to_json(with_key=True), encoding="utf-8")
         try:
-            plan_network(experiment, self._run_file, None)  # rejects too many processes before anything is made
+            lay_out_network(experiment, self._run_file, None)  # rejects too many processes before anything is made
             if record:
                 out = Path(arguments["out"]).expanduser().absolute()
                 self.bag = make_bag_directory(experiment, out, option="out:=")
             # Of each, ``arguments[0]`` is the executable.
-            plans = plan_network(
+            plans = lay_out_network(
                 experiment,
                 self._run_file,
                 self.bag,
@@ -324,9 +324,9 @@ class LaunchedReplay(LaunchedProcesses):
         live = flag(arguments, "live")
         super().__init__(arguments["namespace"])
         if live:
-            plans = [ProcessPlan("live", ("live", "--reliable")), ProcessPlan("player", (*player, "--await", "live"))]
+            plans = [ProcessSpec("live", ("live", "--reliable")), ProcessSpec("player", (*player, "--await", "live"))]
         else:
-            plans = [ProcessPlan("player", player)]
+            plans = [ProcessSpec("player", player)]
         self._plan(plans)
 
 

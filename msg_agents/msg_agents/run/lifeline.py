@@ -22,7 +22,7 @@ from pathlib import Path
 GRACE = 5.0  # s
 
 
-def hold_pipe(descriptor: int) -> None:
+def exit_with_pipe(descriptor: int) -> None:
     """End this process when the other end of a pipe closes: its parent has ended."""
 
     def wait() -> None:
@@ -32,8 +32,8 @@ def hold_pipe(descriptor: int) -> None:
     _end_after(wait)
 
 
-def hold_lock(folder: Path) -> None:
-    """End this process when a folder is no longer locked, or gone: its parent has ended, see ``workshop``."""
+def exit_with_lock(folder: Path) -> None:
+    """End this process when a folder is no longer locked, or gone: its parent has ended, see ``temporary_directory``."""
 
     def wait() -> None:
         with contextlib.suppress(OSError):

@@ -3,7 +3,7 @@
 
 """Files in which the processes of a run report to the runner: neither side ever waits for the other.
 
-Account files have refused messages and what the nodes wait for; the file of steps, how far every agent is; that of
+StatusSummary files have refused messages and what the nodes wait for; the file of steps, how far every agent is; that of
 clocks, how far those of several hosts are apart.
 """
 
@@ -31,7 +31,7 @@ Refused = tuple[str, str, str, int]  # node, topic, reason, count
 
 
 @dataclass(slots=True)
-class Account:
+class StatusSummary:
     """Sum of the account files of a run."""
 
     refused: Counter[tuple[str, str, str]] = field(default_factory=Counter)  # by (node, topic, reason)
@@ -45,7 +45,7 @@ class Account:
         ]
 
 
-def write_account(path: Path, refused: Sequence[Refused], waiting: Mapping[str, str]) -> None:
+def write_status(path: Path, refused: Sequence[Refused], waiting: Mapping[str, str]) -> None:
     """Replace the account file of one process atomically; an error such as a full disk is ignored."""
     _replace(path, {"refused": refused, "waiting": waiting})
 
@@ -84,9 +84,9 @@ def _replace(path: Path, document: Any) -> None:
         temporary.replace(path)
 
 
-def read_accounts(paths: Iterable[Path]) -> Account:
+def read_status_files(paths: Iterable[Path]) -> StatusSummary:
     """Add up account files, given in the order of the starts; missing or damaged files are left out."""
-    account = Account()
+    account = StatusSummary()
     waiting: dict[str, str] = {}
     for path in paths:
         with contextlib.suppress(OSError, ValueError):
@@ -98,7 +98,7 @@ def read_accounts(paths: Iterable[Path]) -> Account:
     return account
 
 
-_ACCOUNT_EVERY = 1.0  # s between two looks at the files of refused messages
+_STATUS_PERIOD = 1.0  # s between two looks at the files of refused messages
 
 
 class EventLog:
@@ -111,7 +111,7 @@ class EventLog:
         self._events, self._clock = events, clock
         self._absent: dict[str, tuple[Sequence[int], int]] = {}  # by node: its agents from 0, their step
         self._refused: set[tuple[str, str, str]] = set()
-        self._next_account = clock()
+        self._next_status = clock()
         self._newest = 0
 
     def killed(self, node: str, agents: Sequence[int], step: int, words: str) -> None:
@@ -123,16 +123,16 @@ class EventLog:
             self._absent[node] = agents, step
         self._add("killed", step if agents else self._newest, node, words)
 
-    def look(self, steps: Sequence[int], account: Callable[[], Account], *, last: bool = False) -> None:
+    def look(self, steps: Sequence[int], account: Callable[[], StatusSummary], *, last: bool = False) -> None:
         """Note who is back and what is refused, given the newest step of every agent; ``last``: at the end."""
         newest = self._newest = max(steps, default=0)
         for node, (agents, step) in list(self._absent.items()):
             if steps and min(steps[agent] for agent in agents) > step:
                 del self._absent[node]
                 self._add("back", newest, node, f"{node}: back")
-        if self._clock() < self._next_account and not last:
+        if self._clock() < self._next_status and not last:
             return
-        self._next_account = self._clock() + _ACCOUNT_EVERY
+        self._next_status = self._clock() + _STATUS_PERIOD
         for key in sorted(set(account().refused) - self._refused):
             self._refused.add(key)
             node, topic, reason = key

@@ -21,7 +21,7 @@ from msg_agents.channel.process import channel_findings, hand_over
 from msg_agents.discovery.profiles import LEASE, profile_for_hosts
 from msg_agents.discovery.rtps import PEERS_VARIABLE
 from msg_agents.environment import channel_environment
-from msg_agents.process_layout import SWITCHER, ProcessPlan
+from msg_agents.process_layout import SWITCHER, ProcessSpec
 from msg_agents.run.supervisor import Supervisor
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
@@ -56,11 +56,11 @@ class RunChannel:
         peers = " ".join(host.address for host in self.hosts.values())
         return channel_environment(profile) | {PEERS_VARIABLE: peers}
 
-    def start(self, supervisor: Supervisor, plans: Sequence[ProcessPlan], wiring: Wiring, *, lockstep: bool) -> None:
+    def start(self, supervisor: Supervisor, plans: Sequence[ProcessSpec], wiring: Wiring, *, lockstep: bool) -> None:
         """Start its process, and say on which host each of the others is to be."""
         self._lockstep = lockstep
         control = supervisor.start_channel()
-        counts = supervisor.channel_account
+        counts = supervisor.channel_status
         active_graph = counts.with_name("active_graph") if self.channel.graph else None
         if active_graph is not None:
             self._active = ActiveGraphFile.create(active_graph, len(self.hosts))
@@ -90,7 +90,7 @@ class RunChannel:
             name: {"address": host.address, "agents": [agent + 1 for agent in self.channel.hosts[name]]}
             for name, host in self.hosts.items()
         }
-        counts = read_counts(supervisor.channel_account) or {"pairs": [], "overflowed": 0, "late_ms": None}
+        counts = read_counts(supervisor.channel_status) or {"pairs": [], "overflowed": 0, "late_ms": None}
         for pair in counts["pairs"]:
             model = self.channel.links[pair["sender"], pair["receiver"]].loss
             pair |= {"loss": model.mean, "inflation": model.inflation}

@@ -14,23 +14,23 @@ from dataclasses import replace
 from pathlib import Path
 
 from msg_agents.channel.channel_file import Channel
-from msg_agents.environment import RESTARTS, ROS_LOGS, require_middleware, surroundings, will_introduce
+from msg_agents.environment import RESTARTS, ROS_LOGS, require_middleware, run_environment, uses_relay
 from msg_agents.process_layout import (
     MOST_PROCESSES,
     MOST_UNAIDED,
     SWITCHER,
     Share,
     count_processes,
+    lay_out_network,
     partners,
     place,
-    plan_network,
 )
 from msg_agents.recovery import entry_size, room_for
-from msg_agents.run.folder import make_bag_directory, workshop
-from msg_agents.run.fork_server import NodeServer
+from msg_agents.run.folder import make_bag_directory, temporary_directory
+from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.result import EventLog, RunResult
 from msg_agents.run.run_channel import RunChannel, run_channel
-from msg_agents.run.supervisor import ACCOUNTS, CLOCKS, CRASHED, LATE, STEPS, Supervisor
+from msg_agents.run.supervisor import CLOCKS, CRASHED, LATE, STATUS_FOLDER, STEPS, Supervisor
 from msg_agents.stepping.stall_detection import ClockDetector, LagDetector, StallDetector
 from msg_agents.terminal import Interruption
 from msg_agents.watch.observer import EarlyEnd
@@ -131,7 +131,7 @@ def run_network(
     """
     view = view or View(on_progress, on_note)
     experiment.require_available()
-    most = MOST_PROCESSES if channel is None and will_introduce(environment or {}) else MOST_UNAIDED
+    most = MOST_PROCESSES if channel is None and uses_relay(environment or {}) else MOST_UNAIDED
     processes = count_processes(experiment, None if share is None else len(share.agents), most=most)
     directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
     bag = directory if share is None or share.home else None
@@ -140,8 +140,8 @@ def run_network(
     try:
         with (
             run_channel(channel) as linked,
-            workshop() as folder,
-            surroundings(
+            temporary_directory() as folder,
+            run_environment(
                 folder,
                 domain,
                 {**(environment or {}), **(linked.environment(folder) if linked else {})},
@@ -149,7 +149,7 @@ def run_network(
             ) as around,
         ):
             variables = around.environment
-            with NodeServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
+            with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 require_middleware(variables, *([fork_server.has_middleware] if fork_server else []))
                 if share is None and linked is None:  # other hosts and users' tools do not reach those of a channel
                     view.joined(around.domain)
@@ -158,7 +158,7 @@ def run_network(
                 run_file.write_text(record.to_json(with_key=True), encoding="utf-8")
                 kept.keep()
                 with (
-                    workshop(experiment.agents * room_for(entry_size(record)))
+                    temporary_directory(experiment.agents * room_for(entry_size(record)))
                     if restarts or until
                     else nullcontext() as checkpoints,
                     Supervisor(
@@ -170,7 +170,7 @@ def run_network(
                         ends_hung=share is None,  # with several hosts, the switcher waits for others at its end
                     ) as supervisor,
                 ):
-                    plans = plan_network(
+                    plans = lay_out_network(
                         experiment,
                         run_file,
                         bag,
@@ -307,7 +307,7 @@ def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View
             return False
         step = min((supervisor.steps[i] for i in child.plan.agents), default=-1) if supervisor.steps else -1
         after = f" after step {step}" if step >= 0 else ""
-        words = f" ({child.last_words()})" if child.process.poll() == CRASHED else ""
+        words = f" ({child.last_line()})" if child.process.poll() == CRASHED else ""
         result.restarts.append(f"{child.plan.name}: {child.failure}{words}{after}, started again")
         events.killed(child.plan.name, child.plan.agents, step, result.restarts[-1])
         view.note(result.restarts[-1])
@@ -324,7 +324,7 @@ def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: I
         where = "" if unknown else f"at step {reached} of {steps}" if reached >= 0 else "before step 0"
         result.interrupt(number, where)
     for child in supervisor.failures:
-        words = child.last_words()
+        words = child.last_line()
         line = f"{child.plan.name}: {child.failure}" + (f": {words}" if words else "")
         if child.resumes and result.restarts:
             counts = {c.plan.name: c.number - 1 for c in supervisor.children if c.number > 1}
@@ -337,7 +337,7 @@ def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: I
 
 def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
     try:
-        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(ACCOUNTS, STEPS, CLOCKS, ROS_LOGS))
+        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(STATUS_FOLDER, STEPS, CLOCKS, ROS_LOGS))
     except OSError as error:
         # The argument of shutil.Error is a list of (from, to, reason).
         reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)

@@ -19,11 +19,11 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from msg_agents.discovery.relay import Introducer
-from msg_agents.process_layout import CHANNEL, RECORDER, SWITCHER, ProcessPlan, keep_to
-from msg_agents.run.fork_server import NodeServer, NodeStart, Process
+from msg_agents.discovery.relay import DiscoveryRelay
+from msg_agents.process_layout import CHANNEL, RECORDER, SWITCHER, ProcessSpec, pin_to_core
+from msg_agents.run.fork_server import ForkServer, NodeStart, Process
 from msg_agents.run.lifeline import SHOW_STACKS, HungDetector
-from msg_agents.run.result import Account, read_accounts, read_clocks, read_steps
+from msg_agents.run.result import StatusSummary, read_clocks, read_status_files, read_steps
 from msg_analysis.errors import ExitCode
 
 ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
@@ -40,7 +40,7 @@ CHANNEL_SILENCE = 10.0  # s after which a channel that reports nothing is given 
 EARLY = 3.0  # s after which an agent that has ended without its last step is not waited for any more
 LATE = 10.0  # s after the end of the run after which a process that has not left is not waited for any more
 CRASHED = 1  # exit code of Python after an uncaught exception
-ACCOUNTS, STEPS, CLOCKS = "accounts", "steps.json", "clocks.json"
+STATUS_FOLDER, STEPS, CLOCKS = "accounts", "steps.json", "clocks.json"
 
 
 def failure_of(code: int) -> str | None:
@@ -54,13 +54,13 @@ def failure_of(code: int) -> str | None:
 class Child:
     """A process of the network."""
 
-    plan: ProcessPlan
+    plan: ProcessSpec
     process: Process
     log: Path  # file of what it printed
     number: int = 1  # of this start; 2: restarted once
     ended: float | None = None  # when it was first seen to have ended with exit code 0 [s]
     early: bool = False  # whether it did so before its last step
-    given_up: str | None = None  # why it was ended
+    end_reason: str | None = None  # why it was ended
     dismissed: bool = False  # whether it was told to end because the run was over
     detector: HungDetector = field(init=False)
 
@@ -73,9 +73,9 @@ class Child:
         return self.process.poll() is None
 
     @property
-    def age_of_account(self) -> float:
+    def status_age(self) -> float:
         """Seconds since it last wrote its account; inf: never."""
-        path = self.log.parent / ACCOUNTS / f"{self.plan.name}.{self.number}.json"
+        path = self.log.parent / STATUS_FOLDER / f"{self.plan.name}.{self.number}.json"
         try:
             return time.time() - path.stat().st_mtime
         except OSError:
@@ -90,8 +90,8 @@ class Child:
     def failure(self) -> str | None:
         """How it failed, in words; None if it is running or has ended well."""
         code = self.process.poll()
-        if self.given_up:
-            return self.given_up
+        if self.end_reason:
+            return self.end_reason
         if self.early:
             return f"exit code {code} before its last step"
         if self.dismissed and code == ExitCode.INCOMPLETE:
@@ -110,9 +110,9 @@ class Child:
             return False
         return code < 0 or (code == CRASHED and self.number == 1)
 
-    def last_words(self) -> str:
+    def last_line(self) -> str:
         """The last line that it printed; none of one that was ended, since it did not say why."""
-        if self.given_up:
+        if self.end_reason:
             return ""
         with contextlib.suppress(OSError):
             lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
@@ -133,19 +133,19 @@ class Supervisor:
     steps: list[int] = field(default_factory=list)  # newest step of every agent, as reported
     cores: Mapping[str, int] = field(default_factory=dict)  # by name of the process; the others are not pinned
     last_step: int = 0  # of the run
-    fork_server: NodeServer | None = None  # without one, or when it has ended, every child starts on its own
-    introducer: Introducer | None = None  # without one, the children look for each other
+    fork_server: ForkServer | None = None  # without one, or when it has ended, every child starts on its own
+    introducer: DiscoveryRelay | None = None  # without one, the children look for each other
     namespaces: Mapping[str, int] = field(default_factory=dict)  # descriptors by name of the process; else that of ours
     options: Mapping[str, Sequence[str]] = field(default_factory=dict)  # more of them, by name of the process
     ends_hung: bool = False  # whether processes that have hung are ended
     channel: Child | None = None  # carries the packets of the others; not one of ``children``: it has no part to do
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
-    _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
+    _status_files: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
     _looked: float = field(default=0.0, init=False)  # for processes that have hung [s of the monotonic clock]
     _over_since: float | None = field(default=None, init=False)  # [s of the monotonic clock]
     _control: socket.socket | None = field(default=None, init=False)  # of the channel, which ends when it is closed
 
-    def start(self, plans: Sequence[ProcessPlan]) -> None:
+    def start(self, plans: Sequence[ProcessSpec]) -> None:
         """Start all processes."""
         self._lifeline = os.pipe()
         for first in range(0, len(plans), AT_ONCE):
@@ -155,23 +155,23 @@ class Supervisor:
         """Start the process of a channel, before all others; the socket at which it waits for ``hand_over``."""
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
-            plan = ProcessPlan(CHANNEL, (CHANNEL, "--control", str(theirs.fileno())))
+            plan = ProcessSpec(CHANNEL, (CHANNEL, "--control", str(theirs.fileno())))
             (self.channel,) = self._start([(plan, 1)])
         return self._control
 
     @property
-    def channel_account(self) -> Path:
+    def channel_status(self) -> Path:
         """The file in which the channel says what it did."""
-        return self.logs / ACCOUNTS / f"{CHANNEL}.1.json"
+        return self.logs / STATUS_FOLDER / f"{CHANNEL}.1.json"
 
     def restart(self, child: Child) -> None:
         """Start a process that has ended again; the new child takes its place in ``children``."""
         place = self.children.index(child)
         self.children[place : place + 1] = self._start([(child.plan, child.number + 1)])
 
-    def _start(self, plans: Sequence[tuple[ProcessPlan, int]]) -> list[Child]:
+    def _start(self, plans: Sequence[tuple[ProcessSpec, int]]) -> list[Child]:
         """Start processes; the numbers count the starts of each."""
-        (self.logs / ACCOUNTS).mkdir(exist_ok=True)
+        (self.logs / STATUS_FOLDER).mkdir(exist_ok=True)
         with contextlib.ExitStack() as stack:
             logs = [stack.enter_context(self._log(plan).open("ab")) for plan, _ in plans]
             starts = [self._node_start(*each, log.fileno()) for each, log in zip(plans, logs, strict=True)]
@@ -184,15 +184,15 @@ class Supervisor:
             for (plan, number), process in zip(plans, processes, strict=True)
         ]
 
-    def _log(self, plan: ProcessPlan) -> Path:
+    def _log(self, plan: ProcessSpec) -> Path:
         return self.logs / f"{plan.name}.log"
 
-    def _node_start(self, plan: ProcessPlan, number: int, output: int) -> NodeStart:
+    def _node_start(self, plan: ProcessSpec, number: int, output: int) -> NodeStart:
         if plan.name == CHANNEL:
             *command, option, control = plan.arguments
             return NodeStart(command, {option: int(control)}, output, None)
-        account = self.logs / ACCOUNTS / f"{plan.name}.{number}.json"
-        self._accounts.append(account)
+        account = self.logs / STATUS_FOLDER / f"{plan.name}.{number}.json"
+        self._status_files.append(account)
         arguments = [*plan.arguments, "--account", str(account), *self.options.get(plan.name, ())]
         if plan.name == SWITCHER:
             arguments += ["--steps", str(self.logs / STEPS), "--clocks", str(self.logs / CLOCKS)]
@@ -216,14 +216,14 @@ class Supervisor:
             start_new_session=True,
         )
         if node.core is not None:
-            keep_to(process.pid, node.core)
+            pin_to_core(process.pid, node.core)
         return process
 
     def read_status(self) -> None:
         """Read what the switcher has reported, and note agents that have ended too early: their code may end Python."""
         self.steps = read_steps(self.logs / STEPS) or self.steps
-        if self.channel and CHANNEL_SILENCE < self.channel.age_of_account < math.inf and self.channel.running:
-            self.channel.given_up = f"no report for {CHANNEL_SILENCE:g} s, as if it was stopped"
+        if self.channel and CHANNEL_SILENCE < self.channel.status_age < math.inf and self.channel.running:
+            self.channel.end_reason = f"no report for {CHANNEL_SILENCE:g} s, as if it was stopped"
             self.channel.process.send_signal(signal.SIGKILL)
         if self.ends_hung and time.monotonic() >= self._looked + LOOK:
             self._looked = time.monotonic()
@@ -240,7 +240,7 @@ class Supervisor:
         """End processes that have hung: the others would wait for them for ever."""
         for child in self.running:
             if words := child.detector.update():
-                child.given_up = f"{words} (stacks in log/{child.log.name})"
+                child.end_reason = f"{words} (stacks in log/{child.log.name})"
                 self._end([child], AFTER_HANG)
 
     def dismiss_late(self) -> list[str]:
@@ -270,9 +270,9 @@ class Supervisor:
         """Children that have not ended."""
         return [child for child in self.children if child.running]
 
-    def account(self) -> Account:
+    def account(self) -> StatusSummary:
         """What the nodes have refused, and what they wait for."""
-        return read_accounts(self._accounts)
+        return read_status_files(self._status_files)
 
     def clocks(self) -> tuple[list[dict[str, Any]] | None, str | None]:
         """How far the clocks of several hosts are apart, and a warning."""
@@ -282,12 +282,12 @@ class Supervisor:
     def silent(self) -> list[Child]:
         """Running children that have not written their account lately."""
         running = self.running + ([self.channel] if self.channel and self.channel.running else [])
-        return [child for child in running if child.age_of_account > SILENCE]
+        return [child for child in running if child.status_age > SILENCE]
 
     @property
     def starting_again(self) -> list[Child]:
         """Restarted children that have not found all others yet: they write no account before."""
-        return [child for child in self.running if child.number > 1 and child.age_of_account == math.inf]
+        return [child for child in self.running if child.number > 1 and child.status_age == math.inf]
 
     @property
     def over(self) -> bool:

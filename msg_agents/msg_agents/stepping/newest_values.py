@@ -215,7 +215,7 @@ class NewestValues(AgentInputs[Value]):
         return {j: self.step - newest for j, newest in self._newest.items()}
 
 
-class NewestOnAir(NewestValues[Value]):
+class NewestReceived(NewestValues[Value]):
     """The same with messages that are lost, or ``delay`` steps old.
 
     Of an agent with a newest state x(n), a step uses the newest of those up to x(n - delay), and the own value where

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_agents.stepping.synchronizer import KEPT_AFTER_USE, RESEND_LIMIT, ReceivedSteps, Synchronizer, Value, marks_of
+from msg_agents.stepping.synchronizer import HISTORY_STEPS, RESEND_LIMIT, ReceivedSteps, Synchronizer, Value, hashes_of
 from msg_analysis.bags.mcap_chunks import gather
 from msg_analysis.bags.state_columns import States, own_layout, run_number
 from msg_analysis.common.arrays import BoolArray, IntArray
@@ -21,7 +21,7 @@ from msg_analysis.messages.topics import TRUTHS, Topic
 from msg_analysis.model.run_record import RunRecord
 
 
-class LookBackSynchronizer(Synchronizer[Value]):
+class DelayedSynchronizer(Synchronizer[Value]):
     """As Synchronizer, but step k uses x_j(``needed``(j, k)), a step that is at most k and does not fall with k.
 
     Values may come in any order: those that are sent again after a restart come behind newer ones. A value that is
@@ -32,7 +32,7 @@ class LookBackSynchronizer(Synchronizer[Value]):
         self._needed_step = needed
         self._held: dict[int, tuple[int, Value]] = {}  # by place
         self._oldest: list[int] = []  # by place, the step of the value that the next step would use
-        super().__init__(kept=max(KEPT_AFTER_USE, delay + 1), **options)
+        super().__init__(kept=max(HISTORY_STEPS, delay + 1), **options)
         self._look()
 
     def _look(self) -> None:
@@ -183,7 +183,7 @@ class StateReceiver:
         if not len(agent):
             return new
         order = np.argsort(agent.astype(np.uint16), kind="stable")  # a radix sort; a bag has fewer topics than 2^16
-        agents, steps, marks = agent[order], step[order], marks_of(contents[order])
+        agents, steps, marks = agent[order], step[order], hashes_of(contents[order])
         first = np.flatnonzero(np.diff(agents, prepend=-1))  # of each agent
         follows = np.diff(steps, prepend=0) == 1
         follows[first] = True

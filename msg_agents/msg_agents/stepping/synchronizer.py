@@ -119,7 +119,7 @@ LOCKSTEP_WINDOW = 64
 RESEND_LIMIT = 6000
 """Most steps that an agent keeps, and sends again when another one was killed; older ones are never sent again."""
 
-KEPT_AFTER_USE = LOCKSTEP_WINDOW
+HISTORY_STEPS = LOCKSTEP_WINDOW
 """Steps for which a value is kept after its use, to notice a different one for the same step: one of the two is forged.
 The true one may come second, when its sender, up to a window behind, makes that step."""
 
@@ -155,7 +155,7 @@ class Synchronizer(AgentInputs[Value]):
     ``kept``: steps for which values are kept after they became the newest.
     """
 
-    def __init__(self, *, window: int = LOCKSTEP_WINDOW, kept: int = KEPT_AFTER_USE, **options: Any) -> None:
+    def __init__(self, *, window: int = LOCKSTEP_WINDOW, kept: int = HISTORY_STEPS, **options: Any) -> None:
         super().__init__(**options)
         self._window, self._kept = window, kept
         self._places = {j: place for place, j in enumerate(self._newest)}  # of the peers in a row
@@ -314,7 +314,7 @@ CONSECUTIVE = 64
 """Steps in a row after which those before them are taken for lost: the reader came late, for example."""
 
 
-def marks_of(contents: IntArray) -> array[int]:
+def hashes_of(contents: IntArray) -> array[int]:
     """Marks of so many contents: numbers of 30 bits, not 0."""
     return array("i", ((contents & _MASK) + 1).astype(np.int32).tobytes())
 

@@ -308,10 +308,10 @@ LINES = 10.0  # s between two lines where there is no terminal
 class RunView(View):
     """Shows a run in all these ways; a context."""
 
-    def __init__(self, experiment: Experiment, web: WebServer | None = None, *, tells_domain: bool = True) -> None:
+    def __init__(self, experiment: Experiment, web: WebServer | None = None, *, prints_domain: bool = True) -> None:
         from msg_analysis.common.text import SafeConsole
 
-        self._experiment, self._tells_domain = experiment, tells_domain
+        self._experiment, self._tells_domain = experiment, prints_domain
         self._console = SafeConsole(stderr=True)
         self.display = Display(self._console, web, panel=self._console.is_terminal, transient=True)
         self._source = SnapshotSource(experiment)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from msg_agents.channel.links import Fate, Link, LinkSettings, LossModel
+from msg_agents.channel.links import Link, LinkSettings, LossModel, PacketOutcome
 
 PACKETS = 100_000
 LEVEL = 1e-6  # false-alarm rate of each statistical test; the seeds are fixed, so it does not change from run to run
@@ -18,7 +18,7 @@ LEVEL = 1e-6  # false-alarm rate of each statistical test; the seeds are fixed, 
 def fates(settings: LinkSettings, seed: int = 1, packets: int = PACKETS, pair: tuple[int, int] = (2, 3)) -> np.ndarray:
     """Whether each packet is lost."""
     link = Link(settings, seed, *pair)
-    return np.array([link.carry(100, 0.0)[0] is Fate.LOST for _ in range(packets)])
+    return np.array([link.carry(100, 0.0)[0] is PacketOutcome.LOST for _ in range(packets)])
 
 
 def loss(probability: float) -> LinkSettings:
@@ -37,7 +37,7 @@ def test_losses_are_the_numbers_of_the_philox_streams() -> None:
 
 def test_losses_are_independent_of_times_and_sizes() -> None:
     link = Link(LinkSettings(loss(0.3).loss, delay=0.02, jitter=0.01), 1, 2, 3)
-    lost = [link.carry(50 + number % 1000, number * 0.37)[0] is Fate.LOST for number in range(1000)]
+    lost = [link.carry(50 + number % 1000, number * 0.37)[0] is PacketOutcome.LOST for number in range(1000)]
     assert lost == fates(loss(0.3), packets=1000).tolist()
 
 
@@ -48,7 +48,7 @@ def test_packets_that_are_skipped_have_numbers_of_their_own() -> None:
         if number % 3:
             link.skip()
         else:
-            assert (link.carry(1, 0.0)[0] is Fate.LOST) == wanted[number]
+            assert (link.carry(1, 0.0)[0] is PacketOutcome.LOST) == wanted[number]
 
 
 @pytest.mark.parametrize("other", [{"seed": 2}, {"pair": (3, 2)}, {"pair": (2, 4)}])
@@ -113,22 +113,30 @@ def test_rate_and_queue_by_hand() -> None:
     """125 bytes take 1 ms at 1 Mbit/s: one is sent, two wait, the fourth is dropped; at 1.5 ms one more can wait."""
     link = Link(LinkSettings(delay=0.01, rate=1.0, queue=2), 1, 2, 3)
     found = [link.carry(125, 0.0) for _ in range(4)] + [link.carry(125, 0.0015) for _ in range(2)]
-    assert [fate for fate, _ in found] == [Fate.PASSED] * 3 + [Fate.DROPPED, Fate.PASSED, Fate.DROPPED]
-    times = [time for fate, time in found if fate is Fate.PASSED]
+    assert [fate for fate, _ in found] == [PacketOutcome.PASSED] * 3 + [
+        PacketOutcome.DROPPED,
+        PacketOutcome.PASSED,
+        PacketOutcome.DROPPED,
+    ]
+    times = [time for fate, time in found if fate is PacketOutcome.PASSED]
     assert times == pytest.approx([0.011, 0.012, 0.013, 0.014])
     assert link.waited == 3
-    assert link.carry(250, 1.0) == (Fate.PASSED, pytest.approx(1.012))
+    assert link.carry(250, 1.0) == (PacketOutcome.PASSED, pytest.approx(1.012))
 
 
 def test_without_a_queue_only_one_packet_is_on_its_way() -> None:
     link = Link(LinkSettings(rate=1.0, queue=0), 1, 2, 3)
-    assert [link.carry(125, time)[0] for time in (0.0, 0.0005, 0.0011)] == [Fate.PASSED, Fate.DROPPED, Fate.PASSED]
+    assert [link.carry(125, time)[0] for time in (0.0, 0.0005, 0.0011)] == [
+        PacketOutcome.PASSED,
+        PacketOutcome.DROPPED,
+        PacketOutcome.PASSED,
+    ]
 
 
 def test_lost_packets_take_their_time_on_the_air() -> None:
     certain = LossModel(1.0, 1.0, 0.0, 1.0)
     link = Link(LinkSettings(certain, rate=1.0, queue=0), 1, 2, 3)
-    assert [link.carry(125, time)[0] for time in (0.0, 0.0005)] == [Fate.LOST, Fate.DROPPED]
+    assert [link.carry(125, time)[0] for time in (0.0, 0.0005)] == [PacketOutcome.LOST, PacketOutcome.DROPPED]
     assert math.isinf(LinkSettings().rate)
 
 

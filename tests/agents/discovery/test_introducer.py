@@ -14,8 +14,8 @@ from contextlib import ExitStack
 import pytest
 
 from msg_agents.discovery import relay
-from msg_agents.discovery.profiles import FIRST_INTRODUCED
-from msg_agents.discovery.relay import Introducer, write_introduction
+from msg_agents.discovery.profiles import FIRST_RELAYED
+from msg_agents.discovery.relay import DiscoveryRelay, report_ready
 from msg_agents.discovery.rtps import discovery_port, disposal_message, free_domain, read_announcement
 
 QUIET = 0.2  # s in which nothing comes
@@ -56,32 +56,32 @@ def domain() -> Iterator[int]:
 
 
 @pytest.fixture
-def meeting(domain: int) -> Iterator[Introducer]:
-    with Introducer(domain) as meeting:
+def meeting(domain: int) -> Iterator[DiscoveryRelay]:
+    with DiscoveryRelay(domain) as meeting:
         meeting.introduce({**PARTNERS, "switcher": set(PARTNERS)})
         yield meeting
     assert not any(thread.name == "introducer" for thread in threading.enumerate())
 
 
 @pytest.fixture
-def crowd(domain: int, meeting: Introducer) -> Iterator[list[Participant]]:
+def crowd(domain: int, meeting: DiscoveryRelay) -> Iterator[list[Participant]]:
     """Four processes of the run."""
     del meeting  # which has the first port
-    crowd = [Participant(domain, FIRST_INTRODUCED + i) for i in range(4)]
+    crowd = [Participant(domain, FIRST_RELAYED + i) for i in range(4)]
     yield crowd
     for each in crowd:
         each.socket.close()
 
 
-def report(meeting: Introducer, name: str, participant: Participant) -> None:
-    write_introduction(os.dup(meeting.descriptor), name, participant.prefix)
+def report(meeting: DiscoveryRelay, name: str, participant: Participant) -> None:
+    report_ready(os.dup(meeting.descriptor), name, participant.prefix)
 
 
 def settle() -> None:
     time.sleep(QUIET)
 
 
-def test_those_who_have_to_do_with_each_other_meet(meeting: Introducer, crowd: list[Participant]) -> None:
+def test_those_who_have_to_do_with_each_other_meet(meeting: DiscoveryRelay, crowd: list[Participant]) -> None:
     """As soon as both are ready: the later one is announced to the earlier one, which answers by itself."""
     for each in crowd:
         each.announce()
@@ -99,7 +99,7 @@ def test_those_who_have_to_do_with_each_other_meet(meeting: Introducer, crowd: l
     switcher.hears()
 
 
-def test_a_report_may_be_faster_than_the_announcement(meeting: Introducer, crowd: list[Participant]) -> None:
+def test_a_report_may_be_faster_than_the_announcement(meeting: DiscoveryRelay, crowd: list[Participant]) -> None:
     one, two, *_ = crowd
     one.announce()
     report(meeting, "agent_1", one)
@@ -109,7 +109,7 @@ def test_a_report_may_be_faster_than_the_announcement(meeting: Introducer, crowd
     one.hears(two)
 
 
-def test_who_comes_back_is_introduced_again(meeting: Introducer, crowd: list[Participant], domain: int) -> None:
+def test_who_comes_back_is_introduced_again(meeting: DiscoveryRelay, crowd: list[Participant], domain: int) -> None:
     one, two, *_ = crowd
     for name, each in (("agent_1", one), ("agent_2", two)):
         each.announce()
@@ -117,7 +117,7 @@ def test_who_comes_back_is_introduced_again(meeting: Introducer, crowd: list[Par
         report(meeting, name, each)
         settle()
     one.hears(two)
-    again = Participant(domain, FIRST_INTRODUCED + 7)
+    again = Participant(domain, FIRST_RELAYED + 7)
     again.announce()
     settle()
     report(meeting, "agent_2", again)
@@ -126,7 +126,7 @@ def test_who_comes_back_is_introduced_again(meeting: Introducer, crowd: list[Par
     again.socket.close()
 
 
-def test_visitors_are_introduced_to_all(meeting: Introducer, crowd: list[Participant], domain: int) -> None:
+def test_visitors_are_introduced_to_all(meeting: DiscoveryRelay, crowd: list[Participant], domain: int) -> None:
     for name, each in zip(["agent_1", "agent_2", "agent_3"], crowd, strict=False):
         each.announce()
         settle()
@@ -145,9 +145,9 @@ def test_visitors_are_asked_to_announce_themselves(domain: int, monkeypatch: pyt
     """Again and again, until the run ends, by a participant of the same machine that listens where processes do."""
     monkeypatch.setattr(relay, "PERIOD", 0.0)
     with ExitStack() as stack:
-        with Introducer(domain) as meeting:
+        with DiscoveryRelay(domain) as meeting:
             meeting.introduce(PARTNERS)
-            visitor, process = Participant(domain, 5), Participant(domain, FIRST_INTRODUCED)
+            visitor, process = Participant(domain, 5), Participant(domain, FIRST_RELAYED)
             for each in (visitor, process):
                 stack.callback(each.socket.close)
             process.announce()
@@ -166,7 +166,9 @@ def test_visitors_are_asked_to_announce_themselves(domain: int, monkeypatch: pyt
         process.hears()
 
 
-def test_who_becomes_ready_hears_of_the_visitors(meeting: Introducer, crowd: list[Participant], domain: int) -> None:
+def test_who_becomes_ready_hears_of_the_visitors(
+    meeting: DiscoveryRelay, crowd: list[Participant], domain: int
+) -> None:
     one, two, *_ = crowd
     one.announce()
     visitor, gone = Participant(domain, 5), Participant(domain, 6)
@@ -186,7 +188,7 @@ def test_who_becomes_ready_hears_of_the_visitors(meeting: Introducer, crowd: lis
 
 
 def test_strangers_among_the_numbers_of_the_run(
-    meeting: Introducer, crowd: list[Participant], monkeypatch: pytest.MonkeyPatch
+    meeting: DiscoveryRelay, crowd: list[Participant], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They may be processes of the run that are not ready; later they are visitors."""
     one, stranger, *_ = crowd
@@ -200,7 +202,7 @@ def test_strangers_among_the_numbers_of_the_run(
 
 
 def test_announcements_are_repeated(
-    meeting: Introducer, crowd: list[Participant], monkeypatch: pytest.MonkeyPatch
+    meeting: DiscoveryRelay, crowd: list[Participant], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Now and then only: most of them, the participants hear directly."""
     one, two, *_ = crowd
@@ -217,7 +219,7 @@ def test_announcements_are_repeated(
 
 
 def test_the_dead_are_not_introduced(
-    meeting: Introducer, crowd: list[Participant], domain: int, monkeypatch: pytest.MonkeyPatch
+    meeting: DiscoveryRelay, crowd: list[Participant], domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Who has said that it leaves, and who has not been heard for long."""
     one, two, three, _ = crowd
@@ -239,7 +241,7 @@ def test_the_dead_are_not_introduced(
 
 
 @pytest.mark.parametrize("noise", [b"", b"RTPS", bytes(3000), b"RTPS" + bytes(100)])
-def test_noise_does_no_harm(meeting: Introducer, crowd: list[Participant], noise: bytes) -> None:
+def test_noise_does_no_harm(meeting: DiscoveryRelay, crowd: list[Participant], noise: bytes) -> None:
     one, two, *_ = crowd
     one.announce(noise)
     os.write(meeting.descriptor, b"nonsense\nzz agent_1\n")
@@ -251,7 +253,7 @@ def test_noise_does_no_harm(meeting: Introducer, crowd: list[Participant], noise
 
 
 def test_not_more_is_remembered_than_needed(
-    meeting: Introducer, crowd: list[Participant], monkeypatch: pytest.MonkeyPatch
+    meeting: DiscoveryRelay, crowd: list[Participant], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(relay, "MOST_KNOWN", 2)
     for each in crowd:
@@ -264,12 +266,12 @@ def test_not_more_is_remembered_than_needed(
 
 def test_without_a_port_it_does_not_start(domain: int) -> None:
     with ExitStack() as stack:
-        for number in range(FIRST_INTRODUCED):
+        for number in range(FIRST_RELAYED):
             taken = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             taken.bind(("127.0.0.1", discovery_port(domain, number)))
-        with pytest.raises(OSError, match="in use"), Introducer(domain):
+        with pytest.raises(OSError, match="in use"), DiscoveryRelay(domain):
             pass
-    with Introducer(domain):
+    with DiscoveryRelay(domain):
         pass
 
 
@@ -277,13 +279,13 @@ def test_with_few_descriptors_it_starts_or_does_not(domain: int) -> None:
     """In a process of its own: as many descriptors as it has, and one more each time."""
     code = f"""
 import os, resource
-from {Introducer.__module__} import Introducer
+from {DiscoveryRelay.__module__} import DiscoveryRelay
 most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
 used = len(os.listdir("/proc/self/fd")) - 1
 for spare in range(20):
     resource.setrlimit(resource.RLIMIT_NOFILE, (used + spare, most))
     try:
-        with Introducer({domain}):
+        with DiscoveryRelay({domain}):
             print("started")
     except OSError as error:
         print(error.strerror)

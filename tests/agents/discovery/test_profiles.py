@@ -13,9 +13,9 @@ import pytest
 
 from msg_agents.discovery import profiles
 from msg_agents.discovery.profiles import (
-    INTRODUCED_PROFILE,
     LOOPBACK_PROFILE,
     PROFILE_VARIABLES,
+    RELAYED_PROFILE,
     UDP_PROFILE,
     has_fast_dds_3,
     has_profile_for,
@@ -43,7 +43,7 @@ def test_profiles_for_fast_dds_3_differ_in_what_it_has_renamed(name: str) -> Non
     assert (FOLDER / "fast_dds_3" / name).read_text() == new
 
 
-@pytest.mark.parametrize("path", [LOOPBACK_PROFILE, INTRODUCED_PROFILE], ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [LOOPBACK_PROFILE, RELAYED_PROFILE], ids=lambda path: path.stem)
 def test_profiles_of_topics_have_the_times_of_the_others(path: Path) -> None:
     """The profile of a topic is read instead of the default one."""
     for kind in ("data_writer", "data_reader"):
@@ -65,7 +65,7 @@ def test_from_kilted_on_the_old_variable_gives_a_warning(distribution: str) -> N
     assert profile_variables(Path("/p.xml"), distribution) == {NEW: "/p.xml"}
 
 
-@pytest.mark.parametrize("profile", [LOOPBACK_PROFILE, INTRODUCED_PROFILE, UDP_PROFILE], ids=lambda path: path.stem)
+@pytest.mark.parametrize("profile", [LOOPBACK_PROFILE, RELAYED_PROFILE, UDP_PROFILE], ids=lambda path: path.stem)
 def test_the_middleware_here_takes_it(profile: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It prints what it does not understand and goes on without the profile."""
     pytest.importorskip("rclpy")
@@ -96,7 +96,7 @@ def test_our_profiles_for_one_machine_bound_the_batches_of_states(
     assert not has_profile_for("/states")
     for path, bounded in (
         (LOOPBACK_PROFILE, True),
-        (INTRODUCED_PROFILE, True),
+        (RELAYED_PROFILE, True),
         (hosts, False),
         (UDP_PROFILE, False),
         (damaged, False),

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("rclpy")
 
-from msg_agents.discovery.profiles import FIRST_INTRODUCED, INTRODUCED_PROFILE, MOST_INTRODUCED, domains_for
+from msg_agents.discovery.profiles import FIRST_RELAYED, MOST_RELAYED, RELAYED_PROFILE, domains_for
 from msg_agents.discovery.rtps import (
     PEERS_VARIABLE,
     PORT_BASE,
@@ -145,7 +145,7 @@ def test_the_announcement_of_a_real_participant() -> None:
         listener = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         listener.bind(("127.0.0.1", discovery_port(domain, 3)))
         listener.settimeout(30)
-        environment = node_environment(domain, INTRODUCED_PROFILE)
+        environment = node_environment(domain, RELAYED_PROFILE)
         process = stack.enter_context(subprocess.Popen([sys.executable, "-P", "-c", ANNOUNCER], env=environment))
         stack.callback(process.kill)
         found = read_announcement(listener.recv(1 << 16))
@@ -158,7 +158,7 @@ def test_the_announcement_of_a_real_participant() -> None:
         lines = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
         ports = {int(line[1].rpartition(":")[2], 16) for line in lines if line[9] in own}
         assert found.port in ports
-        assert discovery_port(domain, FIRST_INTRODUCED) == found.port
+        assert discovery_port(domain, FIRST_RELAYED) == found.port
 
 
 def test_the_disposal_byte_for_byte() -> None:
@@ -201,7 +201,7 @@ def test_a_real_participant_answers_one_without_endpoints(reach: str) -> None:
         assert visitor.stdout is not None
         prefix = bytes.fromhex(visitor.stdout.readline())
         asking = announcement_message(prefix[:4] + bytes(range(8)), listener.getsockname()[1], 20)
-        for participant in range(FIRST_INTRODUCED):
+        for participant in range(FIRST_RELAYED):
             listener.sendto(asking, ("127.0.0.1", discovery_port(domain, participant)))
         answer = None
         while answer is None:
@@ -213,7 +213,7 @@ def test_a_real_participant_answers_one_without_endpoints(reach: str) -> None:
 def test_every_participant_of_the_domain_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """On this machine, and on the other hosts of the run."""
     monkeypatch.setenv(PEERS_VARIABLE, "127.0.0.1 127.0.0.2")
-    places = [("127.0.0.1", 0), ("127.0.0.1", FIRST_INTRODUCED + MOST_INTRODUCED - 1), ("127.0.0.2", 3)]
+    places = [("127.0.0.1", 0), ("127.0.0.1", FIRST_RELAYED + MOST_RELAYED - 1), ("127.0.0.2", 3)]
     with free_domain(2) as domain:
         sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in places]
         for listener, (address, participant) in zip(sockets, places, strict=True):
@@ -232,7 +232,7 @@ def test_ports_are_ports(domain: int) -> None:
     """The last domain has no ports for so many participants."""
     ports = discovery_ports(domain)
     assert ports[0] == discovery_port(domain, 0)
-    assert len(ports) == min(FIRST_INTRODUCED + MOST_INTRODUCED, (65535 - ports[0]) // 2 + 1)
+    assert len(ports) == min(FIRST_RELAYED + MOST_RELAYED, (65535 - ports[0]) // 2 + 1)
     assert ports[-1] < 1 << 16
 
 
@@ -241,9 +241,9 @@ def test_a_farewell_in_the_last_domain() -> None:
     remove_participant(PREFIX, LAST_DOMAIN)
 
 
-@pytest.mark.parametrize(("participants", "domains"), [(1, 1), (87, 1), (88, 2), (MOST_INTRODUCED, 2), (207, 3)])
+@pytest.mark.parametrize(("participants", "domains"), [(1, 1), (87, 1), (88, 2), (MOST_RELAYED, 2), (207, 3)])
 def test_ports_of_a_run_stay_in_its_domains(participants: int, domains: int) -> None:
     """Both ports of the last participant lie below the first of the next domain (9.6.1.1: offsets 10 and 11)."""
     assert domains_for(participants) == domains
-    last = discovery_port(1, FIRST_INTRODUCED + participants - 1) + 1
+    last = discovery_port(1, FIRST_RELAYED + participants - 1) + 1
     assert last < PORT_BASE + PORTS_PER_DOMAIN * (1 + domains)

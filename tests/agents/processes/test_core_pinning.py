@@ -10,15 +10,15 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_agents.process_layout import RECORDER, SWITCHER, ProcessPlan, keep_to, place
+from msg_agents.process_layout import RECORDER, SWITCHER, ProcessSpec, pin_to_core, place
 from msg_analysis.common.resources import available_cores
 
 
-def plans(agents: int, processes: int, *, recorder: bool) -> list[ProcessPlan]:
+def plans(agents: int, processes: int, *, recorder: bool) -> list[ProcessSpec]:
     bounds = [index * agents // processes for index in range(processes + 1)]
     shares = [tuple(range(*ends)) for ends in pairwise(bounds)]
-    first = [ProcessPlan(RECORDER, ())] if recorder else []
-    return [*first, *(ProcessPlan(f"p{share[0]}", (), share) for share in shares), ProcessPlan(SWITCHER, ())]
+    first = [ProcessSpec(RECORDER, ())] if recorder else []
+    return [*first, *(ProcessSpec(f"p{share[0]}", (), share) for share in shares), ProcessSpec(SWITCHER, ())]
 
 
 @given(st.integers(2, 16), st.integers(1, 30), st.integers(0, 70), st.booleans(), st.integers(0, 232))
@@ -54,8 +54,8 @@ def test_a_process_and_what_it_starts_keep_to_the_core() -> None:
     core = available_cores()[-1]
     code = "import os, sys; sys.stdin.read(); os.execvp('grep', ['grep', 'Cpus_allowed_list', '/proc/self/status'])"
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as child:
-        keep_to(child.pid, core)
+        pin_to_core(child.pid, core)
         output, _ = child.communicate()
     assert output.split() == [b"Cpus_allowed_list:", str(core).encode()]
-    keep_to(child.pid, core)  # gone: nothing happens
+    pin_to_core(child.pid, core)  # gone: nothing happens
     assert len(available_cores()) == len(os.sched_getaffinity(0))

@@ -18,7 +18,7 @@ from waiting import gone, participants, record_of_two, wait_for
 
 from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment, require_middleware
-from msg_agents.run.fork_server import LONGEST_TITLE, ForkedProcess, NodeServer, NodeStart
+from msg_agents.run.fork_server import LONGEST_TITLE, ForkedProcess, ForkServer, NodeStart
 from msg_analysis.common.resources import available_cores
 from msg_analysis.errors import InputError
 
@@ -32,8 +32,8 @@ def domain() -> Iterator[int]:
 
 
 @pytest.fixture
-def server(tmp_path: Path, domain: int) -> Iterator[NodeServer]:
-    with NodeServer(node_environment(domain), tmp_path / "server.log") as server:
+def server(tmp_path: Path, domain: int) -> Iterator[ForkServer]:
+    with ForkServer(node_environment(domain), tmp_path / "server.log") as server:
         yield server
     assert not (tmp_path / "server.log").exists()  # it had nothing to say
 
@@ -45,7 +45,7 @@ def waiting(tmp_path: Path) -> list[str]:
     return ["agent", str(file), "--agent", "1"]
 
 
-def start(server: NodeServer, log: Path, *arguments: str, core: int | None = None, **descriptors: int) -> ForkedProcess:
+def start(server: ForkServer, log: Path, *arguments: str, core: int | None = None, **descriptors: int) -> ForkedProcess:
     with log.open("ab") as output:
         options = {f"--{name}": number for name, number in descriptors.items()}
         (process,) = server.fork_nodes([NodeStart(arguments, options, output.fileno(), core)])
@@ -62,7 +62,7 @@ def status(process: ForkedProcess, key: str) -> str:
     return next(line.split(":")[1].strip() for line in lines if line.startswith(f"{key}:"))
 
 
-def test_what_a_command_prints_and_how_it_ends(server: NodeServer, tmp_path: Path) -> None:
+def test_what_a_command_prints_and_how_it_ends(server: ForkServer, tmp_path: Path) -> None:
     """Two exit codes at the same time, each from the right process."""
     good, bad = tmp_path / "good.log", tmp_path / "bad.log"
     processes = start(server, good, "agent", "--help"), start(server, bad, "agent", "nothing", "--agent", "1")
@@ -74,7 +74,7 @@ def test_what_a_command_prints_and_how_it_ends(server: NodeServer, tmp_path: Pat
 
 
 def test_a_forked_process_is_like_any_child(
-    server: NodeServer, tmp_path: Path, waiting: list[str], domain: int
+    server: ForkServer, tmp_path: Path, waiting: list[str], domain: int
 ) -> None:
     core = available_cores()[-1]
     process = start(server, tmp_path / "log", *waiting, core=core)
@@ -90,7 +90,7 @@ def test_a_forked_process_is_like_any_child(
     assert "Traceback" not in (tmp_path / "log").read_text()
 
 
-def test_it_ends_when_its_lifeline_closes(server: NodeServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
+def test_it_ends_when_its_lifeline_closes(server: ForkServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
     reading, writing = os.pipe()
     process = start(server, tmp_path / "log", *waiting, lifeline=reading)
     os.close(reading)
@@ -100,7 +100,7 @@ def test_it_ends_when_its_lifeline_closes(server: NodeServer, tmp_path: Path, wa
     assert process.wait() == 3
 
 
-def test_a_command_of_any_length(server: NodeServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
+def test_a_command_of_any_length(server: ForkServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
     """A process of many agents: its node starts, although ROS names a log file by what ``ps`` shows."""
     command, file, *rest = waiting
     foreign = Path(file).rename(tmp_path / f"{'ж' * 100}.json")
@@ -112,7 +112,7 @@ def test_a_command_of_any_length(server: NodeServer, tmp_path: Path, waiting: li
 
 
 def test_processes_outlive_a_killed_fork_server(
-    server: NodeServer, tmp_path: Path, waiting: list[str], domain: int
+    server: ForkServer, tmp_path: Path, waiting: list[str], domain: int
 ) -> None:
     """How they end is known all the same; no more can be forked."""
     process = start(server, tmp_path / "log", *waiting)
@@ -130,7 +130,7 @@ def test_processes_outlive_a_killed_fork_server(
 def test_the_middleware_is_tried(tmp_path: Path, domain: int, middleware: str, usable: bool) -> None:
     """In a forked process; where that cannot use it, the error is that of a process which has imported nothing."""
     environment = node_environment(domain) | {"RMW_IMPLEMENTATION": middleware}
-    with NodeServer(environment, tmp_path / "server.log") as server:
+    with ForkServer(environment, tmp_path / "server.log") as server:
         assert server.has_middleware() == usable
         with contextlib.nullcontext() if usable else pytest.raises(InputError, match="rmw_none_cpp: this ROS 2 "):
             require_middleware(environment, server.has_middleware)
@@ -144,7 +144,7 @@ def children() -> set[str]:
 def test_a_middleware_that_hangs(tmp_path: Path, domain: int) -> None:
     """It cannot be used, and the process that tried it is ended."""
     (tmp_path / "sitecustomize.py").write_text("import rclpy, time\nrclpy.init = lambda: time.sleep(600)\n")
-    with NodeServer(node_environment(domain) | {"PYTHONPATH": str(tmp_path)}, tmp_path / "server.log") as server:
+    with ForkServer(node_environment(domain) | {"PYTHONPATH": str(tmp_path)}, tmp_path / "server.log") as server:
         before = children()
         assert not server.has_middleware(timeout=1.0)
         assert children() <= before
@@ -153,7 +153,7 @@ def test_a_middleware_that_hangs(tmp_path: Path, domain: int) -> None:
 def test_a_fork_server_that_cannot_import(tmp_path: Path) -> None:
     (tmp_path / "msg_agents.py").write_text("raise ImportError('broken')")
     log = tmp_path / "server.log"
-    with NodeServer(os.environ | {"PYTHONPATH": str(tmp_path)}, log) as server:
+    with ForkServer(os.environ | {"PYTHONPATH": str(tmp_path)}, log) as server:
         assert server.fork_nodes([NodeStart(["agent", "--help"], {}, 1, None)]) == []
         assert not server.has_middleware()
     assert "broken" in log.read_text()
@@ -163,9 +163,9 @@ PARENT = """
 import sys, time
 from pathlib import Path
 from msg_agents.environment import node_environment
-from msg_agents.run.fork_server import NodeServer, NodeStart
+from msg_agents.run.fork_server import ForkServer, NodeStart
 log = Path(sys.argv[1])
-with NodeServer(node_environment(0), log / "server.log") as server, (log / "log").open("w") as output:
+with ForkServer(node_environment(0), log / "server.log") as server, (log / "log").open("w") as output:
     (process,) = server.fork_nodes([NodeStart(["agent", "--help"], {}, output.fileno(), None)])
     process.wait()
     print(server.pid, flush=True)

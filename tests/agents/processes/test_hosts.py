@@ -11,7 +11,7 @@ import pytest
 
 from msg_agents.discovery.profiles import PROFILE_VARIABLES
 from msg_agents.discovery.rtps import PEERS_VARIABLE
-from msg_agents.process_layout import Hosts, Share, plan_network
+from msg_agents.process_layout import Hosts, Share, lay_out_network
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 
@@ -51,7 +51,7 @@ def test_the_shares_are_the_whole() -> None:
     hosts = Hosts.parse(document(), experiment())
     assert hosts.agents == {"base": (), "left": (0, 3), "right": (1, 2, 4)}
     plans = {
-        name: plan_network(experiment(), Path("/run.json"), Path("/bag"), share=share(hosts, name))
+        name: lay_out_network(experiment(), Path("/run.json"), Path("/bag"), share=share(hosts, name))
         for name in hosts.agents
     }
     names = {host: [process.name for process in processes] for host, processes in plans.items()}
@@ -72,7 +72,7 @@ def test_processes_count_for_each_host() -> None:
     hosts = {"a": {"address": "192.0.2.1", "agents": ["1-9", 40]}, "b": {"address": "192.0.2.2", "agents": ["10-39"]}}
     found = Hosts.parse({"recorder": "a", "hosts": hosts}, many)
     assert found.domain == 0
-    processes = plan_network(many, Path("/run.json"), None, share=share(found, "a"))
+    processes = lay_out_network(many, Path("/run.json"), None, share=share(found, "a"))
     assert [process.name for process in processes] == ["agents_1_to_5", "agents_6_and_4_more", "switcher"]
     assert found.participants(many) == 2 + 2 + 8
 

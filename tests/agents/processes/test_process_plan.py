@@ -18,11 +18,11 @@ from msg_agents.process_layout import (
     MOST_PROCESSES,
     MOST_UNAIDED,
     RECORDER,
-    ProcessPlan,
+    ProcessSpec,
     count_processes,
+    lay_out_network,
     partners,
     place,
-    plan_network,
 )
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
@@ -42,11 +42,11 @@ def experiment(agents: int, processes: Any) -> Experiment:
     )
 
 
-def plan(agents: int, processes: Any, bag: Path | None = Path("/bag")) -> list[ProcessPlan]:
-    return plan_network(experiment(agents, processes), Path("/run.json"), bag)
+def plan(agents: int, processes: Any, bag: Path | None = Path("/bag")) -> list[ProcessSpec]:
+    return lay_out_network(experiment(agents, processes), Path("/run.json"), bag)
 
 
-def numbers(process: ProcessPlan) -> list[int]:
+def numbers(process: ProcessSpec) -> list[int]:
     """Agents as the command line names them."""
     words = process.arguments
     return [int(value) for option, value in pairwise(words) if option == "--agent"]
@@ -84,8 +84,8 @@ def test_auto_never_asks_for_too_many(monkeypatch: pytest.MonkeyPatch, cores: in
 def test_too_many_processes(most: int) -> None:
     for processes in ("one_per_agent", most + 1):
         with pytest.raises(InputError, match=rf"run\.processes: {processes} .*at most {most}"):
-            plan_network(experiment(most + 1, processes), Path("/run.json"), None, most=most)
-    assert len(plan_network(experiment(most, "one_per_agent"), Path("/run.json"), None, most=most)) == most + 1
+            lay_out_network(experiment(most + 1, processes), Path("/run.json"), None, most=most)
+    assert len(lay_out_network(experiment(most, "one_per_agent"), Path("/run.json"), None, most=most)) == most + 1
 
 
 def test_large_networks_are_given_time_to_find_each_other() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from waiting import wait_for
 
-from msg_agents.recovery import LEAST_KEPT, MARK, Checkpoint
+from msg_agents.recovery import LEAST_STATES, MARK, Checkpoint
 from msg_analysis.errors import InputError
 
 LARGE = 100_000  # bytes of a message, so that the ring has its least length
@@ -23,12 +23,12 @@ def message(step: int, size: int = LARGE) -> bytes:
     return step.to_bytes(8, "little") * (size // 8)
 
 
-@pytest.mark.parametrize("steps", [0, 1, 5, LEAST_KEPT - 1, LEAST_KEPT, LEAST_KEPT + 1, 3 * LEAST_KEPT + 7])
+@pytest.mark.parametrize("steps", [0, 1, 5, LEAST_STATES - 1, LEAST_STATES, LEAST_STATES + 1, 3 * LEAST_STATES + 7])
 def test_the_newest_are_kept(tmp_path: Path, steps: int) -> None:
     written = Checkpoint(tmp_path / "states", LARGE)
     for step in range(steps):
         written.write(step, message(step))
-    kept = range(max(0, steps - LEAST_KEPT + 1), steps)
+    kept = range(max(0, steps - LEAST_STATES + 1), steps)
     for ring in (written, Checkpoint(tmp_path / "states", LARGE)):
         assert ring.read() == [(step, message(step)) for step in kept]
         assert [step for step, _ in ring.read(steps - 3)] == [step for step in kept if step >= steps - 3]
@@ -38,11 +38,11 @@ def test_the_newest_are_kept(tmp_path: Path, steps: int) -> None:
 def test_messages_of_different_length(tmp_path: Path) -> None:
     """With lost messages, some list what was heard."""
     ring = Checkpoint(tmp_path / "states", LARGE)
-    for step in range(LEAST_KEPT + 5):
+    for step in range(LEAST_STATES + 5):
         ring.write(step, message(step, LARGE - 8 * (step % 3)))
     for again in (ring, Checkpoint(tmp_path / "states", LARGE)):
         assert all(data == message(step, LARGE - 8 * (step % 3)) for step, data in again.read())
-        assert len(again.read()) == LEAST_KEPT - 1
+        assert len(again.read()) == LEAST_STATES - 1
 
 
 def test_in_memory() -> None:
@@ -101,12 +101,12 @@ def test_read_while_it_is_written(tmp_path: Path) -> None:
     file, slot = tmp_path / "states", LARGE + MARK.size
     writer = subprocess.Popen([sys.executable, "-P", "-c", code, str(file)])
     try:
-        wait_for(lambda: file.exists() and file.stat().st_size == LEAST_KEPT * slot)
+        wait_for(lambda: file.exists() and file.stat().st_size == LEAST_STATES * slot)
         with file.open("rb") as stream:
             ring = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         whole = 0
         for number in range(40_000):
-            start = number % LEAST_KEPT * slot
+            start = number % LEAST_STATES * slot
             before = MARK.unpack_from(ring, start + LARGE)
             found = ring[start : start + LARGE]
             if before[1] and MARK.unpack_from(ring, start + LARGE) == before:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from msg_agents.run.result import Account, EventLog
+from msg_agents.run.result import EventLog, StatusSummary
 
 
 def test_events() -> None:
@@ -14,9 +14,9 @@ def test_events() -> None:
     refused: Counter[tuple[str, str, str]] = Counter()
     looks = []
 
-    def account() -> Account:
+    def account() -> StatusSummary:
         looks.append(now[0])
-        return Account(refused)
+        return StatusSummary(refused)
 
     log = EventLog(events, clock=lambda: now[0])
     log.look([], account)
@@ -50,6 +50,6 @@ def test_killed_before_the_first_step() -> None:
     events: list[dict[str, Any]] = []
     log = EventLog(events)
     log.killed("agents_1-3", [0, 1, 2], -1, "killed")
-    log.look([4, 0, -1], Account)
-    log.look([4, 0, 0], Account)
+    log.look([4, 0, -1], StatusSummary)
+    log.look([4, 0, 0], StatusSummary)
     assert [(one["kind"], one["step"]) for one in events] == [("killed", 0), ("back", 4)]

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from msg_agents.process_layout import plan_network
+from msg_agents.process_layout import lay_out_network
 from msg_agents.run.folder import PREFIX
 from msg_agents.run.launch import ANALYSIS, NETWORK_ARGUMENTS, REPLAY_ARGUMENTS, LaunchedNetwork, LaunchedReplay
 from msg_analysis.model.run_record import RunRecord
@@ -38,7 +38,7 @@ def test_the_plan_is_that_of_the_runner(tmp_path: Path) -> None:
         assert (record.experiment.run.seed, record.experiment.run.duration) == (5, 1.0)
         assert network.bag is not None
         lifeline = ("--lifeline-lock", str(run_file.parent))
-        plans = plan_network(record.experiment, run_file, network.bag)
+        plans = lay_out_network(record.experiment, run_file, network.bag)
         assert network.processes == [replace(plan, arguments=plan.arguments + lifeline) for plan in plans]
         assert [plan.name for plan in network.processes] == ["recorder", "agents_1_to_2", "agents_3_to_5", "switcher"]
         assert network.namespace == "/lab"

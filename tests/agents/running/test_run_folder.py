@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 
 from msg_agents.run import folder as module
-from msg_agents.run.folder import PREFIX, YOUTH, workshop
+from msg_agents.run.folder import PREFIX, YOUTH, temporary_directory
 
 HOLD = """
 import sys, time
-from msg_agents.run.folder import workshop
-with workshop() as folder:
+from msg_agents.run.folder import temporary_directory
+with temporary_directory() as folder:
     (folder / "run.json").write_text("{}")
     print(folder, flush=True)
     time.sleep(600)
@@ -38,7 +38,7 @@ def age(folder: Path, seconds: float) -> None:
 
 
 def test_gone_afterwards() -> None:
-    with workshop() as folder:
+    with temporary_directory() as folder:
         (folder / "log").write_text("x")
     assert not folder.exists()
 
@@ -46,16 +46,16 @@ def test_gone_afterwards() -> None:
 def test_in_memory_if_there_is_plenty(tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     memory = tmp_path / "memory"
     monkeypatch.setattr(module, "MEMORY", memory)
-    with workshop(1) as folder:  # there is none
+    with temporary_directory(1) as folder:  # there is none
         assert folder.parent == temporary
     memory.mkdir()
-    with workshop(1) as folder, workshop(10**18) as too_large, workshop() as ordinary:
+    with temporary_directory(1) as folder, temporary_directory(10**18) as too_large, temporary_directory() as ordinary:
         assert folder.parent == memory
         assert {too_large.parent, ordinary.parent} == {temporary}
         age(folder, YOUTH + 60)
     (memory / f"{PREFIX}abandoned").mkdir()
     age(memory / f"{PREFIX}abandoned", YOUTH + 60)
-    with workshop():
+    with temporary_directory():
         assert list(memory.iterdir()) == []
 
 
@@ -71,7 +71,7 @@ def test_of_a_killed_run_is_cleared_and_of_a_living_one_kept(temporary: Path) ->
         dead.wait()
         for folder in (abandoned, held):
             age(folder, YOUTH + 60)
-        with workshop() as mine:
+        with temporary_directory() as mine:
             assert set(temporary.iterdir()) == {held, mine}
         living.kill()
 
@@ -84,7 +84,7 @@ def test_young_ones_and_what_is_no_folder_are_left_alone(temporary: Path) -> Non
     (temporary / "elsewhere").mkdir()
     link.symlink_to(temporary / "elsewhere")
     age(temporary / "elsewhere", YOUTH + 60)
-    with workshop():
+    with temporary_directory():
         assert young.is_dir()
     assert file.read_text() == "mine"
     assert (temporary / "elsewhere").is_dir()

@@ -19,7 +19,7 @@ from waiting import gone, participants, record_of_two, wait_for
 
 from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment
-from msg_agents.process_layout import ProcessPlan
+from msg_agents.process_layout import ProcessSpec
 from msg_agents.run import supervisor as module
 from msg_agents.run.supervisor import Child, Supervisor
 from msg_analysis.errors import ExitCode
@@ -66,7 +66,7 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Child]]:
                 stdout=output,
                 stderr=output,
             )
-        child = Child(ProcessPlan(name, (), resumes=resumes), process, log, number)
+        child = Child(ProcessSpec(name, (), resumes=resumes), process, log, number)
         children.append(child)
         wait_for(lambda: "ready" in log.read_text() or not child.running)
         return child
@@ -117,7 +117,7 @@ def test_the_recorder_is_ended_last(tmp_path: Path, start: Callable[..., Child])
         "print('ready', flush=True)\nsignal.pause()"
     )
     Supervisor(tmp_path, {}, [recorder, agent]).stop()
-    told, ended = (float(child.last_words()) for child in (recorder, agent))
+    told, ended = (float(child.last_line()) for child in (recorder, agent))
     assert ended < told
 
 
@@ -146,7 +146,7 @@ def test_failures_in_words(
     assert child.failure == failure
     assert supervisor.failures == ([child] if failure else [])
     assert supervisor.running == []
-    assert child.last_words() == words
+    assert child.last_line() == words
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_steps_that_the_switcher_reports(tmp_path: Path) -> None:
         reports = [[number, -1] * 500 for number in range(500)]  # more than any pipe holds
         assert sum(len(json.dumps(steps)) for steps in reports) > 2 << 20
         orders.write_text("".join(f"{json.dumps(steps)}\n" for steps in reports))
-        supervisor.start([ProcessPlan("switcher", ("switcher", str(orders)))])
+        supervisor.start([ProcessSpec("switcher", ("switcher", str(orders)))])
         (child,) = supervisor.children
         assert child.process.wait() == 0
         assert child.log.read_text().count("written") == len(reports)
@@ -248,15 +248,15 @@ def run_file(tmp_path: Path) -> Path:
 PARENT = """
 import sys, time
 from pathlib import Path
-from msg_agents.process_layout import ProcessPlan
+from msg_agents.process_layout import ProcessSpec
 from msg_agents.environment import node_environment
 from msg_agents.run.supervisor import Supervisor
 directory = Path(sys.argv[1])
 run_file = str(directory / "run.json")
 plans = [
-    ProcessPlan("recorder", ("recorder", run_file, "--out", str(directory / "bag"))),
-    ProcessPlan("agent_1", ("agent", run_file, "--agent", "1")),
-    ProcessPlan("switcher", ("switcher", run_file)),
+    ProcessSpec("recorder", ("recorder", run_file, "--out", str(directory / "bag"))),
+    ProcessSpec("agent_1", ("agent", run_file, "--agent", "1")),
+    ProcessSpec("switcher", ("switcher", run_file)),
 ]
 with Supervisor(directory, node_environment(int(sys.argv[2]))) as supervisor:
     supervisor.start(plans)
@@ -286,8 +286,8 @@ def test_children_do_not_outlive_a_killed_parent(tmp_path: Path, run_file: Path,
 
 def test_real_nodes_end_in_order_when_told(tmp_path: Path, run_file: Path) -> None:
     plans = [
-        ProcessPlan("recorder", ("recorder", str(run_file), "--out", str(tmp_path / "bag"))),
-        ProcessPlan("agent_1", ("agent", str(run_file), "--agent", "1")),
+        ProcessSpec("recorder", ("recorder", str(run_file), "--out", str(tmp_path / "bag"))),
+        ProcessSpec("agent_1", ("agent", str(run_file), "--agent", "1")),
     ]
     with free_domain() as domain, Supervisor(tmp_path, node_environment(domain)) as supervisor:
         supervisor.start(plans)

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from msg_agents.stepping.state_receiver import LookBackSynchronizer
-from msg_agents.stepping.synchronizer import KEPT_AFTER_USE
+from msg_agents.stepping.state_receiver import DelayedSynchronizer
+from msg_agents.stepping.synchronizer import HISTORY_STEPS
 from msg_analysis.messages.acceptance import Refusal
 
 PRIME = 2**61 - 1
@@ -82,9 +82,9 @@ class Network:
         self.links = {(i, j): deque([0]) for i in range(case.agents) for j in case.peers(i)}  # receiver, sender: steps
         self.nodes = [self.node(i) for i in range(case.agents)]
 
-    def node(self, agent: int) -> LookBackSynchronizer[int]:
+    def node(self, agent: int) -> DelayedSynchronizer[int]:
         case, step = self.case, len(self.states[agent]) - 1
-        found: LookBackSynchronizer[int] = LookBackSynchronizer(
+        found: DelayedSynchronizer[int] = DelayedSynchronizer(
             needed=lambda j, k: case.needed(agent, j, k),
             delay=case.delay,
             agent=agent,
@@ -156,15 +156,15 @@ def test_values_older_than_all_that_is_kept_anyway(delay: int, loss: float, seed
     """With bursts of hundreds of steps, more than a window and what is kept after use."""
     case = Case(3, 700, 64, delay, loss, random.Random(seed))
     oldest = max(k - case.needed(i, j, k) for i, j in case.lost for k in range(case.steps))
-    assert oldest > KEPT_AFTER_USE
+    assert oldest > HISTORY_STEPS
     network = Network(case)
     network.run()
     assert network.states == case.serial()
 
 
-def lonely(held: int) -> LookBackSynchronizer[str]:
+def lonely(held: int) -> DelayedSynchronizer[str]:
     """Agent 0 at step 200, which hears agent 1, of which it holds the value of a step."""
-    node: LookBackSynchronizer[str] = LookBackSynchronizer(
+    node: DelayedSynchronizer[str] = DelayedSynchronizer(
         needed=lambda _j, k: held if k <= 200 else k, delay=0, agent=0, steps=300, inputs=[[1]], peers=[1], start=200
     )
     assert node.learn(0, 0, 0, 299) is None

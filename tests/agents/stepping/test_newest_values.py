@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_agents.stepping.newest_values import NewestOnAir, NewestValues
+from msg_agents.stepping.newest_values import NewestReceived, NewestValues
 from msg_agents.stepping.synchronizer import NOTHING
 from msg_analysis.messages.acceptance import Refusal
 
@@ -152,7 +152,7 @@ def test_another_value_of_the_newest_step() -> None:
 def test_on_the_air(steps: list[int], lost: set[int], delay: int, holds: bool) -> None:
     """Against a memory of all that came, asked after every message or only now and then."""
     nodes = [
-        NewestOnAir(
+        NewestReceived(
             delay=delay,
             lost=lambda agent, step: agent == 3 and step in lost,
             holds=holds,
@@ -184,7 +184,7 @@ def test_on_the_air(steps: list[int], lost: set[int], delay: int, holds: bool) -
 
 def test_on_the_air_what_came_too_early_is_forgotten() -> None:
     clock = Clock()
-    node = NewestOnAir(
+    node = NewestReceived(
         delay=1, lost=lambda _j, _k: False, holds=True, agent=0, steps=STEPS, inputs=[[1]], peers=[1], reach=clock
     )
     assert node.learn(0, 0) is None

@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_agents.stepping.synchronizer import CONSECUTIVE, RESEND_LIMIT, ReceivedSteps, marks_of
+from msg_agents.stepping.synchronizer import CONSECUTIVE, RESEND_LIMIT, ReceivedSteps, hashes_of
 from msg_analysis.messages.acceptance import Refusal
 
 LONG = 50_000
@@ -106,7 +106,7 @@ def test_rows_at_once_are_the_same_as_one_by_one(seed: int, last: int) -> None:
         first = max(0, step + chance.choice([0, 0, 0, 0, 1, -3, 100, -RESEND_LIMIT]))
         contents = [hash((k, chance.random() < 0.01)) for k in range(first, first + chance.randrange(1, 900))]
         one_by_one = [singles.take(k, content) for k, content in enumerate(contents, start=first)]
-        if rows.take_row(first, marks_of(np.array(contents))):
+        if rows.take_row(first, hashes_of(np.array(contents))):
             assert one_by_one == [None] * len(contents)
         else:
             assert [rows.take(k, content) for k, content in enumerate(contents, start=first)] == one_by_one
@@ -118,8 +118,8 @@ def test_rows_at_once_are_the_same_as_one_by_one(seed: int, last: int) -> None:
 
 def test_a_row_beyond_the_end() -> None:
     steps = ReceivedSteps(5)
-    assert not steps.take_row(0, marks_of(np.arange(7)))
-    assert not steps.take_row(1, marks_of(np.arange(3)))
-    assert steps.take_row(0, marks_of(np.arange(6)))
+    assert not steps.take_row(0, hashes_of(np.arange(7)))
+    assert not steps.take_row(1, hashes_of(np.arange(3)))
+    assert steps.take_row(0, hashes_of(np.arange(6)))
     assert steps.row == 5
-    assert not steps.take_row(6, marks_of(np.arange(1)))
+    assert not steps.take_row(6, hashes_of(np.arange(1)))
