@@ -18,16 +18,17 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from msg_agents.discovery.profiles import (
+from msg_agents.discovery.relay import DiscoveryRelay
+from msg_agents.discovery.rtps import (
     LOOPBACK_PROFILE,
     PROFILE_VARIABLES,
     RELAYED_PROFILE,
     UDP_PROFILE,
     domains_for,
+    free_domain,
     has_fast_dds_3,
+    require_loopback,
 )
-from msg_agents.discovery.relay import DiscoveryRelay
-from msg_agents.discovery.rtps import free_domain, require_loopback
 from msg_analysis.common.resources import SINGLE_THREAD
 from msg_analysis.common.version import ros_distribution
 from msg_analysis.errors import InputError
@@ -36,7 +37,7 @@ MEMORY = Path("/dev/shm")
 """A page of a file on a disk costs about twice as much to write for the first time, and again after each time the
 system has saved it."""
 
-LEAST = 64 << 10  # bytes; where a page that ROS maps there cannot be had, the processes of a run die of SIGBUS
+LEAST_FREE = 64 << 10  # bytes; where a page that ROS maps there cannot be had, the processes of a run die of SIGBUS
 
 
 def free_space(directory: Path) -> int:
@@ -50,7 +51,7 @@ def free_space(directory: Path) -> int:
 def require_shared_memory(directory: Path = MEMORY) -> None:
     """InputError if it is full. Without it, or where it cannot be written, a run does without."""
     # The library of the tracer LTTng, which rclpy loads, makes a file of one page there and writes to it.
-    if os.access(directory, os.W_OK) and (free := free_space(directory)) < LEAST:
+    if os.access(directory, os.W_OK) and (free := free_space(directory)) < LEAST_FREE:
         raise InputError(
             f"{directory}: full ({free} bytes free): ROS 2 processes would be killed by SIGBUS: remove what is not "
             "used, with `fastdds shm clean` or by hand"
@@ -58,8 +59,8 @@ def require_shared_memory(directory: Path = MEMORY) -> None:
 
 
 # With none of these, rclpy, its libraries and its middleware can only be those of this Python.
-SUSPECTS = ("RMW_IMPLEMENTATION", "PYTHONPATH", "AMENT_PREFIX_PATH", "ROS_DISTRO")
-PATIENCE = 60.0  # s
+FOREIGN_VARIABLES = ("RMW_IMPLEMENTATION", "PYTHONPATH", "AMENT_PREFIX_PATH", "ROS_DISTRO")
+PROBE_TIMEOUT = 60.0  # s
 PROBE = """
 import importlib.util, os, warnings
 warnings.simplefilter("ignore")
@@ -86,7 +87,7 @@ def require_middleware(environment: Mapping[str, str], forked: Callable[[], bool
     ``forked``: whether a process could that was forked from one which has imported all; it saves the imports.
     """
     require_rclpy()
-    present = [name for name in SUSPECTS if environment.get(name)]
+    present = [name for name in FOREIGN_VARIABLES if environment.get(name)]
     if not present or forked():
         return
     try:
@@ -97,7 +98,7 @@ def require_middleware(environment: Mapping[str, str], forked: Callable[[], bool
             capture_output=True,
             text=True,
             errors="replace",
-            timeout=PATIENCE,
+            timeout=PROBE_TIMEOUT,
             check=False,
         )
     except subprocess.TimeoutExpired:
@@ -254,11 +255,11 @@ ROS_LOGS = "ros"  # folder for nodes that have no other place for the log files 
 
 @dataclass(frozen=True, slots=True)
 class RunEnvironment:
-    """Of one run."""
+    """Domain, environment variables and discovery relay of one run."""
 
     domain: int
     environment: dict[str, str]
-    introducer: DiscoveryRelay | None  # None: the processes look for each other, by the user's profile for example
+    relay: DiscoveryRelay | None  # None: the processes look for each other, by the user's profile for example
 
 
 @contextmanager
@@ -273,17 +274,17 @@ def run_environment(
         if domain is None:
             domain = stack.enter_context(free_domain(domains_for(participants)))
         environment = node_environment(domain, RELAYED_PROFILE) | dict(changes)
-        introducer = None
+        relay = None
         if uses_relay(changes):
             require_loopback()
             try:
-                introducer = stack.enter_context(DiscoveryRelay(domain))
+                relay = stack.enter_context(DiscoveryRelay(domain))
             except OSError:  # many others are in this domain
                 environment = node_environment(domain) | dict(changes)
         require_discovery(environment)
         require_shared_memory()
         environment |= other_logs(folder / ROS_LOGS)
-        yield RunEnvironment(domain, environment, introducer)
+        yield RunEnvironment(domain, environment, relay)
 
 
 def uses_relay(changes: Mapping[str, str]) -> bool:

@@ -15,7 +15,7 @@ import yaml
 from scipy import stats
 from user_namespace import give_up_rights
 
-from msg_agents.channel.namespaces import open_hosts
+from msg_agents.channel.process import open_hosts
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.errors import NotAvailableError
 

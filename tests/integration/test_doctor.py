@@ -14,8 +14,7 @@ from typing import Any
 import ill_machines
 import pytest
 
-from msg_agents.discovery.profiles import LOOPBACK_PROFILE
-from msg_agents.discovery.rtps import free_domain
+from msg_agents.discovery.rtps import LOOPBACK_PROFILE, free_domain
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 NAMES = [

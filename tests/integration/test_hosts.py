@@ -21,7 +21,7 @@ import yaml
 from processors import another_processor
 from set_clock import SetClock
 
-from msg_agents.discovery.profiles import PROFILE_VARIABLES
+from msg_agents.discovery.rtps import PROFILE_VARIABLES
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.twin.check import check
 

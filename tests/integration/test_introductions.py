@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 from visitor import assert_delivery
 
-from msg_agents.discovery.profiles import FIRST_RELAYED
-from msg_agents.discovery.rtps import discovery_port, free_domain
+from msg_agents.discovery.rtps import FIRST_RELAYED, discovery_port, free_domain
 from msg_agents.environment import node_environment
 from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate

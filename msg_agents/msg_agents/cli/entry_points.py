@@ -19,7 +19,7 @@ import click
 
 from msg_agents.environment import LAST_DOMAIN, check_domain, tolerate_warnings
 from msg_agents.nodes.parameters import GIVES_PARAMETERS, PROCESS, given, mention_qos, merge, name_of, options_of
-from msg_agents.run.lifeline import exit_with_lock
+from msg_agents.run.fork_server import exit_with_lock
 from msg_agents.terminal import exit_on_signals
 from msg_analysis.cli.options import PATH
 

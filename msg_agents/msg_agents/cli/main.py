@@ -324,10 +324,10 @@ def host(
     if only_profile:
         click.echo(places.profile(what), nl=False)
         return
-    share = places.share(name or this_host(), discovery_timeout=discovery_timeout, patience=patience)
-    mine = show([agent_name(agent + 1, what.names) if what.names else agent + 1 for agent in share.agents])
+    assignment = places.assignment(name or this_host(), discovery_timeout, patience)
+    mine = show([agent_name(agent + 1, what.names) if what.names else agent + 1 for agent in assignment.agents])
     with temporary_directory() as folder, RunView(what) as view:
-        also = " and the recorder" if share.home else ""
+        also = " and the recorder" if assignment.has_recorder else ""
         view.note(f"this host runs agents {mine}{also} in ROS_DOMAIN_ID {places.domain}")
         result = run_network(
             what,
@@ -339,11 +339,11 @@ def host(
             view=view,
             environment=places.environment(what, folder),
             record=record,
-            share=share,
+            assignment=assignment,
             interruption=interruption,
         )
     finish(result, as_json, interruption=interruption, analyse=not no_analyse, report=write_report)
-    if not share.home and not as_json:
+    if not assignment.has_recorder and not as_json:
         click.echo(f"the run has ended: its verdict is on {places.recorder}")
 
 

@@ -18,7 +18,7 @@ from click.shell_completion import CompletionItem
 
 from msg_agents.cli.entry_points import RosCommand
 from msg_agents.environment import DISCOVERY_TIMEOUT
-from msg_agents.run.lifeline import exit_with_pipe
+from msg_agents.run.fork_server import exit_with_pipe
 from msg_analysis.cli.console import examples
 from msg_analysis.cli.options import (
     PATH,
@@ -33,7 +33,7 @@ from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
     from msg_agents.nodes.base import NetworkNode
-    from msg_agents.stepping.newest_values import ClockOffsets
+    from msg_agents.stepping.monitoring import ClockOffsets
     from msg_analysis.bags.mcap_chunks import Compression
     from msg_analysis.model.run_record import RunRecord
 
@@ -207,9 +207,9 @@ def switcher(
     def tell_channel(file: Path | None) -> Callable[[int], None]:
         if file is None:
             return lambda _: None
-        from msg_agents.channel.links import ActiveGraphFile
+        from msg_agents.channel.process import ActiveGraphFile
 
-        return ActiveGraphFile(file).tell
+        return ActiveGraphFile(file).set_mode
 
     def nodes() -> list[NetworkNode]:
         from msg_agents.nodes.base import ACK_TIMEOUT
@@ -279,7 +279,7 @@ def _run_nodes(
     patience: float | None = None,
 ) -> None:
     if namespace is not None:
-        from msg_agents.channel.namespaces import enter
+        from msg_agents.channel.process import enter
 
         enter(namespace)
     if lifeline is not None:
@@ -294,9 +294,9 @@ def _run_nodes(
         discovery_timeout=discovery_timeout,
         throughput=throughput,
         use_sim_time=use_sim_time,
-        account=account,
-        introduction=introduction,
-        patience=patience,
+        status_file=account,
+        relay=introduction,
+        peer_timeout=patience,
     ):
         sys.exit(ExitCode.INCOMPLETE)
 

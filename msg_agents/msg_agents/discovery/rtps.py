@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""RTPS: domains and their ports, datagrams of discovery, loopback and multicast."""
+"""Discovery by RTPS: profiles of Fast DDS, domains and their ports, datagrams, loopback and multicast."""
 
 from __future__ import annotations
 
@@ -12,14 +12,93 @@ import random
 import socket
 import struct
 import tempfile
-from collections.abc import Iterator
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from msg_agents.discovery.profiles import FIRST_RELAYED, MOST_RELAYED
+from msg_analysis.common.version import ros_distribution
 from msg_analysis.errors import InputError
+
+
+def has_fast_dds_3(distribution: str) -> bool:
+    """Whether a ROS 2, by its name, comes with Fast DDS 3 or newer: from Kilted on; they are named alphabetically."""
+    return distribution > "jazzy"
+
+
+# Fast DDS 3 refuses a profile with an element that it has renamed, and Fast DDS 2 one with the new name.
+PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name
+_PLACE = Path(__file__).parent / ("fast_dds_3" if has_fast_dds_3(ros_distribution()) else "")
+LOOPBACK_PROFILE = _PLACE / "loopback.xml"
+MOST_PARTICIPANTS = 100  # that find each other in a domain on one machine: maxInitialPeersRange of loopback.xml
+RELAYED_PROFILE = _PLACE / "relayed.xml"
+FIRST_RELAYED = 32  # participantID of relayed.xml; the numbers below are left to all others
+MOST_RELAYED = 206  # participants that the relay connects: they fill the ports of two domains
+NUMBERS_OF_DOMAIN = 119  # of participants whose ports are those of their domain; from there on, of the next one
+UDP_PROFILE = Path(__file__).with_name("udp.xml")
+
+LEASE = 60.0
+"""s of silence after which a participant on another host counts as gone, and messages on their way to it are lost: the
+longest time for which a host may be cut off."""
+
+ANNOUNCEMENT = 3.0  # s between two announcements of a participant to other hosts
+_NAMESPACE = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
+
+
+def has_profile_for(topic: str) -> bool:
+    """Whether the profile of this process, if there is one, says something of a topic, by its resolved name."""
+    for variable in PROFILE_VARIABLES:
+        with contextlib.suppress(OSError, ET.ParseError):
+            tree = ET.parse(os.environ.get(variable, ""))
+            return tree.find(f".//{{*}}data_writer[@profile_name='{topic}']") is not None
+    return False
+
+
+def domains_for(participants: int) -> int:
+    """How many domains in a row have the ports of so many participants that the relay connects."""
+    return -(-(FIRST_RELAYED + participants) // NUMBERS_OF_DOMAIN)
+
+
+def profile_for_hosts(
+    addresses: Sequence[str] = (),  # of all hosts, at which participants are looked for; empty: by multicast
+    participants: int = MOST_PARTICIPANTS,  # to look for at each address
+    *,
+    lease: float = LEASE,  # s
+) -> str:
+    """A profile, as XML, for participants on several hosts: UDP at all their interfaces."""
+    ET.register_namespace("", _NAMESPACE)
+    tree = ET.parse(LOOPBACK_PROFILE)  # drops its comments, which are about another profile
+
+    def find(path: str) -> ET.Element:
+        found = tree.find(f".//{{*}}{path.replace('/', '/{*}')}")
+        assert found is not None, path
+        return found
+
+    find("maxInitialPeersRange").text = str(participants)
+    find("transport_descriptor").remove(find("interfaceWhiteList"))  # messages go to other hosts
+    for each in find("profiles").findall("./*"):
+        if each.get("profile_name", "").startswith("/"):  # batches stay small: a link that loses parts loses the whole
+            find("profiles").remove(each)
+    discovery = ET.Element(_tag("discovery_config"))
+    find("builtin").insert(0, discovery)
+    for key, seconds in (("leaseDuration", lease), ("leaseAnnouncement", ANNOUNCEMENT)):
+        ET.SubElement(ET.SubElement(discovery, _tag(key)), _tag("sec")).text = f"{seconds:.0f}"
+    peers = find("initialPeersList")
+    peers.clear()
+    for address in addresses:
+        locator = ET.SubElement(ET.SubElement(peers, _tag("locator")), _tag("udpv4"))
+        ET.SubElement(locator, _tag("address")).text = address
+    if not addresses:
+        find("builtin").remove(peers)
+    ET.indent(tree, "  ")
+    return ET.tostring(tree.getroot(), encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _tag(name: str) -> str:
+    return f"{{{_NAMESPACE}}}{name}"
+
 
 DOMAINS = range(1, 102)
 """0 is the default of every ROS program; above 101 the ports are among the ephemeral ports of Linux."""
@@ -51,14 +130,14 @@ def _open_lock(path: Path) -> int:
 
 
 @contextmanager
-def free_domain(count: int = 1) -> Iterator[int]:
+def free_domain(count: int = 1, domains: Sequence[int] = DOMAINS) -> Iterator[int]:
     """Hold a ROS_DOMAIN_ID that no other run holds and whose ports are unused; InputError if there is none.
 
     ``count``: as many in a row, for a network that needs their ports; the first one is its domain. They are held by
     locks on files, which the system releases when this process ends, however it ends.
     """
     busy = domains_with_ports_in_use()
-    free = [domain for domain in DOMAINS if domain not in busy]
+    free = [domain for domain in domains if domain not in busy]
     candidates = [first for first in free if set(range(first, first + count)) <= set(free)]
     random.shuffle(candidates)
     for first in candidates:
@@ -66,13 +145,13 @@ def free_domain(count: int = 1) -> Iterator[int]:
             if all(_lock(domain, locks) for domain in range(first, first + count)):
                 yield first
                 return
-    raise InputError(f"no free ROS domain among {DOMAINS[0]}..{DOMAINS[-1]}: end some runs or give --domain")
+    raise InputError(f"no free ROS domain among {domains[0]}..{domains[-1]}: end some runs or give --domain")
 
 
-def held_domains() -> list[int]:
+def held_domains(domains: Sequence[int] = DOMAINS) -> list[int]:
     """The domains that runs on this machine hold."""
     names = (file.stem.rpartition("_")[2] for file in Path(tempfile.gettempdir()).glob(_lock_name("*")))
-    return sorted(domain for domain in map(int, filter(str.isdecimal, names)) if domain in DOMAINS and is_held(domain))
+    return sorted(domain for domain in map(int, filter(str.isdecimal, names)) if domain in domains and is_held(domain))
 
 
 def is_held(domain: int) -> bool:
@@ -257,7 +336,7 @@ def remove_participant(prefix: bytes, domain: int, *, repeats: int = 3) -> None:
                     sender.sendto(message, place)
 
 
-PATIENCE = 1.0  # s; in the kernel, a message is there at once
+LOOPBACK_TIMEOUT = 1.0  # s; in the kernel, a message is there at once
 WORD = b"msg_agents"
 
 
@@ -289,7 +368,7 @@ def loopback_has_multicast() -> bool:
 
 def _exchange(receiver: socket.socket, address: str) -> None:
     """Send a message over loopback, and receive it; OSError: that was not possible."""
-    receiver.settimeout(PATIENCE)
+    receiver.settimeout(LOOPBACK_TIMEOUT)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(LOOPBACK))
         sender.sendto(WORD, (address, receiver.getsockname()[1]))

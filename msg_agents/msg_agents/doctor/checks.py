@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from msg_agents.discovery.profiles import RELAYED_PROFILE
+from msg_agents.discovery.rtps import RELAYED_PROFILE
 from msg_agents.environment import (
     LOGS_VARIABLE,
     MEMORY,

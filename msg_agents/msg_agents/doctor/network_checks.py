@@ -11,9 +11,9 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from msg_agents.discovery.profiles import PROFILE_VARIABLES
 from msg_agents.discovery.rtps import (
     DOMAINS,
+    PROFILE_VARIABLES,
     domains_with_ports_in_use,
     free_domain,
     is_held,

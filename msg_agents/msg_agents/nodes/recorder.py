@@ -14,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msg_agents.nodes.base import NOT_AN_AGENT, NetworkNode
-from msg_agents.nodes.diagnostics import Health
+from msg_agents.nodes.base import NOT_AN_AGENT, Health, NetworkNode
 from msg_agents.nodes.ros import every
 from msg_agents.stepping.state_receiver import StateReceiver
 from msg_analysis.bags.mcap_chunks import DEFAULT_STORAGE, Storage
@@ -79,7 +78,7 @@ class Recorder(NetworkNode):
         every(self, LOOK_PERIOD, self._look_for_others)
 
     def health(self) -> Health:
-        """Number of recorded messages. One that has everything says so again, as agents that stand do."""
+        """Number of recorded messages. One that has everything reports so again, as stalled agents do."""
         self._report_if_complete()
         values = {"messages": str(self.bag.messages), "topics without their last message": str(len(self._awaiting))}
         return Health(f"{self.bag.messages} messages recorded", values=values)

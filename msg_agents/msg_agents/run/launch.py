@@ -1,12 +1,10 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Runs under `ros2 launch`: arguments, and processes that launch starts.
+"""Runs under `ros2 launch`, without ``launch``: arguments, which processes, what the end of each means, what follows.
 
-What the launch files do, without ``launch``: which processes, what the end of each one means, what follows the run.
-
-The plan is that of ``msg-agents run`` (``process_plan``). ``launch`` itself starts the processes and handles signals
-and output (``nodes/launch_actions.py``). Killed processes are not started again here.
+The processes are those of ``msg-agents run``. ``launch`` itself starts them and handles signals and output
+(``nodes/launch_actions.py``). Killed processes are not started again here.
 """
 
 from __future__ import annotations
@@ -182,7 +180,7 @@ class LaunchedProcesses:
     def __init__(self, namespace: str) -> None:
         self.namespace = namespace.strip()
         self._stack = ExitStack()
-        # Its lock is the lifeline of the processes: SIGTERM ends launch without a word to them.
+        # The processes end when its lock is released: SIGTERM ends launch without a signal to them.
         self._folder = self._stack.enter_context(temporary_directory())
         atexit.register(self.close)
         self.processes: list[ProcessSpec] = []
@@ -191,10 +189,10 @@ class LaunchedProcesses:
         self._running: set[str] = set()
         self._stopped: set[str] = set()
 
-    def _plan(self, processes: Sequence[ProcessSpec]) -> None:
-        lifeline = ("--lifeline-lock", str(self._folder))
-        self.processes = [replace(plan, arguments=plan.arguments + lifeline) for plan in processes]
-        self._running = {plan.name for plan in processes}
+    def _set(self, processes: Sequence[ProcessSpec]) -> None:
+        lock = ("--lifeline-lock", str(self._folder))
+        self.processes = [replace(spec, arguments=spec.arguments + lock) for spec in processes]
+        self._running = {spec.name for spec in processes}
 
     @property
     def over(self) -> bool:
@@ -258,7 +256,7 @@ class LaunchedNetwork(LaunchedProcesses):
                 out = Path(arguments["out"]).expanduser().absolute()
                 self.bag = make_bag_directory(experiment, out, option="out:=")
             # Of each, ``arguments[0]`` is the executable.
-            plans = lay_out_network(
+            processes = lay_out_network(
                 experiment,
                 self._run_file,
                 self.bag,
@@ -266,7 +264,7 @@ class LaunchedNetwork(LaunchedProcesses):
                 parameter_services=services,
                 storage=storage,
             )
-            self._plan(plans)
+            self._set(processes)
         except BaseException:
             self.close()
             raise
@@ -324,10 +322,13 @@ class LaunchedReplay(LaunchedProcesses):
         live = flag(arguments, "live")
         super().__init__(arguments["namespace"])
         if live:
-            plans = [ProcessSpec("live", ("live", "--reliable")), ProcessSpec("player", (*player, "--await", "live"))]
+            processes = [
+                ProcessSpec("live", ("live", "--reliable")),
+                ProcessSpec("player", (*player, "--await", "live")),
+            ]
         else:
-            plans = [ProcessSpec("player", player)]
-        self._plan(plans)
+            processes = [ProcessSpec("player", player)]
+        self._set(processes)
 
 
 def environment() -> dict[str, str]:

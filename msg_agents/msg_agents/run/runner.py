@@ -19,19 +19,19 @@ from msg_agents.process_layout import (
     MOST_PROCESSES,
     MOST_UNAIDED,
     SWITCHER,
-    Share,
+    HostAssignment,
+    assign_cores,
     count_processes,
     lay_out_network,
     partners,
-    place,
 )
 from msg_agents.recovery import entry_size, room_for
 from msg_agents.run.folder import make_bag_directory, temporary_directory
 from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.result import EventLog, RunResult
 from msg_agents.run.run_channel import RunChannel, run_channel
-from msg_agents.run.supervisor import CLOCKS, CRASHED, LATE, STATUS_FOLDER, STEPS, Supervisor
-from msg_agents.stepping.stall_detection import ClockDetector, LagDetector, StallDetector
+from msg_agents.run.supervisor import CLOCKS, CRASHED, HUNG, LATE, STATUS_FOLDER, STEPS, Supervisor
+from msg_agents.stepping.monitoring import ClockDetector, LagDetector, StallDetector
 from msg_agents.terminal import Interruption
 from msg_agents.watch.observer import EarlyEnd
 from msg_agents.watch.panel import View
@@ -65,10 +65,11 @@ def run_network(
     view: View | None = None,
     environment: Mapping[str, str] | None = None,
     record: RunRecord | None = None,
-    share: Share | None = None,
+    assignment: HostAssignment | None = None,
     channel: Channel | None = None,
     interruption: Interruption | None = None,
     until: Until | None = None,
+    hung_timeout: float = HUNG,
 ) -> RunResult:
     """Run an experiment as a network of ROS 2 processes.
 
@@ -107,16 +108,18 @@ def run_network(
         changes to the environment of the processes
     record
         record of the run; None: a new one is made
-    share
+    assignment
         what this host runs, of several hosts; None: all. Without the recorder only the logs are kept, in the
         directory that would hold the bag
     channel
         the hosts on which the processes are, and what is between them; None: all are on this one
     until
         when the run may end before its duration, in order, as a complete run of fewer steps; None: it does not. Not
-        with a ``share``
+        with an ``assignment``
     interruption
         keeps signals from the start of the processes on, beyond the end of this call; None: one for this call only
+    hung_timeout
+        s without running after which a process whose main thread waits is ended and started again
 
     Returns
     -------
@@ -132,9 +135,9 @@ def run_network(
     view = view or View(on_progress, on_note)
     experiment.require_available()
     most = MOST_PROCESSES if channel is None and uses_relay(environment or {}) else MOST_UNAIDED
-    processes = count_processes(experiment, None if share is None else len(share.agents), most=most)
+    count = count_processes(experiment, None if assignment is None else len(assignment.agents), most=most)
     directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
-    bag = directory if share is None or share.home else None
+    bag = directory if assignment is None or assignment.has_recorder else None
     result = RunResult(experiment, bag)
     kept = interruption or Interruption()
     try:
@@ -145,13 +148,15 @@ def run_network(
                 folder,
                 domain,
                 {**(environment or {}), **(linked.environment(folder) if linked else {})},
-                processes + 2,
+                count + 2,
             ) as around,
         ):
             variables = around.environment
             with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 require_middleware(variables, *([fork_server.has_middleware] if fork_server else []))
-                if share is None and linked is None:  # other hosts and users' tools do not reach those of a channel
+                if (
+                    assignment is None and linked is None
+                ):  # other hosts and users' tools do not reach those of a channel
                     view.joined(around.domain)
                 record = replace(record or new_record(experiment), until=until)
                 run_file = folder / "run.json"
@@ -166,32 +171,35 @@ def run_network(
                         variables,
                         last_step=experiment.steps,
                         fork_server=fork_server,
-                        introducer=around.introducer,
-                        ends_hung=share is None,  # with several hosts, the switcher waits for others at its end
+                        relay=around.relay,
+                        hung_timeout=hung_timeout,
+                        ends_hung=assignment is None,  # with several hosts, the switcher waits for others at its end
                     ) as supervisor,
                 ):
-                    plans = lay_out_network(
+                    processes = lay_out_network(
                         experiment,
                         run_file,
                         bag,
                         checkpoints=checkpoints,
                         use_sim_time=use_sim_time,
                         storage=storage,
-                        share=share,
+                        assignment=assignment,
                         readers=readers,
-                        most=MOST_PROCESSES if around.introducer else MOST_UNAIDED,
+                        most=MOST_PROCESSES if around.relay else MOST_UNAIDED,
                         hosts=linked.agents if linked else (),
                     )
                     if linked:
-                        linked.start(supervisor, plans, record.model, lockstep=experiment.run.pace == "lockstep")
-                    if around.introducer:
-                        around.introducer.introduce(partners(plans, record.model.listens()))
+                        linked.start(supervisor, processes, record.model, lockstep=experiment.run.pace == "lockstep")
+                    if around.relay:
+                        around.relay.connect(partners(processes, record.model.listens()))
                     if pin and experiment.run.pace == "lockstep":
-                        supervisor.cores = place(plans, available_cores(), first=around.domain)
-                    supervisor.start(plans)
+                        supervisor.cores = assign_cores(processes, available_cores(), first=around.domain)
+                    supervisor.start(processes)
                     ending = EarlyEnd(record, checkpoints) if until and checkpoints else None
                     with ending or nullcontext():
-                        view.begin(record, checkpoints if share is None else None, ending.observer if ending else None)
+                        view.begin(
+                            record, checkpoints if assignment is None else None, ending.observer if ending else None
+                        )
                         view.started(supervisor.by_node)
                         _watch(
                             supervisor,
@@ -208,7 +216,7 @@ def run_network(
                     result.until = ending.to_json() if ending else None
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
                     _collect_failures(supervisor, result, kept, restarts)
-            result.strangers = supervisor.account().strangers()
+            result.strangers = supervisor.status().rejected_messages()
             result.clocks, _ = supervisor.clocks()
             if linked:
                 result.channel = linked.to_json(supervisor, experiment)
@@ -258,7 +266,7 @@ def _watch(
         if ending and ending.look(min(supervisor.steps, default=-1), view.note):
             supervisor.last_step = steps = ending.last_step
             view.ends_at(steps)
-        events.look(supervisor.steps, supervisor.account)
+        events.look(supervisor.steps, supervisor.status)
         if not warned and (warned := supervisor.clocks()[1]):
             view.note(warned)
         view.look(supervisor.steps)
@@ -269,7 +277,7 @@ def _watch(
             view.note(words)
             lag = LagDetector(due)
         if stall.update(sum(supervisor.steps)) and 0 <= reached < steps:
-            view.note(f"no step for {stall.stalled:.0f} s: {_standstill(supervisor, result.experiment.names)}")
+            view.note(f"no step for {stall.stalled:.0f} s: {_stall_causes(supervisor, result.experiment.names)}")
         if reached < 0:
             continue
         if lag and reached < steps and (behind := lag.update(reached)):
@@ -282,16 +290,16 @@ def _watch(
         if reached < steps or not result.wall_time:
             result.wall_time = now - began
     supervisor.read_status()  # what was reported between the last look and the end
-    events.look(supervisor.steps, supervisor.account, last=True)
+    events.look(supervisor.steps, supervisor.status, last=True)
     view.look(supervisor.steps)
     if result.wall_time:
         result.rate = min(supervisor.steps, default=0) / result.wall_time
 
 
-def _standstill(supervisor: Supervisor, names: Sequence[str] | None) -> str:
+def _stall_causes(supervisor: Supervisor, names: Sequence[str] | None) -> str:
     """Causes of a stall, as far as they are known; a silent process is stopped, or waits for one that is."""
-    words = [f"{node}: {message}" for node, message in sorted(supervisor.account().waiting.items())]
-    silent = [child.plan.name for child in supervisor.silent]
+    words = [f"{node}: {message}" for node, message in sorted(supervisor.status().waiting.items())]
+    silent = [child.spec.name for child in supervisor.silent]
     if silent:
         words.append("no report from " + ", ".join(silent))
     if not words and supervisor.steps:  # the processes that know are on another host
@@ -305,11 +313,11 @@ def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View
     for child in supervisor.failures:
         if not child.resumes or len(result.restarts) >= restarts:
             return False
-        step = min((supervisor.steps[i] for i in child.plan.agents), default=-1) if supervisor.steps else -1
+        step = min((supervisor.steps[i] for i in child.spec.agents), default=-1) if supervisor.steps else -1
         after = f" after step {step}" if step >= 0 else ""
         words = f" ({child.last_line()})" if child.process.poll() == CRASHED else ""
-        result.restarts.append(f"{child.plan.name}: {child.failure}{words}{after}, started again")
-        events.killed(child.plan.name, child.plan.agents, step, result.restarts[-1])
+        result.restarts.append(f"{child.spec.name}: {child.failure}{words}{after}, started again")
+        events.killed(child.spec.name, child.spec.agents, step, result.restarts[-1])
         view.note(result.restarts[-1])
         supervisor.restart(child)
         view.started(supervisor.by_node)
@@ -320,14 +328,14 @@ def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: I
     result.reached = min(supervisor.steps, default=-1)
     if (number := interruption.take()) is not None:
         reached, steps = result.reached, result.experiment.steps
-        unknown = all(child.plan.name != SWITCHER for child in supervisor.children)  # it is on another host
+        unknown = all(child.spec.name != SWITCHER for child in supervisor.children)  # it is on another host
         where = "" if unknown else f"at step {reached} of {steps}" if reached >= 0 else "before step 0"
         result.interrupt(number, where)
     for child in supervisor.failures:
         words = child.last_line()
-        line = f"{child.plan.name}: {child.failure}" + (f": {words}" if words else "")
+        line = f"{child.spec.name}: {child.failure}" + (f": {words}" if words else "")
         if child.resumes and result.restarts:
-            counts = {c.plan.name: c.number - 1 for c in supervisor.children if c.number > 1}
+            counts = {c.spec.name: c.number - 1 for c in supervisor.children if c.number > 1}
             listed = ", ".join(
                 f"{name} {times} times" if times > 1 else f"{name} once" for name, times in counts.items()
             )

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from msg_agents.channel.process import channel_findings
+from msg_agents.run.run_channel import channel_findings
 from msg_analysis.inference.messages import UnheardMessages
 
 

@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 
 from msg_agents.channel.channel_file import Channel
-from msg_agents.channel.links import ActiveGraphFile, LinkSettings, LossModel, destinations, read_counts
-from msg_agents.channel.namespaces import Host, enter, host_address, open_hosts
-from msg_agents.channel.process import hand_over, serve
+from msg_agents.channel.links import LinkSettings, LossModel, destinations, read_counts
+from msg_agents.channel.process import ActiveGraphFile, Host, enter, hand_over, host_address, open_hosts, serve
 from msg_analysis.errors import NotAvailableError
 
 NAMES = ["base", "left", "right"]

@@ -14,9 +14,8 @@ from contextlib import ExitStack
 import pytest
 
 from msg_agents.discovery import relay
-from msg_agents.discovery.profiles import FIRST_RELAYED
 from msg_agents.discovery.relay import DiscoveryRelay, report_ready
-from msg_agents.discovery.rtps import discovery_port, disposal_message, free_domain, read_announcement
+from msg_agents.discovery.rtps import FIRST_RELAYED, discovery_port, disposal_message, free_domain, read_announcement
 
 QUIET = 0.2  # s in which nothing comes
 PARTNERS = {"agent_1": {"agent_2", "switcher"}, "agent_2": {"agent_1", "switcher"}, "agent_3": {"switcher"}}

@@ -11,17 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from msg_agents.discovery import profiles
-from msg_agents.discovery.profiles import (
+from msg_agents.discovery.rtps import (
     LOOPBACK_PROFILE,
     PROFILE_VARIABLES,
     RELAYED_PROFILE,
     UDP_PROFILE,
+    free_domain,
     has_fast_dds_3,
     has_profile_for,
     profile_for_hosts,
 )
-from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment, profile_variables
 from msg_analysis.messages.topics import STATES, TRUTHS
 

@@ -16,16 +16,19 @@ from hypothesis import strategies as st
 
 pytest.importorskip("rclpy")
 
-from msg_agents.discovery.profiles import FIRST_RELAYED, MOST_RELAYED, RELAYED_PROFILE, domains_for
 from msg_agents.discovery.rtps import (
+    FIRST_RELAYED,
+    MOST_RELAYED,
     PEERS_VARIABLE,
     PORT_BASE,
     PORTS_PER_DOMAIN,
+    RELAYED_PROFILE,
     Announcement,
     announcement_message,
     discovery_port,
     discovery_ports,
     disposal_message,
+    domains_for,
     free_domain,
     read_announcement,
     remove_participant,

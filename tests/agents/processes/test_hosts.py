@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 
-from msg_agents.discovery.profiles import PROFILE_VARIABLES
-from msg_agents.discovery.rtps import PEERS_VARIABLE
+from msg_agents.discovery.rtps import PEERS_VARIABLE, PROFILE_VARIABLES
 from msg_agents.process_layout import Hosts, Share, lay_out_network
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment

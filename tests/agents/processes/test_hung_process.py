@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 
 import pytest
+from msg_agents.run.lifeline import LONGEST_LOOK, HungDetector
 from started_processes import started_processes
 from waiting import state_of, wait_for
 
 from msg_agents.run import lifeline
-from msg_agents.run.lifeline import LONGEST_LOOK, HungDetector
 
 BLOCKED = "import threading; lock = threading.Lock(); lock.acquire(); print(flush=True); lock.acquire()"
 HELPED = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from msg_agents.stepping.newest_values import ClockOffsets
+from msg_agents.stepping.monitoring import ClockOffsets
 
 MS = 1_000_000  # ns
 

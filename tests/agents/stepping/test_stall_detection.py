@@ -7,8 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from msg_agents.stepping import stall_detection
-from msg_agents.stepping.stall_detection import ClockDetector, LagDetector, StallDetector
+from msg_agents.stepping.monitoring import ClockDetector, LagDetector, StallDetector
 
 
 @pytest.fixture
