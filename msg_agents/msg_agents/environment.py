@@ -242,11 +242,7 @@ def without_shared_memory() -> dict[str, str]:
         return {}
     # Both add shared memory to any profile.
     if os.environ.get(RANGE_VARIABLE) == "LOCALHOST" or os.environ.get(LOCALHOST_VARIABLE) == "1":
-        return {
-            RANGE_VARIABLE: "SYSTEM_DEFAULT",
-            LOCALHOST_VARIABLE: "",
-            **profile_variables(LOOPBACK_PROFILE),
-        }
+        return {RANGE_VARIABLE: "SYSTEM_DEFAULT", LOCALHOST_VARIABLE: "", **profile_variables(LOOPBACK_PROFILE)}
     return profile_variables(UDP_PROFILE)
 
 

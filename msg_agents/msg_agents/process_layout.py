@@ -262,9 +262,7 @@ class HostSpec(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
     address: str = Field(
-        min_length=1,
-        description="the address at which the other hosts reach this one",
-        examples=["192.0.2.1"],
+        min_length=1, description="the address at which the other hosts reach this one", examples=["192.0.2.1"]
     )
     agents: Annotated[list[int], BeforeValidator(agent_numbers)] = Field(
         default=[], description="the agents that run there", examples=[[1, "3-5"]]

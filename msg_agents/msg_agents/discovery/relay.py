@@ -37,9 +37,7 @@ from msg_agents.discovery.rtps import (
 
 REPEAT = 10.0  # s after which an announcement is forwarded again: it was lost, or its lease has ended
 FRESH = 10.0  # s for which an announcement is valid; a participant repeats it every 3 s
-JOINING_AFTER = (
-    5.0  # s after which a participant with a number of the run that has reported nothing is a joining participant
-)
+JOINING_AFTER = 5.0  # s after which a participant with a number of the run that reported nothing counts as joining
 PERIOD, LEASE = 3.0, 20  # s between announcements of this program itself, and for which others remember it
 HOST = slice(0, 4)  # the part of a prefix that is the same for all participants of a vendor on a machine
 MOST_KNOWN = 1000  # participants

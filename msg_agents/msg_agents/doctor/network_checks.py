@@ -250,18 +250,8 @@ OF_SYSTEM = (
     checks.check_logs,
     checks.check_temporary_directory,
 )
-OF_NETWORK = (
-    check_loopback,
-    check_multicast,
-    check_buffers,
-)
-OF_SHELL = (
-    checks.check_rclpy,
-    check_profiles,
-    check_range,
-    check_server,
-    check_peers,
-)
+OF_NETWORK = (check_loopback, check_multicast, check_buffers)
+OF_SHELL = (checks.check_rclpy, check_profiles, check_range, check_server, check_peers)
 LATER = (  # each with the checks that it needs to be without an error
     ("middleware", checks.check_middleware, {"rclpy", "temporary_directory"}),
     ("ros_domain_id", check_own_domain, {"temporary_directory"}),

@@ -100,11 +100,7 @@ class _Group:
                 cmd=[ExecutableInPackage(executable="msg-analysis", package="msg_analysis"), *arguments],
                 output="screen",
             )
-            return [
-                LogInfo(msg=f"the run is complete: {arguments[1]}"),
-                self._at_end_of(ANALYSIS, analysis),
-                analysis,
-            ]
+            return [LogInfo(msg=f"the run is complete: {arguments[1]}"), self._at_end_of(ANALYSIS, analysis), analysis]
         launched.close()
         for timer in self._timers:
             timer.cancel()

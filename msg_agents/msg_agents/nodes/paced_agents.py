@@ -76,9 +76,7 @@ class LockstepAgent(Agent):
             return Health(f"at step {step}", values=values)
         waiting = self._synchronizer.waiting_for()
         if overdue and step == 0 and self.get_name() in self.duplicate_names():
-            self._group.fail(
-                self.duplicate_name_error([self.get_name()], stall.stalled)
-            )  # the others have started without this one
+            self._group.fail(self.duplicate_name_error([self.get_name()], stall.stalled))  # others have started
         elif overdue:
             self.get_logger().warning(f"no step for {stall.stalled:.0f} s at step {step}: waiting for {waiting}")
             self._request_states(self._synchronizer.lacking())
@@ -144,9 +142,7 @@ class RealtimeAgent(Agent):
         super().__init__(**options)
         experiment = self.record.experiment
         if experiment.run.delivery != "reliable":
-            self.state_qos = (
-                topics.PASSIVE_NEWEST
-            )  # only the newest value is of use; none of the others is kept or repeated
+            self.state_qos = topics.PASSIVE_NEWEST  # only the newest value is of use
         self._phase = float(phases(experiment)[self._law.agent])
         self._speed = experiment.run.speed
         self._dt = experiment.step_length
@@ -163,9 +159,7 @@ class RealtimeAgent(Agent):
         # The stamps of others may be so much ahead of our clock.
         self._margin = round(CLOCK_MARGIN * SECOND * self._speed)
         self._common: Schedule | None = None  # simulated time without a phase
-        self._ahead_at_most = (
-            math.inf
-        )  # how far our clock is ahead of the switcher's at most, by what came from it [ns]
+        self._ahead_at_most = math.inf  # ns by which our clock is ahead of the switcher's at most
         self._late = self._graph_late = 0  # largest lateness since the last report [ns of simulated time]
         self._looked = 0  # time of the clock at the last call of ``_waiting_for`` [ns]
         self._missed = self._missed_before = 0  # steps made later than the next one was due

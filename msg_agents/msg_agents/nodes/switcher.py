@@ -83,9 +83,7 @@ class Switcher(NetworkNode):
             self._stop = self.publisher_of(topics.STOP)
             self._stops = StopFiles(checkpoints, record.run) if checkpoints else None
         self._state_file = checkpoints and checkpoints / f"switcher.{record.run}"
-        if (
-            self._state_file and self._state_file.exists()
-        ):  # in the middle of a run, none of the user's nodes is awaited
+        if self._state_file and self._state_file.exists():  # in the middle of a run, no node of the user is awaited
             readers = [name for name in readers if name == RECORDER]
         self._expected = [agent_node_name(i) for i in range(model.agents)] + readers
         self._experiment = self.publisher_of(topics.EXPERIMENT)

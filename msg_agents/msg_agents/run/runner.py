@@ -145,18 +145,13 @@ def run_network(
             run_channel(channel) as linked,
             temporary_directory() as folder,
             run_environment(
-                folder,
-                domain,
-                {**(environment or {}), **(linked.environment(folder) if linked else {})},
-                count + 2,
+                folder, domain, {**(environment or {}), **(linked.environment(folder) if linked else {})}, count + 2
             ) as around,
         ):
             variables = around.environment
             with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 require_middleware(variables, *([fork_server.has_middleware] if fork_server else []))
-                if (
-                    assignment is None and linked is None
-                ):  # other hosts and users' tools do not reach those of a channel
+                if assignment is None and linked is None:  # tools of the user do not reach a channel
                     view.joined(around.domain)
                 record = replace(record or new_record(experiment), until=until)
                 run_file = folder / "run.json"

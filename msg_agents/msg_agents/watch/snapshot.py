@@ -168,11 +168,7 @@ class SnapshotSource:
         self._events.append(Event(self._reached, text))
 
     def snapshot(
-        self,
-        steps: Sequence[int],
-        report: LiveReport | None = None,
-        note: str | None = None,
-        ended: Iterable[int] = (),
+        self, steps: Sequence[int], report: LiveReport | None = None, note: str | None = None, ended: Iterable[int] = ()
     ) -> Snapshot:
         """The snapshot now, from the newest step of every agent (-1: none; empty before the start).
 
