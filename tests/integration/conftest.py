@@ -25,6 +25,7 @@ from typing import Any
 import pytest
 import yaml
 from left_processes import describe, last_line
+from networks import document, experiment
 from started_processes import started_processes
 
 pytest.importorskip("rclpy")
@@ -51,20 +52,6 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "repetition" in metafunc.fixturenames:
         count = int(os.environ.get("STRESS", "1"))
         metafunc.parametrize("repetition", range(count), ids=[f"repetition_{i}" for i in range(count)])
-
-
-def document(**changes: Any) -> dict[str, Any]:
-    """Five agents on a line and a ring; ``run`` is merged, other keys are replaced."""
-    run = {"dt": 0.05, "duration": 15, "replicas": 2, "seed": 7} | changes.pop("run", {})
-    return {
-        "name": "net",
-        "problem": "consensus",
-        "time": "continuous",
-        "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
-        "switching": {"generator": [[-1, 1], [1, -1]]},
-        **changes,
-        "run": run,
-    }
 
 
 @dataclass(frozen=True)
@@ -184,10 +171,7 @@ class Network:
         """Start ``msg-agents run`` without a verdict."""
         return self.start("run", file, "--out", self.directory / "runs", "--no-analyse", *options, **environment)
 
-    @staticmethod
-    def experiment(**changes: Any) -> Experiment:
-        """See ``document``."""
-        return Experiment.parse(document(**changes))
+    experiment = staticmethod(experiment)
 
     def file(self, name: str = "net.yaml", **changes: Any) -> Path:
         """An experiment file."""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from visitor import watched_endpoints
+from joining_node import watched_endpoints
 
 from msg_agents.run.result import read_steps
 from msg_analysis.bags.reading import read_bag

@@ -26,14 +26,14 @@ def network_awaiting(node: str, record: RunRecord, directory: Path, domain: int)
         Supervisor(directory, environment, fork_server=server) as nodes,
     ):
         recorder, *others = lay_out_network(record.experiment, directory / "run.json", directory / BAG)
-        nodes.start([recorder, *(_awaiting(node, plan) for plan in others)])
+        nodes.start([recorder, *(_awaiting(node, spec) for spec in others)])
         yield nodes
 
 
-def _awaiting(node: str, plan: ProcessSpec) -> ProcessSpec:
-    return dataclasses.replace(plan, arguments=(*plan.arguments, "--await", node))
+def _awaiting(node: str, spec: ProcessSpec) -> ProcessSpec:
+    return dataclasses.replace(spec, arguments=(*spec.arguments, "--await", node))
 
 
 def failures_of(nodes: Supervisor) -> list[tuple[str, str | None, str]]:
     """Processes that have failed: name, how, and the last line that they printed."""
-    return [(child.plan.name, child.failure, child.last_line()) for child in nodes.failures]
+    return [(child.spec.name, child.failure, child.last_line()) for child in nodes.failures]

@@ -9,8 +9,9 @@ import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from msg_agents.run.lifeline import SHOW_STACKS
 from waiting import state_of
+
+from msg_agents.run.fork_server import SHOW_STACKS
 
 ANSWER = 0.5  # s that they have to write their stacks
 LONGEST = 6000  # characters of a file

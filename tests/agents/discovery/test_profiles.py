@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from msg_agents.discovery import rtps
 from msg_agents.discovery.rtps import (
     LOOPBACK_PROFILE,
     PROFILE_VARIABLES,
@@ -25,17 +26,17 @@ from msg_agents.environment import node_environment, profile_variables
 from msg_analysis.messages.topics import STATES, TRUTHS
 
 OLD, NEW = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
-FOLDER = Path(profiles.__file__).parent
+FOLDER = Path(rtps.__file__).parent
 # All that the profiles have and Fast DDS 3 has renamed: its profiles are made by
 #     cd msg_agents/msg_agents/discovery
-#     for i in loopback introduced; do
+#     for i in loopback relayed; do
 #         sed -e s/heartbeatPeriod/heartbeat_period/ -e s/initialAcknackDelay/initial_acknack_delay/ $i.xml \
 #             > fast_dds_3/$i.xml
 #     done
 RENAMED = {"heartbeatPeriod": "heartbeat_period", "initialAcknackDelay": "initial_acknack_delay"}
 
 
-@pytest.mark.parametrize("name", ["loopback.xml", "introduced.xml"])
+@pytest.mark.parametrize("name", ["loopback.xml", "relayed.xml"])
 def test_profiles_for_fast_dds_3_differ_in_what_it_has_renamed(name: str) -> None:
     old = (FOLDER / name).read_text()
     new = re.sub("|".join(RENAMED), lambda found: RENAMED[found[0]], old)
