@@ -1,4 +1,4 @@
-"""Cyclone DDS, another vendor's middleware, beside a run: as a reader, as a stranger, and as one of its agents."""
+"""Cyclone DDS, another vendor's middleware, beside a run: as a reader, as a foreign node, and as one of its agents."""
 
 from __future__ import annotations
 
@@ -124,14 +124,14 @@ def test_a_reader_comes_late_and_another_one_is_killed(network: Any) -> None:
     assert (graphs[-1][2], came_late["end"]) == (steps - 1, [[0, steps]])
 
 
-def test_a_stranger_is_refused(network: Any) -> None:
+def test_a_foreign_node_is_refused(network: Any) -> None:
     what = network.experiment(run={"duration": 50, "processes": 2})
     with free_domain() as domain, cyclone(domain, "--forge") as reader:
         result = network.run(what, domain=domain, readers=["cyclone_reader"])
         came(reader)
     assert result.failures == []
     equal_to_the_twin(result.trajectory)
-    refused = {(stranger["topic"].lstrip("/"), stranger["reason"]) for stranger in result.strangers}
+    refused = {(entry["topic"].lstrip("/"), entry["reason"]) for entry in result.strangers}
     assert {topic for topic, _ in refused} >= {"graph", "end", "progress", "agent_1/state"}
 
 
@@ -149,7 +149,7 @@ def test_an_agent(network: Any, noise: dict[str, Any]) -> None:
             ForkServer(environment, directory / "fork_server.log") as server,
             Supervisor(directory, environment, fork_server=server) as nodes,
         ):
-            nodes.start([plan for plan in lay_out_network(record.experiment, file, bag) if plan.name != "agent_3"])
+            nodes.start([spec for spec in lay_out_network(record.experiment, file, bag) if spec.name != "agent_3"])
             foreign = subprocess.run(
                 [sys.executable, str(AGENT), str(file), "3"],
                 env=os.environ | {"ROS_DOMAIN_ID": str(domain), "CYCLONEDDS_URI": UNICAST},

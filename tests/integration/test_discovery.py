@@ -23,7 +23,7 @@ from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
 NODES = sorted(["recorder", "switcher", *(f"agent_{i}" for i in range(1, 6))])
-VISITOR = """
+JOINING = """
 import sys, time, rclpy
 rclpy.init()
 name, *wanted = sys.argv[1:]
@@ -42,21 +42,21 @@ def domain() -> Iterator[int]:
         yield number
 
 
-def visits(stack: ExitStack, when: str, domain: int) -> dict[str, subprocess.Popen[str]]:
-    """Visitors in each kind of run_environment, by the names of their nodes."""
-    run_environment = {
+def joining(stack: ExitStack, when: str, domain: int) -> dict[str, subprocess.Popen[str]]:
+    """Joining nodes with each kind of environment, by the names of their nodes."""
+    environments = {
         "our_profile": node_environment(domain),
         "range_of_ros": os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
     }
     found = {}
-    for kind, environment in run_environment.items():
-        command = [sys.executable, "-P", "-c", VISITOR, f"visitor_{when}_{kind}", *NODES]
-        visitor = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
-        found[command[4]] = stack.enter_context(visitor)
+    for kind, environment in environments.items():
+        command = [sys.executable, "-P", "-c", JOINING, f"other_{when}_{kind}", *NODES]
+        other = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+        found[command[4]] = stack.enter_context(other)
     return found
 
 
-def test_visitors_see_every_process(network: Any, domain: int) -> None:
+def test_others_see_every_process(network: Any, domain: int) -> None:
     """Those that were there before the run and those that come during it, with our profile and in ROS's own range.
 
     Of a run in which no process knows more than half of the others. In real time, agents hear each other with best
@@ -66,25 +66,25 @@ def test_visitors_see_every_process(network: Any, domain: int) -> None:
     # Few steps, and large states, which are soon seen in the bag.
     file = network.file(graphs=graphs, run={"pace": "realtime", "duration": 2000, "replicas": 128})
     with ExitStack() as stack:
-        visitors = visits(stack, "before", domain)
-        for visitor in visitors.values():
-            assert visitor.stdout is not None
-            assert visitor.stdout.readline() == "ready\n"
+        others = joining(stack, "before", domain)
+        for other in others.values():
+            assert other.stdout is not None
+            assert other.stdout.readline() == "ready\n"
         run = network.record(file, "--domain", str(domain))
         network.wait_until_moving()
-        visitors |= visits(stack, "during", domain)
-        for name, visitor in visitors.items():
-            said, _ = visitor.communicate(timeout=90)
+        others |= joining(stack, "during", domain)
+        for name, other in others.items():
+            said, _ = other.communicate(timeout=90)
             seen = said.splitlines()[-1].split()
             assert name in seen
-            assert [node for node in seen if node not in visitors] == NODES, name
+            assert [node for node in seen if node not in others] == NODES, name
         assert_delivery("BEST_EFFORT", [2], domain)
         run.terminate()
         run.communicate(timeout=60)
 
 
 def test_a_domain_without_room_for_introductions(network: Any, domain: int) -> None:
-    """Where others have all the numbers of visitors, the processes look for each other; the result is the same.
+    """Where others have all its numbers, the processes look for each other; the result is the same.
 
     One process per agent: the twin says, from the experiment alone, what they record.
     """

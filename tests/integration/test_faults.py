@@ -58,8 +58,8 @@ def kill_and_see(network: Any, run: subprocess.Popen[str], victim: Any, *, early
     assert network.processes() == []
     first = {1: "agents_1_to_2", 3: "agents_3_to_5"}[victim.agent] if kind == "agent" else kind
     assert re.search(rf"^failed: {first}: killed by SIGKILL", stderr, re.MULTILINE), stderr
-    blamed = re.findall(r"^failed: (agents?_\w+|switcher|recorder): ", stderr, re.MULTILINE)
-    assert blamed == [first], stderr
+    failed = re.findall(r"^failed: (agents?_\w+|switcher|recorder): ", stderr, re.MULTILINE)
+    assert failed == [first], stderr
     (bag,) = (network.directory / "runs").iterdir()
     assert (bag / "log" / f"{first}.log").exists()
     if early and not list(bag.glob("*.mcap")):
@@ -75,8 +75,6 @@ def kill_and_see(network: Any, run: subprocess.Popen[str], victim: Any, *, early
 
 
 NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
-# 20,000 steps: no test waits for them; of states that are soon seen in the bag
-LONG = {"duration": 1000, "replicas": 16, "processes": 2}
 
 
 def test_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:

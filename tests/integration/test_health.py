@@ -121,10 +121,10 @@ def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
         refused = any(key.startswith("refused on ") for key in status)  # of a second process
         assert status["level"] == (1 if waits or refused else 0)
         assert waits == ("waiting for" in status["message"])
-    blamed = {
+    waited = {
         s["waiting for"] for s in agents if s["name"] == "agent_1: network" and s["step"] == step and "waiting for" in s
     }
-    assert blamed == {words}
+    assert waited == {words}
     moving = [s for s in agents if re.fullmatch(r"at step \d+", s["message"]) and float(s["steps per second"]) > 0]
     assert moving
 

@@ -217,7 +217,7 @@ def test_interrupted_it_says_what_it_has(
     )
 
 
-LISTENER = """
+PICTURES = """
 import json
 import rclpy
 from visualization_msgs.msg import MarkerArray
@@ -253,7 +253,7 @@ def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyP
     """
     with free_domain() as domain:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-        script = LISTENER.replace("{LAST}", str(STEPS))
+        script = PICTURES.replace("{LAST}", str(STEPS))
         listener = subprocess.Popen([sys.executable, "-P", "-c", script], stdout=subprocess.PIPE, text=True)
         assert listener.stdout
         assert listener.stdout.readline() == "ready\n"

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import yaml
 
-from msg_agents.run import lifeline
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.verdict import compare
@@ -124,12 +123,11 @@ def test_a_protocol_that_ends_its_process(network: Any) -> None:
 @pytest.mark.parametrize("restarts", [3, 0])
 def test_a_protocol_that_hangs(network: Any, monkeypatch: pytest.MonkeyPatch, restarts: int) -> None:
     """Once: its process is ended and comes back. Without restarts the run ends. Nobody waits for ever."""
-    monkeypatch.setattr(lifeline, "HUNG", 3.0)
     packages = _install(network, HANGING)
     monkeypatch.syspath_prepend(packages)
     what = network.experiment(protocol={"name": "broken"}, run={"duration": 60, "start": "zero", "processes": 2})
     environment = {"PYTHONPATH": str(packages), "MSG_AGENTS_HANGING": str(network.directory / "mark")}
-    result = network.run(what, restarts=restarts, environment=environment)
+    result = network.run(what, restarts=restarts, environment=environment, hung_timeout=3.0)
     words = "agents_3_to_5: hung, its main thread has not run for 3 s (stacks in log/agents_3_to_5.log)"
     assert [line.startswith(words) for line in result.restarts] == ([True] if restarts else [])
     assert (words in result.failures) == (not restarts)

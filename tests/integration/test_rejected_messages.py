@@ -126,7 +126,7 @@ def test_a_forged_state_is_noticed_and_nothing_is_concluded(network: Any) -> Non
 
 
 # Listens, and sends what cannot be as seen from the step at which the run is; says what it sent.
-INTRUDER = """
+FOREIGN = """
 import random, sys, time
 from pathlib import Path
 import numpy as np
@@ -147,7 +147,7 @@ other = rng.randbytes(16)
 frame = StateFrame(run, 2, 0)
 now = [0]
 rclpy.init()
-node = rclpy.create_node("intruder", enable_rosout=False)
+node = rclpy.create_node("foreign", enable_rosout=False)
 state = node.create_publisher(StateMsg, "agent_2/state", ros_profile(topics.STREAM))
 states = node.create_publisher(StateBatch, "states", ros_profile(topics.STREAM))
 graph = node.create_publisher(GraphMsg, "graph", ros_profile(topics.LATCHED))
@@ -204,29 +204,29 @@ time.sleep(600)
 """
 
 
-def test_an_intruder_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:
-    """Everything that cannot be, in any order, sent to a run that is under way; the intruder is killed at last."""
+def test_a_foreign_node_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:
+    """Everything that cannot be, in any order, sent to a run that is under way; the foreign node is killed at last."""
     # 25,000 steps: in time, the last one is more than 6,000 ahead, and the recorder refuses it as impossible.
     graphs = {"line": {"path": [1, 2, 3, 4]}, "ring": {"cycle": [1, 2, 3, 4]}}
     file = network.file(graphs=graphs, run={"duration": 1250, "processes": 2})
     with free_domain() as domain:
-        options = ("--out", network.directory / "runs", "--domain", str(domain), "--await", "intruder", "--json")
+        options = ("--out", network.directory / "runs", "--domain", str(domain), "--await", "foreign", "--json")
         run = network.start("run", file, *options)
         network.wait_for(network.nodes, 30, "a node")
-        intruder = subprocess.Popen(
-            [sys.executable, "-P", "-c", INTRUDER, str(network.run_file()), str(rng.random())],
+        foreign = subprocess.Popen(
+            [sys.executable, "-P", "-c", FOREIGN, str(network.run_file()), str(rng.random())],
             env=node_environment(domain),
             stdout=subprocess.PIPE,
             text=True,
         )
         try:
-            assert intruder.stdout is not None
-            assert int(intruder.stdout.readline()) < 17_000  # it was in time
+            assert foreign.stdout is not None
+            assert int(foreign.stdout.readline()) < 17_000  # it was in time
             result = network.completed(run)
         finally:
-            intruder.kill()
-            intruder.wait()
-            intruder.stdout.close()
+            foreign.kill()
+            foreign.wait()
+            foreign.stdout.close()
     refused = {(entry["topic"].lstrip("/"), entry["reason"]): entry for entry in result["strangers"]}
     for reason in (
         "other run",
@@ -302,7 +302,7 @@ def test_steering_and_states_that_are_not_finite(network: Any) -> None:
     trajectory, _, refused = run_beside(network, record, [*steering(record), *forged])
     unharmed(record, trajectory)
     steered_nobody(refused, "lockstep")
-    # In a batch; and as single messages, which the recorder reads when it sees a stranger on these topics.
+    # In a batch; and as single messages, which the recorder reads when it sees another node on these topics.
     assert refused["recorder", "/agent_4/state", "not finite"] == 2 * (STEPS + 1)
     for node, agent in (("agent_5", 1), ("agent_3", 2), ("agent_2", 3), ("agent_1", 5)):
         assert refused[node, f"agent_{agent}/state", "not finite"] == STEPS + 1

@@ -160,8 +160,8 @@ def test_what_the_launch_files_do(network: Any) -> None:
     launched = LaunchedNetwork(arguments)
     ros = ["--ros-args", "-r", "__ns:=/lab"]
     running = {
-        plan.name: start(plan.arguments[0], *plan.arguments[1:], *ros, environment=environment())
-        for plan in launched.processes
+        spec.name: start(spec.arguments[0], *spec.arguments[1:], *ros, environment=environment())
+        for spec in launched.processes
     }
     for name, process in running.items():
         assert not launched.over
