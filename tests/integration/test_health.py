@@ -141,4 +141,4 @@ def test_an_agent_that_was_not_given_the_end(network: Any) -> None:
     (victim,) = (process for process in network.processes("agent") if process.agent == 2)
     victim.kill(signal.SIGSTOP)
     recorder.kill(signal.SIGCONT)
-    assert network.completed(run)["notes"] == ["agent_2 had not left 10 s after the end of the run: told to end"]
+    assert network.completed(run)["notes"] == ["agent_2 had not left 10 s after the end of the run: interrupted"]

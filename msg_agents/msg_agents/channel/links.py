@@ -291,11 +291,11 @@ class Forwarder:
             link.skip()
             counts.cut += 1
             return
-        fate, due = link.carry(len(packet), now)
+        outcome, due = link.carry(len(packet), now)
         counts.queued = link.waited
-        if fate is PacketOutcome.LOST:
+        if outcome is PacketOutcome.LOST:
             counts.lost += 1
-        elif fate is PacketOutcome.DROPPED:
+        elif outcome is PacketOutcome.DROPPED:
             counts.dropped += 1
         elif due <= now and not self._waiting:
             self._pass(receiver, packet, due)

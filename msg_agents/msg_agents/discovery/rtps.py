@@ -186,7 +186,7 @@ _MAGIC, _HEADER_SIZE = b"RTPS", 20
 FAST_DDS = b"\x01\x0f"  # the vendor (8.3.3.1.3)
 _HEADER = _MAGIC + b"\x02\x03" + FAST_DDS  # version 2.3
 _DATA, _TO_ONE = 0x15, 0x0E  # submessages
-_ANYBODY = bytes(PREFIX_SIZE)  # as the addressee: all that hear it (8.3.7.6)
+_ANYBODY = bytes(PREFIX_SIZE)  # as the addressee: all that receive it (8.3.7.6)
 _LITTLE_ENDIAN, _INLINE_QOS, _WITH_DATA = 0x01, 0x02, 0x04  # flags
 _PARTICIPANT, _PARTICIPANT_WRITER = b"\x00\x00\x01\xc1", b"\x00\x01\x00\xc2"
 _KEY_HASH, _STATUS_INFO, _SENTINEL, _DISCOVERY_LOCATOR = 0x70, 0x71, 0x01, 0x32
@@ -198,12 +198,12 @@ _LATE = 1 << 30  # sequence number: higher than that of any announcement that th
 
 
 def discovery_port(domain: int, participant: int) -> int:
-    """Port at which a participant of this number hears announcements (9.6.1.1)."""
+    """Port at which a participant of this number receives announcements (9.6.1.1)."""
     return PORT_BASE + PORTS_PER_DOMAIN * domain + 10 + 2 * participant
 
 
 def multicast_port(domain: int) -> int:
-    """Port of the group at which all participants of a domain hear announcements (9.6.1.1)."""
+    """Port of the group at which all participants of a domain receive announcements (9.6.1.1)."""
     return PORT_BASE + PORTS_PER_DOMAIN * domain
 
 
@@ -218,7 +218,7 @@ class Announcement:
     """What a participant says of itself to those that do not know it yet."""
 
     prefix: bytes  # of its GUID
-    port: int  # at which it hears announcements; 0: it leaves
+    port: int  # at which it receives announcements; 0: it leaves
     datagram: bytes
 
     @property
@@ -285,8 +285,7 @@ def _parameters(body: bytes, position: int) -> Iterator[tuple[int, int, int]]:
 def announcement_message(prefix: bytes, port: int, lease: int) -> bytes:
     """The message by which a participant without endpoints announces itself.
 
-    ``prefix``: of its GUID, 12 bytes. ``port``: of the loopback address, at which it hears others. ``lease``: time [s]
-    without a message after which others forget it.
+    ``prefix``: of its GUID, 12 bytes. ``port``: of the loopback address, for those of others. ``lease``: time [s] without a message after which others forget it.
     """
     locator = struct.pack("<iI12x4s", _UDP_V4, port, socket.inet_aton(LOOPBACK))
     values = {
@@ -380,12 +379,12 @@ LOOPBACK_INTERFACES = ("lo", "lo0")  # on Linux, elsewhere
 
 
 def announce_here(datagram: bytes, domain: int) -> None:
-    """Send an announcement to the participants on this machine that hear a domain's group at an interface.
+    """Send an announcement to the participants on this machine that receive a domain's group at an interface.
 
-    One of Cyclone DDS has no number by default, and hears of others only there.
+    One of Cyclone DDS has no number by default, and discovers others only there.
     """
     for index, name in socket.if_nameindex():
-        if name in LOOPBACK_INTERFACES:  # the processes of the run hear the group there, and would all answer
+        if name in LOOPBACK_INTERFACES:  # the processes of the run receive the group there, and would all answer
             continue
         with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)

@@ -161,7 +161,7 @@ class Agent(NetworkNode):
     def begin(self) -> None:
         """Publish x(0); after a takeover, repeat what others may have missed, and ask the peers to repeat theirs."""
         if self._published.found:
-            # All that is kept, for the recorder and for readers outside the run; peers have what is older.
+            # All stored states, for the recorder and for readers outside the run; peers have what is older.
             self._repeat(0, peers_since=0 if self.has_other_readers(self._states) else self._first_missed())
             self._request_states(self.remote)
         if not self._law.step:
@@ -169,7 +169,7 @@ class Agent(NetworkNode):
         self._report()
 
     def rejoin(self) -> bool:
-        """See NetworkNode. All that is kept goes to the recorder again, and what peers may lack to them."""
+        """See NetworkNode. All stored states go to the recorder again, and what peers may lack to them."""
         if self._group.missing_recorder():
             return False
         self._repeat(0, peers_since=self._first_missed())
@@ -256,7 +256,7 @@ class Agent(NetworkNode):
         self._repeat(since)
 
     def _repeat(self, since: int, peers_since: int = 0) -> None:
-        """Repeat the kept states from step ``since`` on, as they were published.
+        """Repeat the stored states from step ``since`` on, as they were published.
 
         Those before ``peers_since`` go to the recorder only.
         """

@@ -103,7 +103,7 @@ def reads_most(remote: int, others: int) -> bool:
 class BatchLinks:
     """Of one process, on the node ``host``: whose batches it reads, and which processes read those it publishes.
 
-    Processes are told apart by the GUIDs of their endpoints, since other nodes do not say which agents they run with.
+    Processes are distinguished by the GUIDs of their endpoints: nodes do not publish which agents they run with.
     """
 
     def __init__(self, host: NetworkNode, publisher: Publisher, agents: Iterable[int]) -> None:

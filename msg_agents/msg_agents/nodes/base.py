@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What all nodes of a network share."""
+"""What all nodes of a network have in common: messages of their run, discovery, health, presence of their peers."""
 
 from __future__ import annotations
 
@@ -352,9 +352,9 @@ class PeerPresence:
             self._fail(list(self._since), f" and did not return within {self._timeout:g} s")
 
     def _announce_again(self) -> None:
-        """Make ROS tell the others the names of our nodes: a node whose lease for us had ended does not ask for them.
+        """Make ROS send the others the names of our nodes: a node whose lease for us had ended does not ask for them.
 
-        It tells them with every new endpoint; to a reader that it takes for a known one, DDS repeats nothing.
+        It does so with every new endpoint; to a reader that it takes for a known one, DDS repeats nothing.
         """
         self._node.destroy_publisher(self._node.publisher_of(topics.LEAVE))
 

@@ -73,10 +73,10 @@ class Markers(Watcher):
         agents = experiment.agents
         self._newest, self._places = [None] * agents, circle(agents)
         for graph in experiment.graph_list:
-            heard: list[list[int]] = [[] for _ in range(agents)]
+            neighbours: list[list[int]] = [[] for _ in range(agents)]
             for source, target, _ in graph.arcs:
-                heard[target - 1].append(source - 1)
-            self._links.append(heard)
+                neighbours[target - 1].append(source - 1)
+            self._links.append(neighbours)
         self._subscribe_to_states(topics.STATE, topics.PASSIVE_NEWEST, whole=False)
         self._moved = time.monotonic()
         every(self, 1.0 / self._rate, self._draw)

@@ -112,8 +112,8 @@ class LockstepAgent(Agent):
     def _advance(self) -> None:
         synchronizer, law = self._synchronizer, self._law
         while synchronizer.ready():
-            mode, heard = synchronizer.inputs()
-            law.advance(mode, heard)
+            mode, values = synchronizer.inputs()
+            law.advance(mode, values)
             synchronizer.advance()
             self._publish_state(mode + 1)
             if time.monotonic() >= self._next_progress or synchronizer.finished:

@@ -204,8 +204,8 @@ class Player(LeanNode):
         bag: Playback,
         options: PlayOptions,
         keyboard: Keyboard,
-        jobs: JobControl,  # tells when the process had been stopped
-        interruption: Interruption,  # tells when it is to end
+        jobs: JobControl,  # knows when the process had been stopped
+        interruption: Interruption,  # knows when it is to end
         on_progress: Callable[[Played], None],  # called a few times a second
         on_note: Callable[[str], None],
     ) -> None:
@@ -456,7 +456,7 @@ def play(
 ) -> Played:
     """Play a bag (or one of its files) in this process; BagError or InputError: not a bag, or not playable like that.
 
-    Ctrl-C raises KeyboardInterrupt, another signal SystemExit: only ``on_progress`` then tells how far it came.
+    Ctrl-C raises KeyboardInterrupt, another signal SystemExit: only ``on_progress`` then has said how far it came.
     """
     bag = Playback(path)
     for line in bag.damage:

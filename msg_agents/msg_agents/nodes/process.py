@@ -204,7 +204,7 @@ def _ignore_interrupts() -> None:
 def own_prefix(node: Node) -> bytes:
     """The prefix of the GUIDs of this process, read from the endpoints of one of its nodes.
 
-    Empty if that cannot be told, since another node has the same name.
+    Empty if it is not known, since another node has the same name.
     """
     own = (node.get_name(), node.get_namespace())
     endpoints = [p for topic in node.publishers for p in node.get_publishers_info_by_topic(topic.topic_name)]
@@ -222,7 +222,7 @@ def store_participant(takeovers: Sequence[Takeover], node: Node) -> None:
 def leave(nodes: Sequence[Node], executor: Executor | None, *, complete: bool) -> None:
     """Remove the nodes from the network, so that no other node waits for them, and make sure that the process ends.
 
-    As long as an executor has a node, the middleware keeps it, and the others are not told.
+    As long as an executor has a node, the middleware keeps it, and the others are not informed.
     """
     # When many participants leave at once, Fast DDS 2.14 can deadlock in DomainParticipant::set_listener, with the
     # interpreter's lock held or after the interpreter has gone. Then only C code helps. Nothing is lost, because a

@@ -174,7 +174,7 @@ class LaunchFailedError(Exception):
 class LaunchedProcesses:
     """Processes that ``launch`` starts together: when one fails, the others are stopped; then ``reason`` says why.
 
-    ``launch`` is told to pass on the end of each process, and to ask ``to_stop`` and ``analysis`` then.
+    The actions of ``launch`` pass on the end of each process, and ask ``to_stop`` and ``analysis`` then.
     """
 
     def __init__(self, namespace: str) -> None:
@@ -300,7 +300,7 @@ class LaunchedNetwork(LaunchedProcesses):
         return ": the run is not complete" + (f"; its data so far are in {self.bag}" if self._recorded else "")
 
     def close(self) -> None:
-        """See LaunchedProcesses; the run record is kept with the bag."""
+        """See LaunchedProcesses; the run record is stored with the bag."""
         if self.bag is not None:
             if self._recorded and self._run_file.exists():
                 with suppress(OSError):

@@ -110,7 +110,7 @@ class RunChannel:
 
 
 def predicted_errors(channel: Channel, experiment: Experiment) -> dict[str, Any] | None:
-    """Errors predicted before the run: in place of what the channel loses, the last value heard; nothing is late.
+    """Errors predicted before the run: in place of what the channel loses, the last value received; nothing is late.
 
     None where that is not what happens (lockstep, reliable delivery, losses in the experiment itself, packets that the
     graph cuts, bursts, which are of packets and not of the messages of a link), or where it has no prediction.
@@ -121,8 +121,7 @@ def predicted_errors(channel: Channel, experiment: Experiment) -> dict[str, Any]
     if any(link.loss.good != link.loss.bad for link in channel.links.values()):
         return None
     document = experiment.to_document()
-    heard = heard_links(experiment.graph_list, experiment.time)
-    probability = channel.agent_loss(experiment.agents) * heard
+    probability = channel.agent_loss(experiment.agents) * heard_links(experiment.graph_list, experiment.time)
     arcs = [[j + 1, i + 1, float(probability[i, j])] for i, j in np.argwhere(probability).tolist()]
     if arcs:
         document["noise"] |= {"loss": {"arcs": arcs}, "on_loss": "hold"}
@@ -144,7 +143,7 @@ def run_channel(channel: Channel | None) -> Iterator[RunChannel | None]:
 
 
 def channel_findings(
-    channel: Mapping[str, Any], unheard: UnheardMessages | None = None, period_ms: float | None = None
+    channel: Mapping[str, Any], lost: UnheardMessages | None = None, period_ms: float | None = None
 ) -> list[str]:
     """Sentences about ``channel``, as in the result of a run, and about the messages of its log in real time."""
     pairs = channel["pairs"]
@@ -169,13 +168,13 @@ def channel_findings(
             f"packets were passed on {late['mean']:.1f} ms later than the file says, on average, with a period of "
             f"{period_ms:.3g} ms: the machine is too busy for this channel"
         )
-    if unheard is not None and unheard.words():
-        found.append(_messages(channel, unheard))
+    if lost is not None and lost.words():
+        found.append(_messages(channel, lost))
     return [f"{words[:1].upper()}{words[1:]}." for words in found]
 
 
 def _unlike_the_file(pair: Mapping[str, Any]) -> str | None:
-    """That a pair lost another share at random than the file says; that is rare where it does what it should."""
+    """That a pair lost another fraction at random than the file says; that is rare where it does what it should."""
     sent, loss = pair["sent"], pair["loss"]
     spread = math.sqrt(sent * loss * (1.0 - loss) * pair["inflation"])
     if abs(pair["lost"] - sent * loss) <= max(MOST_Z * spread, 0.5):
@@ -186,24 +185,24 @@ def _unlike_the_file(pair: Mapping[str, Any]) -> str | None:
     )
 
 
-def _messages(channel: Mapping[str, Any], unheard: UnheardMessages) -> str:
-    """Why messages were not heard in time: the losses of the experiment, those of the channel, and the rest."""
+def _messages(channel: Mapping[str, Any], lost: UnheardMessages) -> str:
+    """Why messages were not received in time: the losses of the experiment, those of the channel, and the rest."""
     host = {agent - 1: name for name, host in channel["hosts"].items() for agent in host["agents"]}
     losses = {(pair["sender"], pair["receiver"]): pair["loss"] for pair in channel["pairs"]}
     by_channel = by_both = 0.0
-    rows = zip(unheard.links.tolist(), unheard.messages.tolist(), unheard.probability.tolist(), strict=True)
+    rows = zip(lost.links.tolist(), lost.messages.tolist(), lost.probability.tolist(), strict=True)
     for (receiver, sender), messages, probability in rows:
         loss = losses.get((host[sender], host[receiver]), 0.0)
         by_channel += messages * (1.0 - probability) * loss
         by_both += messages * (probability + (1.0 - probability) * loss)
-    share, interval, expected = unheard.share()
-    total = int(unheard.messages.sum())
+    fraction, (low, high), expected = lost.share()
+    total = int(lost.messages.sum())
     words = (
-        f"of the messages between agents, {percent(share)} ({100 * interval[0]:.3g} to {100 * interval[1]:.3g} %) were "
-        f"not heard in time: the experiment loses {percent(expected)}, the channel {percent(by_channel / total)} more"
+        f"of the messages between agents, {percent(fraction)} ({100 * low:.3g} to {100 * high:.3g} %) were not received "
+        f"in time: the experiment loses {percent(expected)}, the channel {percent(by_channel / total)} more"
     )
-    if interval[0] > by_both / total:
+    if low > by_both / total:
         return f"{words}; the others were late or dropped"
-    if interval[1] < by_both / total:
+    if high < by_both / total:
         return f"{words}; lost messages were sent again in time"
     return words

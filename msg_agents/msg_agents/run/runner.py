@@ -46,7 +46,7 @@ from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.twin.simulate import new_record
 
-FIRST_POLL, POLL = 0.02, 0.05  # s; the first until the switcher here has heard of all agents
+FIRST_POLL, POLL = 0.02, 0.05  # s; the first until the switcher here knows of all agents
 
 
 def run_network(
@@ -85,7 +85,7 @@ def run_network(
         ROS_DOMAIN_ID; None: a free one is chosen
     restarts
         how often, in all, processes of agents and the switcher are started again when they were killed (or crashed for
-        the first time); one more failure ends the run. 0: no states are kept for a restart
+        the first time); one more failure ends the run. 0: no states are stored for a restart
     readers
         names of other nodes, in the same domain, that must read the states of all agents before the run starts, as
         those of a tool do that must not miss a message
@@ -139,7 +139,7 @@ def run_network(
     directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
     bag = directory if assignment is None or assignment.has_recorder else None
     result = RunResult(experiment, bag)
-    kept = interruption or Interruption()
+    signals = interruption or Interruption()
     try:
         with (
             run_channel(channel) as linked,
@@ -156,7 +156,7 @@ def run_network(
                 record = replace(record or new_record(experiment), until=until)
                 run_file = folder / "run.json"
                 run_file.write_text(record.to_json(with_key=True), encoding="utf-8")
-                kept.keep()
+                signals.keep()
                 with (
                     temporary_directory(experiment.agents * room_for(entry_size(record)))
                     if restarts or until
@@ -201,7 +201,7 @@ def run_network(
                             experiment,
                             result,
                             restarts,
-                            kept,
+                            signals,
                             view,
                             ending,
                             linked,
@@ -210,24 +210,24 @@ def run_network(
                         view.end()
                     result.until = ending.to_json() if ending else None
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
-                    _collect_failures(supervisor, result, kept, restarts)
+                    _collect_failures(supervisor, result, signals, restarts)
             result.strangers = supervisor.status().rejected_messages()
             result.clocks, _ = supervisor.clocks()
             if linked:
                 result.channel = linked.to_json(supervisor, experiment)
             if bag is not None:
                 try:
-                    with kept.let_through():
+                    with signals.let_through():
                         _settle(bag, result)
                 except KeyboardInterrupt:
                     result.interrupt(signal.SIGINT, "while the bag was read")
             if directory is not None:
                 _keep_logs(folder, directory / "log", result)
-        if (number := kept.take()) is not None and not result.interrupted:
+        if (number := signals.take()) is not None and not result.interrupted:
             result.interrupt(number, "while the logs were kept")
     finally:
         if interruption is None:
-            kept.end()
+            signals.end()
         if directory is not None:
             with suppress(OSError):
                 directory.rmdir()  # if it is empty
@@ -252,7 +252,7 @@ def _watch(
     due = run.speed / experiment.step_length  # steps per second in real time
     lag, clock = (LagDetector(due), ClockDetector()) if run.pace == "realtime" and follow_clock else (None, None)
     events, warned = EventLog(result.events), None
-    will_begin = SWITCHER in supervisor.by_node  # with several hosts, one has it; the others are not told
+    will_begin = SWITCHER in supervisor.by_node  # with several hosts, one has it; the others do not know
     while interruption.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
         if linked:
             linked.look(supervisor)
@@ -266,7 +266,7 @@ def _watch(
             view.note(warned)
         view.look(supervisor.steps)
         for name in supervisor.dismiss_late():
-            view.note(f"{name} had not left {LATE:g} s after the end of the run: told to end")
+            view.note(f"{name} had not left {LATE:g} s after the end of the run: interrupted")
         reached = min(supervisor.steps, default=-1)
         if clock and (words := clock.update()):
             view.note(words)

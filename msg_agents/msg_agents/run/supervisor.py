@@ -95,7 +95,7 @@ class Child:
     ended: float | None = None  # when it was first seen to have ended with exit code 0 [s]
     early: bool = False  # whether it did so before its last step
     end_reason: str | None = None  # why it was ended
-    dismissed: bool = False  # whether it was told to end because the run was over
+    dismissed: bool = False  # whether it was interrupted because the run was over
     detector: HungDetector = field(init=False)
 
     def __post_init__(self) -> None:
@@ -281,7 +281,7 @@ class Supervisor:
                 self._end([child], AFTER_HANG)
 
     def dismiss_late(self) -> list[str]:
-        """Tell processes to end that have not left long after the switcher; the names of those that were just told.
+        """Interrupt processes that have not left long after the switcher; the names of those that are now interrupted.
 
         The middleware may not have given them the end of the run; one that was stopped then is not given it any more.
         """

@@ -162,9 +162,9 @@ class StateReceiver:
         states, _ = own_layout(data, start, size, np.arange(len(start)))
         good = self._possible(states)
         if not good.all() or len(states) < len(start):
-            kept = np.zeros(len(start), np.bool_)
-            kept[states.position[good]] = True
-            for index in np.flatnonzero(~kept).tolist():
+            accepted = np.zeros(len(start), np.bool_)
+            accepted[states.position[good]] = True
+            for index in np.flatnonzero(~accepted).tolist():
                 refused.append(self._fault(data[start[index] : start[index] + size[index]]))
             states = states[good]
         agent, step = states.agent - 1, states.step

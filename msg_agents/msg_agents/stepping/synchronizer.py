@@ -33,7 +33,7 @@ class AgentInputs(Generic[Value]):
         agent: int,
         steps: int,  # N
         inputs: Sequence[Sequence[int]],  # per mode, the other agents that the agent's row uses, ascending
-        peers: Collection[int],  # every other agent that it ever hears or is heard by; includes ``inputs``
+        peers: Collection[int],  # every other agent with which it ever exchanges states; includes ``inputs``
         start: int = 0,  # the current step, after a takeover
     ) -> None:
         self.agent, self.step, self.steps = agent, start, steps
@@ -118,7 +118,7 @@ RESEND_LIMIT = 6000
 """Most steps that an agent keeps, and sends again when another one was killed; older ones are never sent again."""
 
 HISTORY_STEPS = LOCKSTEP_WINDOW
-"""Steps for which a value is kept after its use, to notice a different one for the same step: one of the two is forged.
+"""Steps for which a used value is stored, to notice a different one for the same step: one of the two is forged.
 The true one may come second, when its sender, up to a window behind, makes that step."""
 
 

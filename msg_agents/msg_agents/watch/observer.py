@@ -119,18 +119,18 @@ class CheckpointReader:
         for ring in self._rings:
             head = np.ascontiguousarray(ring[slots, : STATE_HEAD.itemsize]).view(STATE_HEAD)[:, 0]
             stamp = head["seconds"].astype(np.int64) * SECOND + head["nanoseconds"]
-            mark = np.ascontiguousarray(ring[slots, self._size :]).view("<u8")[:, 1]
-            found.append(np.where(mark == steps + 1, stamp, -1))
+            number = np.ascontiguousarray(ring[slots, self._size :]).view("<u8")[:, 1]
+            found.append(np.where(number == steps + 1, stamp, -1))
         return np.stack(found, axis=1)
 
     def _read(self, ring: AnyArray, steps: IntArray) -> tuple[AnyArray, IntArray, BoolArray]:
         """Slots (b, slot), lengths of the entries in them (b,), and whether they still held these steps (b,)."""
         slots = steps % self._capacity
         data = ring[slots]
-        marks = np.ascontiguousarray(data[:, self._size :]).view("<u8")
+        footers = np.ascontiguousarray(data[:, self._size :]).view("<u8")
         again = np.ascontiguousarray(ring[slots, self._size :]).view("<u8")
-        whole = (marks[:, 1] == steps + 1) & (again[:, 1] == steps + 1)
-        return data, np.where(whole, marks[:, 0], self._size).astype(np.int64), whole
+        whole = (footers[:, 1] == steps + 1) & (again[:, 1] == steps + 1)
+        return data, np.where(whole, footers[:, 0], self._size).astype(np.int64), whole
 
     @staticmethod
     def _numbers(data: AnyArray, end: IntArray, count: int) -> FloatArray:

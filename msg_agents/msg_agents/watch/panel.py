@@ -118,13 +118,17 @@ def _speed(snapshot: Snapshot) -> list[str]:
 
 def _progress(snapshot: Snapshot, experiment: Experiment, width: int) -> RenderableType:
     last = snapshot.last or experiment.steps
-    share = snapshot.reached / last
-    parts = [f"step {snapshot.reached} of {last}", f"{100 * share:.0f} %", *_speed(snapshot)]
+    fraction = snapshot.reached / last
+    parts = [f"step {snapshot.reached} of {last}", f"{100 * fraction:.0f} %", *_speed(snapshot)]
     if snapshot.left is not None:
         parts.append(f"{_duration(snapshot.left)} left")
     text = "  ".join(parts)
     bar = ProgressBar(
-        total=1.0, completed=share, width=max(width - len(text) - 2, 4), complete_style="cyan", finished_style="green"
+        total=1.0,
+        completed=fraction,
+        width=max(width - len(text) - 2, 4),
+        complete_style="cyan",
+        finished_style="green",
     )
     line = Table.grid(padding=(0, 2, 0, 0))
     line.add_row(Text(text, no_wrap=True, overflow="ellipsis"), bar)

@@ -64,7 +64,7 @@ def channel(*pairs: dict[str, Any], overflowed: int = 0, late: float = 0.1) -> d
     return {"hosts": hosts, "pairs": list(rows), "overflowed": overflowed, "late_ms": {"mean": late, "max": 9.0}}
 
 
-def unheard(between_hosts: int, on_one_host: int = 0, probability: float = 0.0) -> UnheardMessages:
+def lost(between_hosts: int, on_one_host: int = 0, probability: float = 0.0) -> UnheardMessages:
     """10,000 messages on each of the links 1 to 2 and 1 to 3."""
     links = np.array([[1, 0], [2, 0]])
     lost = np.array([on_one_host, between_hosts])
@@ -73,7 +73,7 @@ def unheard(between_hosts: int, on_one_host: int = 0, probability: float = 0.0) 
 
 def test_a_channel_that_does_what_its_file_says() -> None:
     assert channel_findings(channel()) == []
-    assert channel_findings(channel(), unheard(0), 10.0) == []
+    assert channel_findings(channel(), lost(0), 10.0) == []
     assert channel_findings(channel(pair("left", "right", lost=2_190))) == []  # 4.75 standard errors
     assert channel_findings(channel(pair("left", "right", lost=0, loss=0.0))) == []
 
@@ -104,17 +104,17 @@ def test_full_queues_overflow_and_lateness() -> None:
 
 def test_messages_that_the_channel_lost_are_said_to_be_its_own() -> None:
     """Half of the messages go from host to host."""
-    (words,) = channel_findings(channel(), unheard(2_000), 10.0)
+    (words,) = channel_findings(channel(), lost(2_000), 10.0)
     assert words == (
-        "Of the messages between agents, 10 % (9.59 to 10.4 %) were not heard in time: the experiment loses 0 %, the "
-        "channel 10 % more."
+        "Of the messages between agents, 10 % (9.59 to 10.4 %) were not received in time: the experiment loses 0 %, "
+        "the channel 10 % more."
     )
-    (words,) = channel_findings(channel(), unheard(3_600, 2_000, 0.2), 10.0)
+    (words,) = channel_findings(channel(), lost(3_600, 2_000, 0.2), 10.0)
     assert words.endswith("the experiment loses 20 %, the channel 8 % more.")
 
 
 def test_messages_that_neither_of_the_two_lost_or_that_came_again() -> None:
-    (words,) = channel_findings(channel(), unheard(4_000), 10.0)
+    (words,) = channel_findings(channel(), lost(4_000), 10.0)
     assert words.endswith("the channel 10 % more; the others were late or dropped.")
-    (words,) = channel_findings(channel(), unheard(1_000), 10.0)
+    (words,) = channel_findings(channel(), lost(1_000), 10.0)
     assert words.endswith("the channel 10 % more; lost messages were sent again in time.")
