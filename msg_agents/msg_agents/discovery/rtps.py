@@ -285,7 +285,8 @@ def _parameters(body: bytes, position: int) -> Iterator[tuple[int, int, int]]:
 def announcement_message(prefix: bytes, port: int, lease: int) -> bytes:
     """The message by which a participant without endpoints announces itself.
 
-    ``prefix``: of its GUID, 12 bytes. ``port``: of the loopback address, for those of others. ``lease``: time [s] without a message after which others forget it.
+    ``prefix``: of its GUID, 12 bytes. ``port``: of the loopback address, for announcements of others. ``lease``: s
+    without a message after which others forget it.
     """
     locator = struct.pack("<iI12x4s", _UDP_V4, port, socket.inet_aton(LOOPBACK))
     values = {

@@ -198,8 +198,8 @@ def _messages(channel: Mapping[str, Any], lost: UnheardMessages) -> str:
     fraction, (low, high), expected = lost.share()
     total = int(lost.messages.sum())
     words = (
-        f"of the messages between agents, {percent(fraction)} ({100 * low:.3g} to {100 * high:.3g} %) were not received "
-        f"in time: the experiment loses {percent(expected)}, the channel {percent(by_channel / total)} more"
+        f"of the messages between agents, {percent(fraction)} ({100 * low:.3g} to {100 * high:.3g} %) were not "
+        f"received in time: the experiment loses {percent(expected)}, the channel {percent(by_channel / total)} more"
     )
     if low > by_both / total:
         return f"{words}; the others were late or dropped"
