@@ -27,7 +27,7 @@ from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment
 from msg_agents.nodes.process import prefer_throughput
 from msg_agents.nodes.ros import RCLError
-from msg_agents.process_layout import RECORDER, ProcessSpec, pin_to_core, place
+from msg_agents.process_layout import RECORDER, ProcessSpec, assign_cores, pin_to_core
 from msg_analysis.common.resources import available_cores
 
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, depth=0)
@@ -177,7 +177,7 @@ def _cores(agents: int, processes: int, recorder: bool) -> list[int]:
     bounds = [worker * agents // processes for worker in range(processes + 1)]
     plans = [ProcessSpec(RECORDER, ())] if recorder else []
     plans += [ProcessSpec(f"{first}", (), tuple(range(first, end))) for first, end in pairwise(bounds)]
-    placed = list(place(plans, available_cores()).values())
+    placed = list(assign_cores(plans, available_cores()).values())
     return placed[recorder:] + placed[:recorder]
 
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Random networks and random faults of the tests: valid, of every kind, and found when they go wrong."""
+"""Random networks and random faults of the tests: what can be run, what it meets, and what is wrong with it then."""
 
 from __future__ import annotations
 
@@ -28,78 +28,6 @@ from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run import Run
 from msg_analysis.twin.simulate import simulate
 
-SEEDS = range(300)
-
-
-@pytest.fixture(scope="module")
-def documents() -> list[dict[str, Any]]:
-    return [random_document(seed) for seed in SEEDS]
-
-
-def test_every_one_can_be_run(documents: list[dict[str, Any]]) -> None:
-    """In lockstep, as the loader of experiment files says."""
-    for document in documents:
-        experiment = Experiment.parse(json.loads(json.dumps(document)))
-        experiment.require_available()
-        assert experiment.run.pace == "lockstep"
-        assert experiment.agents == document["agents"]
-
-
-def test_every_kind_is_there(documents: list[dict[str, Any]]) -> None:
-    found = {word for document in documents for word in kinds(document)}
-    assert found == {
-        *("consensus", "tracking", "continuous", "discrete", "inf", "finite"),
-        *("path", "cycle", "edges", "arcs", "star", "complete", "grid"),
-        *("no switching", "generator", "rates", "transition", "from stationary", "from a graph"),
-        *("number", "list", "matrix", "by graph", "broadcast", "link", "loss", "delay", "burst", "on_loss"),
-        *("start stationary", "start zero", "start list", "auto", "one_per_agent", "some processes"),
-    }
-    assert {document["agents"] for document in documents} == set(range(2, MOST_AGENTS + 1))
-    assert {len(document["graphs"]) for document in documents} == set(range(1, len(GRAPH_NAMES) + 1))
-
-
-def kinds(document: dict[str, Any]) -> Iterator[str]:
-    """What an experiment has, in words."""
-    yield document["problem"]
-    yield document["time"]
-    if "leaders" in document:
-        yield "inf" if document["leaders"]["gain"] == "inf" else "finite"
-    for graph in document["graphs"].values():
-        yield from graph
-    switching = document.get("switching")
-    if switching is None:
-        yield "no switching"
-    else:
-        yield from switching.keys() & {"generator", "rates", "transition"}
-        yield "from stationary" if switching["initial"] == "stationary" else "from a graph"
-    noise = dict(document["noise"])
-    process = noise.pop("process")
-    yield "by graph" if isinstance(process, dict) else shape(process)
-    yield from noise
-    start, processes = document["run"]["start"], document["run"]["processes"]
-    yield f"start {start if isinstance(start, str) else 'list'}"
-    yield processes if isinstance(processes, str) else "some processes"
-
-
-def shape(gain: Any) -> str:
-    if not isinstance(gain, list):
-        return "number"
-    return "matrix" if isinstance(gain[0], list) else "list"
-
-
-def test_some_are_connected_only_in_all_graphs_together() -> None:
-    """Then an error in the path of the graphs is sure to be one in the states."""
-    apart = 0
-    for seed in range(100):
-        experiment = Experiment.parse(random_document(seed))
-        graphs = [nx.from_numpy_array(graph.adjacency != 0, create_using=nx.DiGraph) for graph in experiment.graph_list]
-        assert nx.is_weakly_connected(nx.compose_all(graphs))
-        apart += not any(nx.is_weakly_connected(graph) for graph in graphs)
-    assert apart > 20
-
-
-AGENTS, STEPS = 3, 1000
-NODES = {"agent_1", "agent_2", "agent_3", "switcher", "recorder"}
 KILL, STOP = Fault("agent_2", 10, 0.0), Fault("agent_1", 20, 0.0, stopped=1.0)
 KILL_RECORDER = Fault("recorder", 10, 0.0)
 KILLED = "agent_2: killed by SIGKILL after step 12, started again"
@@ -107,6 +35,41 @@ SALVAGED = "the bag was salvaged: 100 messages kept"
 LAST = "last recorded step: agent 1: 40, agent 2: 41, agent 3: 40"
 
 Processes = dict[str, subprocess.Popen[bytes]]
+
+
+def test_every_network_can_be_run() -> None:
+    """In lockstep, as the loader of experiment files says; some are connected only in all graphs together."""
+    apart, agents, graphs = 0, set(), set()
+    for seed in range(300):
+        document = random_document(seed)
+        what = Experiment.parse(json.loads(json.dumps(document)))
+        what.require_available()
+        assert what.run.pace == "lockstep"
+        assert what.agents == document["agents"]
+        there = [nx.from_numpy_array(graph.adjacency != 0, create_using=nx.DiGraph) for graph in what.graph_list]
+        assert nx.is_weakly_connected(nx.compose_all(there))
+        apart += not any(nx.is_weakly_connected(graph) for graph in there)
+        agents.add(what.agents)
+        graphs.add(len(there))
+    assert apart > 60
+    assert agents == set(range(2, MOST_AGENTS + 1))
+    assert graphs == set(range(1, len(GRAPH_NAMES) + 1))
+
+
+def test_faults_of_all_nodes_at_all_times() -> None:
+    """As docs/faults.md says: a run survives as many killed agents and switchers as it has restarts, no recorder."""
+    plans = [plan_faults(seed, 3, 1000) for seed in range(300)]
+    faults = [fault for plan in plans for fault in plan.faults]
+    nodes = {"agent_1", "agent_2", "agent_3", "switcher", "recorder"}
+    for kills in (False, True):
+        assert {fault.node for fault in faults if fault.kills == kills} == nodes
+    assert min(fault.step for fault in faults) == -1
+    assert 600 < max(fault.step for fault in faults) < 1000
+    for plan in plans:
+        killed = [fault.node for fault in plan.faults if fault.kills]
+        assert plan.survivable == ("recorder" not in killed and len(killed) <= plan.restarts)
+    assert {plan.restarts for plan in plans if plan.survivable} == {RESTARTS}
+    assert 20 < sum(not plan.survivable for plan in plans) < 60
 
 
 @pytest.fixture
@@ -125,64 +88,40 @@ def injection(processes: Processes, *faults: Fault) -> FaultInjection:
     return made
 
 
-def stopped(process: subprocess.Popen[bytes]) -> bool:
-    return state_of(process.pid) == "T"
-
-
 def test_a_kill_comes_when_all_agents_have_made_its_step(processes: Processes) -> None:
+    """To the process that is the node's then; one that has ended meets no fault."""
     late, early = Fault("agent_2", 7, 0.0), Fault("agent_1", 5, 0.0)
-    made = injection(processes, early, late)
-    made.look([])
+    made = injection(processes, early, late, Fault("agent_1", 8, 0.0))
     made.look([4, 9])
     assert made.delivered == []
     made.look([6, 9])
     assert made.delivered == [early]
     assert processes["agent_1"].wait() == -signal.SIGKILL
-    made.look([7, 9])
+    made.started(processes | {"agent_2": processes["recorder"]})
+    made.look([8, 9])
     assert made.delivered == [early, late]
-    assert processes["agent_2"].wait() == -signal.SIGKILL
-    assert processes["recorder"].poll() is None
-
-
-def test_a_fault_before_the_first_step(processes: Processes) -> None:
-    made = injection(processes, Fault("agent_1", -1, 0.0))
-    made.look([])
-    assert processes["agent_1"].wait() == -signal.SIGKILL
+    assert processes["recorder"].wait() == -signal.SIGKILL
+    assert processes["agent_2"].poll() is None
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="this machine: no /proc")
 def test_a_stopped_process_goes_on(processes: Processes) -> None:
     """After its time, or as soon as the run is over."""
+
+    def stopped(name: str) -> bool:
+        return state_of(processes[name].pid) == "T"
+
     made = injection(processes, Fault("recorder", 0, 0.0, stopped=600.0), Fault("agent_1", 0, 0.0, stopped=0.0))
     made.look([0, 0])
-    for name in ("recorder", "agent_1"):
-        wait_for(lambda name=name: stopped(processes[name]))
+    wait_for(lambda: stopped("recorder") and stopped("agent_1"))
     made.look([1, 1])
-    wait_for(lambda: not stopped(processes["agent_1"]))
-    assert stopped(processes["recorder"])
+    wait_for(lambda: not stopped("agent_1"))
+    assert stopped("recorder")
     made.end()
-    wait_for(lambda: not stopped(processes["recorder"]))
+    wait_for(lambda: not stopped("recorder"))
 
 
-def test_a_process_that_has_ended_meets_no_fault(processes: Processes) -> None:
-    made = injection(processes, Fault("agent_1", 0, 0.0), Fault("agent_2", 0, 0.0, stopped=1.0))
-    for name in ("agent_1", "agent_2"):
-        processes[name].kill()
-        processes[name].wait()
-    made.look([3, 3])
-    assert made.delivered == []
-
-
-def test_the_process_of_a_restarted_node(processes: Processes) -> None:
-    made = injection(processes, Fault("agent_1", 2, 0.0))
-    processes["agent_1"].kill()
-    processes["agent_1"].wait()
-    made.started(processes | {"agent_1": processes["recorder"]})
-    made.look([2, 2])
-    assert processes["recorder"].wait() == -signal.SIGKILL
-
-
-def test_a_run_that_stands_still_is_ended_once(processes: Processes) -> None:
+def test_a_run_that_stalls_is_ended_once(processes: Processes) -> None:
     made = FaultInjection(FaultPlan((), 3), timeout=0.0)
     made.started(processes)
     made.note("no step for 5 s: cause unknown")
@@ -190,8 +129,7 @@ def test_a_run_that_stands_still_is_ended_once(processes: Processes) -> None:
         made.look([2, 3])
         assert interruption.caught is None
         wait_for(lambda: made.look([2, 3]) or made.standstill)
-        assert interruption.caught == signal.SIGINT
-        interruption.caught = None
+        assert interruption.take() == signal.SIGINT
         made.look([2, 3])
         assert interruption.caught is None
     assert made.standstill == "ended after 0 s without a step: no step for 5 s: cause unknown"
@@ -201,45 +139,11 @@ def plan(*faults: Fault, restarts: int = 3) -> FaultPlan:
     return FaultPlan(faults, restarts)
 
 
-def kill(node: str) -> Fault:
-    return Fault(node, 0, 0.0)
-
-
-def test_all_nodes_and_all_times() -> None:
-    faults = [fault for seed in range(300) for fault in plan_faults(seed, AGENTS, STEPS).faults]
-    for kills in (False, True):
-        assert {fault.node for fault in faults if fault.kills == kills} == NODES
-    assert min(fault.step for fault in faults) == -1
-    assert 600 < max(fault.step for fault in faults) < STEPS
-    assert min(fault.stopped for fault in faults if fault.stopped is not None) > 0
-
-
-def test_most_runs_go_on() -> None:
-    plans = [plan_faults(seed, AGENTS, STEPS) for seed in range(300)]
-    ends = [each for each in plans if not each.survivable]
-    assert 20 < len(ends) < 60
-    assert {each.restarts for each in plans if each.survivable} == {RESTARTS}
-    assert {sum(fault.kills for fault in each.faults) for each in plans if each.survivable} == set(range(RESTARTS + 1))
-    for each in ends:
-        killed = [fault.node for fault in each.faults if fault.kills]
-        assert killed.count("recorder") == 1 or len(killed) == each.restarts + 1
-
-
-def test_what_a_run_survives() -> None:
-    """As docs/faults.md says: as many killed agents and switchers as there are restarts, and no killed recorder."""
-    assert plan().survivable
-    assert plan(kill("agent_1"), kill("switcher"), kill("agent_1")).survivable
-    assert plan(Fault("recorder", 0, 0.0, stopped=1.0)).survivable
-    assert not plan(kill("recorder")).survivable
-    assert plan(kill("agent_1"), restarts=1).survivable
-    assert not plan(kill("agent_1"), restarts=0).survivable
-    assert not plan(*(kill("switcher") for _ in range(4))).survivable
-
-
 def simulated(seed: int) -> Run:
     graphs = {"line": {"path": [1, 2, 3]}, "pair": {"path": [1, 2]}}
     switching = {"generator": [[-2, 2], [2, -2]]}
-    return simulate(experiment(graphs=graphs, switching=switching, run={"duration": 5, "start": "zero", "seed": seed}))
+    run = {"duration": 5, "start": "zero", "seed": seed}
+    return simulate(experiment(3, graphs=graphs, switching=switching, run=run))
 
 
 @pytest.fixture(scope="module")
@@ -257,7 +161,7 @@ def test_equal(twin: Run) -> None:
 
 
 def test_one_bit(twin: Run) -> None:
-    """In the last place of one number; whatever else has happened."""
+    """In the last place of one number; whatever else has happened. Another seed, too."""
     states = twin.states.copy()
     states[57, 1, 0] = np.nextafter(states[57, 1, 0], np.inf)
     wrong = replace(twin, states=states)
@@ -268,18 +172,13 @@ def test_one_bit(twin: Run) -> None:
     ):
         assert verdict.status == "differs"
         assert verdict.text.startswith("agent 2 at step 57, replica 1: logged ")
-
-
-def test_another_seed(twin: Run) -> None:
-    other = replace(simulated(1), record=twin.record)
-    assert judge(run(other), plan(KILL)).status == "differs"
+    assert judge(run(replace(simulated(1), record=twin.record)), plan(KILL)).status == "differs"
 
 
 def test_missing_and_twice(twin: Run) -> None:
     count = twin.completeness
     for found in (replace(count, missing=1), replace(count, missing_modes=1), replace(count, duplicates=1)):
-        verdict = judge(run(replace(twin, completeness=found)), plan(KILL))
-        assert verdict.status == "failed", found
+        assert judge(run(replace(twin, completeness=found)), plan(KILL)).status == "failed", found
 
 
 @pytest.mark.parametrize(
@@ -306,8 +205,7 @@ def test_restarts_without_a_fault(twin: Run) -> None:
     crash = "agent_2: exit code 1 (KeyError: 3), started again"
     for restarts, faults in (([crash], [KILL]), ([KILLED, crash], [KILL, KILL]), ([KILLED, KILLED], [KILL, STOP])):
         verdict = judge(run(twin, restarts=restarts), plan(*faults))
-        assert verdict.status == "failed"
-        assert verdict.text == f"restarted without a fault: {restarts[-1]}"
+        assert verdict == Verdict("failed", f"restarted without a fault: {restarts[-1]}", verdict.compared)
 
 
 def test_a_standstill(twin: Run) -> None:
