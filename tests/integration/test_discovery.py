@@ -114,10 +114,3 @@ def test_readers_of_states(network: Any, domain: int, delivery: str) -> None:
     assert_delivery(delivery.upper(), [2, 5], domain)
     run.terminate()
     run.communicate(timeout=60)
-
-
-def test_lockstep_refuses_best_effort(network: Any) -> None:
-    run = network.start("run", network.file(), "--delivery", "best_effort")
-    _, stderr = run.communicate(timeout=60)
-    assert run.returncode == 2
-    assert "--delivery: run.delivery: best_effort: in lockstep expected reliable, since every value is needed" in stderr

@@ -100,18 +100,6 @@ def test_a_replay_without_its_start_is_known_from_a_file(network: Any, domain: i
     assert found["system_error"]["measured"] == pytest.approx(error, rel=1e-9)
 
 
-def test_files_of_which_no_run_is_known(network: Any) -> None:
-    file = network.file()
-    for words, message in (
-        (["--bag", network.directory], "not a bag: expected metadata.yaml, .mcap or .db3 files"),
-        (["--experiment", file], "not a run record (JSONDecodeError"),
-        (["--experiment", network.directory / "none.json"], "cannot be read"),
-        (["--experiment", file, "--bag", network.directory], "--bag and --experiment: expected at most one of them"),
-    ):
-        _, stderr = ended(network.start("live", *words), code=2)
-        assert message in stderr
-
-
 def test_a_running_network_is_watched_to_its_end(network: Any, domain: int) -> None:
     """From the first step that it gets whole, it misses none: its number is that of the bag, to every printed digit.
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
+from networks import document as net
 
 pytest.importorskip("rclpy")
 
@@ -29,15 +30,8 @@ PROGRAM = Path(sys.executable).with_name("msg-agents")
 COMMANDS = ["agent", "check", "prepare", "recorder", "run", "switcher"]
 
 
-def document(**run: Any) -> dict[str, Any]:
-    return {
-        "name": "small",
-        "problem": "consensus",
-        "time": "continuous",
-        "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
-        "switching": {"generator": [[-1, 1], [1, -1]]},
-        "run": {"dt": 0.05, "duration": 5, "seed": 5, **run},
-    }
+def document() -> dict[str, Any]:
+    return net(3, name="small", run={"duration": 5, "replicas": 1, "seed": 5})
 
 
 def call(*arguments: str | Path, directory: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -104,6 +98,11 @@ def run_file(tmp_path: Path) -> Path:
         ({}, ["--duration", "0.07"], ["run.duration"]),
         ({}, ["--domain", "500"], ["--domain", "500"]),
         ({}, ["--seed", "many"], ["--seed"]),
+        (
+            {},
+            ["--delivery", "best_effort"],
+            ["--delivery: run.delivery: best_effort: in lockstep expected reliable, since"],
+        ),
     ],
     ids=lambda value: json.dumps(value) if isinstance(value, dict) else " ".join(value),
 )
@@ -119,6 +118,25 @@ def test_experiments_that_cannot_be_run(
     file.write_text(yaml.safe_dump(content))
     refused(call("run", file, "--out", tmp_path / "runs", *options), *words)
     assert not (tmp_path / "runs").exists()  # nothing half-done
+
+
+def test_channel_files(experiment: Path, tmp_path: Path) -> None:
+    channel = tmp_path / "channel.yaml"
+    channel.write_text("default: {loss: 2, delay: 3}\n")
+    refused(call("run", experiment, "--channel", channel), "channel.yaml: 2 problems")
+    channel.write_text("{}\n")
+    options = ("--channel", channel, "--pace", "realtime", "--use-sim-time")
+    refused(call("run", experiment, *options), "--use-sim-time: not with --channel")
+
+
+def test_files_of_which_no_run_is_known(experiment: Path, tmp_path: Path) -> None:
+    for words, message in (
+        (["--bag", tmp_path], "not a bag: expected metadata.yaml, .mcap or .db3 files"),
+        (["--experiment", experiment], "not a run record (JSONDecodeError"),
+        (["--experiment", tmp_path / "none.json"], "cannot be read"),
+        (["--experiment", experiment, "--bag", tmp_path], "--bag and --experiment: expected at most one of them"),
+    ):
+        refused(call("live", *words), message)
 
 
 @pytest.mark.parametrize(("out", "reason"), [("small.yaml", "is a file"), ("small.yaml/x", "Not a directory")])
@@ -206,7 +224,7 @@ def test_unknown_agents(run_file: Path, numbers: list[str], words: list[str]) ->
 def test_the_recorder_never_overwrites(tmp_path: Path, run_file: Path) -> None:
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "mine").write_text("mine")
-    refused(call("recorder", run_file, "--out", tmp_path / "bag"), "exists already")
+    refused(execute("recorder", run_file, "--out", tmp_path / "bag"), "exists already")
     assert [file.name for file in (tmp_path / "bag").iterdir()] == ["mine"]
 
 
