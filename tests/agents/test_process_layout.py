@@ -115,10 +115,7 @@ def test_names_and_commands() -> None:
         "switcher",
     ]
     assert recorder.arguments == ("recorder", "/run.json", "--out", "/bag", "--compression", "zstd")
-    assert first.arguments == (
-        *("agent", "/run.json", "--agent", "1", "--agent", "2"),
-        *("--await", "recorder"),
-    )
+    assert first.arguments == (*("agent", "/run.json", "--agent", "1", "--agent", "2"), *("--await", "recorder"))
     assert switcher.arguments == ("switcher", "/run.json", "--await", "recorder")
     assert [process.name for process in layout(2, "one_per_agent")][1:3] == ["agent_1", "agent_2"]
 

@@ -108,11 +108,7 @@ def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
         assert line.endswith("; no report from agent_2\n")
 
     known = statuses(heard)
-    assert heard_of(heard) == {
-        *(f"agent_{i}: network" for i in range(1, 6)),
-        "switcher: network",
-        "recorder: network",
-    }
+    assert heard_of(heard) == {*(f"agent_{i}: network" for i in range(1, 6)), "switcher: network", "recorder: network"}
     agents = [status for status in known if status["name"].startswith("agent")]
     for status in agents:
         assert int(status["step"]) >= 0

@@ -118,8 +118,7 @@ def test_a_running_network_is_watched_to_its_end(network: Any, domain: int) -> N
         if "no complete step yet" not in last:
             break
     found = re.fullmatch(
-        r"step 5000 of 5000, system error ([\d.]+) .*, (\d+) steps(?: since step (\d+))?, 0 missing, \d+ steps/s",
-        last,
+        r"step 5000 of 5000, system error ([\d.]+) .*, (\d+) steps(?: since step (\d+))?, 0 missing, \d+ steps/s", last
     )
     assert found, last
     first = int(found[3] or 0)

@@ -23,15 +23,11 @@ from msg_analysis.twin.simulate import simulate
 
 LEADERS = {"agents": [1, 4], "reference": 2.0}
 CASES: dict[str, dict[str, Any]] = {
-    "tracking": {
-        "problem": "tracking",
-        "leaders": {**LEADERS, "gain": 0.7},
-        "noise": {"process": [1, 2, 1, 0.5, 1]},
-    },
+    "tracking": {"problem": "tracking", "leaders": {**LEADERS, "gain": 0.7}, "noise": {"process": [1, 2, 1, 0.5, 1]}},
     "noise by graph": {
         "noise": {
             "process": {"line": [1, 2, 0, 0.5, 1], "ring": [[0.1 * (1 + i + j) for j in range(5)] for i in range(5)]}
-        },
+        }
     },
     "grounded": {"problem": "tracking", "leaders": {**LEADERS, "gain": "inf"}},
     "discrete": {

@@ -56,8 +56,7 @@ class Broken(Protocol):
 
 
 @pytest.mark.parametrize(
-    ("name", "processes"),
-    [("metropolis", "one_per_agent"), ("saturated", 2), ("integral_action", 4)],
+    ("name", "processes"), [("metropolis", "one_per_agent"), ("saturated", 2), ("integral_action", 4)]
 )
 def test_examples(network: Any, name: str, processes: int | str) -> None:
     """Agents alone in their process, several in one, and both, which shows that states of 2 numbers come through each.

@@ -77,14 +77,7 @@ def test_another_run_and_nonsense(network: Any) -> None:
     assert refused["recorder", "experiment", "other run"] == 2  # that of the other run, and one that only has an id
 
 
-GARBAGE = [
-    b"",
-    b"\x00",
-    b"\x00\x01\x00\x00",
-    bytes(range(40)),
-    b"\xff" * 200,
-    b"\x00\x01\x00\x00" + b"\xff" * 96,
-]
+GARBAGE = [b"", b"\x00", b"\x00\x01\x00\x00", bytes(range(40)), b"\xff" * 200, b"\x00\x01\x00\x00" + b"\xff" * 96]
 
 
 def of_another_run(run: bytes, record: RunRecord) -> list[Forgery]:

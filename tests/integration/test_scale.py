@@ -110,10 +110,7 @@ def test_processes_of_one_agent_that_hear_all_others(network: Any) -> None:
 
 @pytest.mark.parametrize(
     ("experiment", "processes", "of_batches", "of_first", "of_last"),
-    [
-        (complete(24), 5, [1, 5, 10, 15, 20], [], []),
-        (first_third_hears_all(24), 3, [1], [*range(9, 25)], []),
-    ],
+    [(complete(24), 5, [1, 5, 10, 15, 20], [], []), (first_third_hears_all(24), 3, [1], [*range(9, 25)], [])],
     ids=["all", "a third"],
 )
 def test_processes_that_hear_most_of_a_network(
