@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The player: publishes the messages of a bag again."""
+"""The player: publishes the messages of a bag again, for the readers that it is to wait for."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The life of one process of a network: nodes, start gate, spin, end."""
+"""The life of one process of a network: nodes, start gate, spin, end, which a hanging middleware does not prevent."""
 
 from __future__ import annotations
 

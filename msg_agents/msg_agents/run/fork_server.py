@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Starting processes of nodes: the fork server, a process that has imported everything and forks them.
+"""Processes of nodes: forked from a fork server, which has imported everything, and ended with their parent.
 
 Every forked process is a child of the process that asked for it, which waits for it as for any other: the fork server
 may end, or be killed, at any time.

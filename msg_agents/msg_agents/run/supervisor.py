@@ -1,7 +1,11 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Starts the processes of a network, watches them and ends them: none outlives its parent."""
+"""Starts the processes of a network, watches them and ends them: none outlives its parent, none that has hung stays.
+
+A process has hung when its main thread waits, and has not run for a minute, though nobody has stopped it. The main
+thread of a node that waits for others, for its clock, or for a slow reader still runs several times a second.
+"""
 
 from __future__ import annotations
 
