@@ -376,28 +376,22 @@ def assignment_problems(hosts: Mapping[str, Sequence[int]], agents: int) -> list
             where.setdefault(number, []).append(name)
     unknown = sorted(number for number in where if number > agents)
     if unknown:
-        problems.append(
-            problem("agents", _listed(unknown), f"expected numbers from 1 to {agents}", "remove the others")
-        )
+        problems.append(problem("agents", show(unknown), f"expected numbers from 1 to {agents}", "remove the others"))
     twice = {number: names for number, names in where.items() if len(names) > 1}
     if twice:
         number = min(twice)
         problems.append(
             problem(
                 "agents",
-                _listed(sorted(twice)),
+                show(sorted(twice)),
                 "expected each agent once",
                 f"{number} is on {' and '.join(twice[number])}",
             )
         )
     missing = [number for number in range(1, agents + 1) if number not in where]
     if missing:
-        problems.append(problem("agents", _listed(missing), "on no host", "name each agent on one"))
+        problems.append(problem("agents", show(missing), "on no host", "name each agent on one"))
     return problems
-
-
-def _listed(numbers: Sequence[int]) -> str:
-    return show(list(numbers))
 
 
 def this_host() -> str:

@@ -132,7 +132,8 @@ class Agent(NetworkNode):
     def discovered_all(self) -> bool:
         """See NetworkNode. One that comes back will ask for messages at once, so it must be ready for them."""
         if self.resumed and not (
-            all(states.get_publisher_count() for states in self._remote_states) and self._group.batches_discovered()
+            all(states.get_publisher_count() for states in self._remote_states)
+            and self._group.links.batches_discovered()
         ):
             return False
         expected = self._awaited() + self._others
@@ -144,7 +145,7 @@ class Agent(NetworkNode):
 
     def _awaited(self) -> list[str]:
         """Names of the peers that must read its topic: not those that its batches reach."""
-        reached = self._group.reached()
+        reached = self._group.links.reached()
         return [name for name in self._peer_names if name not in reached] if reached else self._peer_names
 
     def finish(self, *, complete: bool, deadline: float) -> None:
@@ -215,11 +216,12 @@ class Agent(NetworkNode):
         if self._exact is not None:
             if to_peers:
                 self.publish(self._exact, message)
-            self._group.record_exact_state(message)
+            assert self._group.exact_states is not None
+            self._group.exact_states.add(message)
             message, state = with_state(message, value, len(state)), value
         if to_peers:
             self.publish(self._states, message)
-        self._group.record_state(message)
+        self._group.states.add(message)
         for receive in self._listeners if to_peers else ():
             receive(self._law.agent, step, mode, state, message)
         if step == self._last:

@@ -229,13 +229,14 @@ class AgentGroup:
             )
         self.nodes = list(self._agents.values())  # in the order of ``agents``
         self._host = self.nodes[0]
-        self._states = StateBatches(self._host, topics.STATES)
-        self._links = BatchLinks(self._host, self._states.publisher, agents)
+        self.states = StateBatches(self._host, topics.STATES)  # as other agents receive them
+        self.links = BatchLinks(self._host, self.states.publisher, agents)
         self._connect()
         self._host.create_shared(self.nodes)
         self._progress = self._host.publisher_of(topics.PROGRESS)
         self._awaits_recorder = RECORDER in readers
-        self._exact_states = StateBatches(self._host, topics.TRUTHS) if record.experiment.truth else None
+        exact = record.experiment.truth  # whether the exact states are others
+        self.exact_states = StateBatches(self._host, topics.TRUTHS) if exact else None
         self._resend: Publisher | None = None
         self._sending = False  # whether ``_send_states`` will be called
         self._asked: dict[int, int] = {}  # agents (from 0) that are to be asked for their states from a step on
@@ -253,18 +254,18 @@ class AgentGroup:
             agent.connect(self._agents)
             for j in agent.remote:
                 listeners.setdefault(j, []).append(Listener(agent.receive, agent.refuse))
-        if not (self._host.reads_batches and self._links.listen(listeners)):
+        if not (self._host.reads_batches and self.links.listen(listeners)):
             for agent in self.nodes:
                 agent.subscribe_to_remote()
 
     def _end_turns(self) -> None:
-        if self._links.read and not self._sending:  # other processes wait for these states
+        if self.links.read and not self._sending:  # other processes wait for these states
             self._sending = True
             self._defer(self._send_states)  # after what has come meanwhile, which may let others step
 
     def _send_states(self) -> None:
         self._sending = False
-        self._states.send()
+        self.states.send()
 
     def _defer(self, callback: Callable[[], None]) -> None:
         self._host.executor.create_task(callback)
@@ -274,26 +275,17 @@ class AgentGroup:
         for agent in self.nodes:
             agent.fail(error)
 
-    def record_state(self, message: bytes) -> None:
-        """Send a state as other agents receive it to the recorder."""
-        self._states.add(message)
-
-    def record_exact_state(self, message: bytes) -> None:
-        """Send the exact state, where that is another one."""
-        assert self._exact_states is not None
-        self._exact_states.add(message)
-
     def record_contradiction(self, message: bytes, state: bytes) -> None:
         """Send the recorder both states of one step that an agent has received: this message, and another ``state``.
 
         One of them is forged, and nobody can know which: with both in the bag, the step counts as missing.
         """
-        self._states.add(with_state(message, state))
-        self._states.add(message)
+        self.states.add(with_state(message, state))
+        self.states.add(message)
 
     def send_batches(self) -> None:
         """Send to the recorder at once what has been collected for it."""
-        for batches in (self._states, self._exact_states):
+        for batches in (self.states, self.exact_states):
             if batches is not None:
                 batches.send()
 
@@ -301,7 +293,7 @@ class AgentGroup:
         """The recorder, if it is awaited and has not been discovered."""
         if not self._awaits_recorder:
             return []
-        return self._states.missing_nodes() + (self._exact_states.missing_nodes() if self._exact_states else [])
+        return self.states.missing_nodes() + (self.exact_states.missing_nodes() if self.exact_states else [])
 
     def report(self, agent: int, step: int) -> None:
         """Tell the switcher which step an agent (index from 0) has reached."""
@@ -322,14 +314,6 @@ class AgentGroup:
             return
         for agent, step in asked.items():
             self._host.publish(self._resend, self._host.progress(topics.RESEND, agent + 1, step))
-
-    def reached(self) -> frozenset[str]:
-        """Names of the agents of other processes that read the batches of this one."""
-        return self._links.reached()
-
-    def batches_discovered(self) -> bool:
-        """Whether all processes whose batches this one reads have been discovered."""
-        return self._links.batches_discovered()
 
     def _receive_resend(self, data: bytes) -> None:
         request = self._host.decode_progress(data, topics.RESEND)
