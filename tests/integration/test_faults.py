@@ -62,8 +62,9 @@ def kill_and_see(network: Any, run: subprocess.Popen[str], victim: Any, *, early
     assert failed == [first], stderr
     (bag,) = (network.directory / "runs").iterdir()
     assert (bag / "log" / f"{first}.log").exists()
-    if early and not list(bag.glob("*.mcap")):
-        assert "nothing was recorded" in stderr
+    recorded = not early or bool(list(bag.glob("*.mcap")))
+    assert ("nothing was recorded" in stderr) == (not recorded)
+    if not recorded:
         return
     assert re.search(r"last recorded step: agent 1: (\d+|none), .*agent 5: (\d+|none)$", stderr, re.MULTILINE), stderr
     assert (bag / "metadata.yaml").exists()
