@@ -25,7 +25,7 @@ from typing import Any
 import pytest
 import yaml
 from left_processes import describe, last_line
-from networks import document, experiment
+from networks import assert_equal_to_twin, document, experiment
 from started_processes import started_processes
 
 pytest.importorskip("rclpy")
@@ -38,7 +38,6 @@ from msg_agents.run.supervisor import STEPS
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.run_writer import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
 MARK = "MSG_AGENTS_TEST"
@@ -200,10 +199,7 @@ class Network:
         assert saved.exists() == (result["verdict"] is not None)
         assert not saved.exists() or json.loads(saved.read_text()) == result
         trajectory = read_bag(result["bag"])
-        assert trajectory.completeness.complete
-        assert trajectory.completeness.duplicates == 0
-        outcome = check(trajectory)
-        assert (outcome.difference, outcome.missing) == (None, 0)
+        assert_equal_to_twin(trajectory)
         return result | {"notes": re.findall(r"^note: (.*)", stderr, re.MULTILINE)}
 
     def recorded_bytes(self, out: str = "runs") -> int:

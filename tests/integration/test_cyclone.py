@@ -17,6 +17,8 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
+from networks import assert_equal_to_twin
+
 from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment
 from msg_agents.process_layout import lay_out_network
@@ -24,7 +26,6 @@ from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.supervisor import Supervisor
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.model.run import Run
-from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record
 
 READER = Path(__file__).parents[1] / "support" / "cyclone_reader.py"
@@ -57,9 +58,7 @@ def came(reader: subprocess.Popen[str]) -> dict[str, list[Any]]:
 
 
 def equal_to_the_twin(trajectory: Run) -> None:
-    assert trajectory.completeness.complete
-    outcome = check(trajectory)
-    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert_equal_to_twin(trajectory)
 
 
 def states_of(trajectory: Run, agent: int) -> list[list[int]]:

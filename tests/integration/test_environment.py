@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from networks import assert_equal_to_twin
 from programs import without_progress
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.twin.check import check
 
 RUN = {"processes": 2, "duration": 5}
 READ_ONLY = 'mount --bind "$1" "$1" && mount -o remount,ro,bind / && shift && exec "$@"'
@@ -27,8 +27,7 @@ def undisturbed(network: Any, run: subprocess.Popen[str]) -> None:
     result = json.loads(stdout)
     assert (result["verdict"], result["failures"], result["restarts"]) == ("agrees", [], [])
     assert Path(result["report"]).stat().st_size > 100_000
-    outcome = check(read_bag(result["bag"]))
-    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert_equal_to_twin(read_bag(result["bag"]))
     assert sorted(path.name for path in (Path(result["bag"]) / "log").iterdir()) == [
         *("agents_1_to_2.log", "agents_3_to_5.log", "recorder.log", "run.json", "switcher.log")
     ]

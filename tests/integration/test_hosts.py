@@ -18,12 +18,12 @@ from typing import Any
 
 import pytest
 import yaml
+from networks import assert_equal_to_twin
 from processors import another_processor
 from set_clock import SetClock
 
 from msg_agents.discovery.rtps import PROFILE_VARIABLES
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.twin.check import check
 
 PREFIX = "msga"
 NAMES = ("base", "left", "right")
@@ -148,10 +148,7 @@ def whole(lan: Lan, texts: dict[str, tuple[str, str]], processes: dict[str, set[
     assert [result["bag"] is None for result in results.values()] == [False, True, True]
     trajectory = read_bag(results["base"]["bag"])
     assert trajectory.record.run.hex == json.loads(lan.run_file.read_text())["run"].replace("-", "")
-    assert trajectory.completeness.complete
-    assert trajectory.completeness.duplicates == 0
-    outcome = check(trajectory)
-    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert_equal_to_twin(trajectory)
     logs = {name: {log.stem for log in (lan.network.directory / name).glob("*/log/*.log")} for name in NAMES}
     assert logs == {"base": {"recorder", "switcher"}, **processes}
 

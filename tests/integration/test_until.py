@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import yaml
+from networks import assert_equal_to_twin
 
 from msg_agents.run.result import RunResult, conclude
 from msg_agents.watch import observer as early_end
@@ -20,7 +21,6 @@ from msg_agents.watch import observer as run_observer
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.inference import online_errors
 from msg_analysis.model.run_record import Until
-from msg_analysis.twin.check import check
 
 LONG = {"duration": 2000, "replicas": 8, "processes": 2}  # 40,000 steps
 PLANNED = 40_000
@@ -50,9 +50,7 @@ def complete(result: RunResult) -> None:
     """The run of a test in this process is complete, and equal to its twin."""
     assert result.failures == []
     assert result.trajectory is not None
-    assert result.trajectory.completeness.complete
-    outcome = check(result.trajectory)
-    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert_equal_to_twin(result.trajectory)
 
 
 def says_so(result: dict[str, Any], until: str) -> None:

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.run import Run
+from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record
 
 
@@ -43,3 +45,11 @@ def record_of_two(directory: Path) -> Path:
     """File run.json of a run of two agents: one of them waits for the other."""
     line = {"graphs": {"line": {"path": [1, 2]}}, "switching": {"generator": [[0]]}}
     return run_file(directory, 2, **line, run={"duration": 1, "start": "zero"})
+
+
+def assert_equal_to_twin(run: Run) -> None:
+    """Complete, each state once, and what the law and the seed give, to the last bit."""
+    assert run.completeness.complete
+    assert run.completeness.duplicates == 0
+    outcome = check(run)
+    assert (outcome.difference, outcome.missing) == (None, 0)
