@@ -83,7 +83,7 @@ def test_others_see_every_process(network: Any, domain: int) -> None:
         run.communicate(timeout=60)
 
 
-def test_a_domain_without_room_for_introductions(network: Any, domain: int) -> None:
+def test_a_domain_without_a_port_for_the_relay(network: Any, domain: int) -> None:
     """Where others have all its numbers, the processes look for each other; the result is the same.
 
     One process per agent: the twin says, from the experiment alone, what they record.
@@ -106,7 +106,7 @@ def test_a_domain_without_room_for_introductions(network: Any, domain: int) -> N
 
 @pytest.mark.parametrize("delivery", ["best_effort", "reliable"])
 def test_readers_of_states(network: Any, domain: int, delivery: str) -> None:
-    """Agents 2 and 5 hear agent 1. What holds if nothing is said: test_introductions."""
+    """Agents 2 and 5 hear agent 1. What holds if nothing is said: above."""
     # Few steps, and large states, which are soon seen in the bag.
     file = network.file(run={"pace": "realtime", "duration": 1000, "replicas": 128})
     run = network.record(file, "--domain", str(domain), "--delivery", delivery)

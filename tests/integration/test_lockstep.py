@@ -53,7 +53,7 @@ LAYOUTS: dict[str, list[Any]] = {
 }
 """Every law, and every number of processes: what one agent computes does not depend on the other.
 
-Consensus with equal noise: below, with one and two processes, and in test_introductions with one per agent.
+Consensus with equal noise: below, with one and two processes, and in test_discovery with one per agent.
 """
 
 

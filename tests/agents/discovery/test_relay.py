@@ -108,7 +108,7 @@ def test_a_report_may_be_faster_than_the_announcement(relay: DiscoveryRelay, pro
     one.hears(two)
 
 
-def test_who_comes_back_is_introduced_again(relay: DiscoveryRelay, processes: list[Participant], domain: int) -> None:
+def test_who_comes_back_is_connected_again(relay: DiscoveryRelay, processes: list[Participant], domain: int) -> None:
     one, two, *_ = processes
     for name, each in (("agent_1", one), ("agent_2", two)):
         each.announce()
@@ -125,7 +125,7 @@ def test_who_comes_back_is_introduced_again(relay: DiscoveryRelay, processes: li
     again.socket.close()
 
 
-def test_joining_participants_are_introduced_to_all(
+def test_joining_participants_are_connected_to_all(
     relay: DiscoveryRelay, processes: list[Participant], domain: int
 ) -> None:
     for name, each in zip(["agent_1", "agent_2", "agent_3"], processes, strict=False):

@@ -210,12 +210,12 @@ def test_a_real_participant_answers_one_without_endpoints(reach: str) -> None:
         listener.settimeout(10)
         own = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": reach}
         environment = node_environment(domain) if reach == "our profile" else os.environ | own
-        visitor = stack.enter_context(
+        participant_of_ros = stack.enter_context(
             subprocess.Popen([sys.executable, "-P", "-c", ANSWERER], stdout=subprocess.PIPE, text=True, env=environment)
         )
-        stack.callback(visitor.kill)
-        assert visitor.stdout is not None
-        prefix = bytes.fromhex(visitor.stdout.readline())
+        stack.callback(participant_of_ros.kill)
+        assert participant_of_ros.stdout is not None
+        prefix = bytes.fromhex(participant_of_ros.stdout.readline())
         asking = announcement_message(prefix[:4] + bytes(range(8)), listener.getsockname()[1], 20)
         for participant in range(FIRST_RELAYED):
             listener.sendto(asking, ("127.0.0.1", discovery_port(domain, participant)))
@@ -223,7 +223,7 @@ def test_a_real_participant_answers_one_without_endpoints(reach: str) -> None:
         while answer is None:
             answer = read_announcement(listener.recv(1 << 16))
         assert answer.prefix == prefix
-        assert visitor.stdout.readline() == "['answerer']\n"
+        assert participant_of_ros.stdout.readline() == "['answerer']\n"
 
 
 def test_every_participant_of_the_domain_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,7 +252,7 @@ def test_ports_are_ports(domain: int) -> None:
     assert ports[-1] < 1 << 16
 
 
-def test_a_farewell_in_the_last_domain() -> None:
+def test_a_disposal_in_the_last_domain() -> None:
     """No number is tried whose port would be above the last one, which a socket refuses."""
     remove_participant(PREFIX, LAST_DOMAIN)
 
