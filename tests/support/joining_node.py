@@ -16,14 +16,14 @@ Endpoints = Mapping[str, Sequence[Sequence[str]]]
 
 
 def assert_endpoints(readers: Endpoints, writers: Endpoints, domain: int) -> None:
-    """Within 20 s, these topics have exactly these readers and writers: node and reliability of each, sorted."""
+    """Within 60 s, these topics have exactly these readers and writers: node and reliability of each, sorted."""
     with watched_endpoints(readers, writers, domain):
         pass
 
 
 @contextmanager
 def watched_endpoints(readers: Endpoints, writers: Endpoints, domain: int) -> Iterator[None]:
-    """The same of a network that is started meanwhile: the joining is there before it, so the run may be short."""
+    """The same of a network that is started meanwhile: the joining node is there before it, so the run may be short."""
     wanted = json.dumps([readers, writers])
     command = [sys.executable, "-P", "-c", JOINING, wanted]
     with started_processes() as started:
@@ -56,7 +56,7 @@ wanted, found = json.loads(sys.argv[1]), []
 rclpy.init()
 node = rclpy.create_node("joining")
 print("ready", flush=True)
-end = time.monotonic() + 20
+end = time.monotonic() + 60
 looks = node.get_subscriptions_info_by_topic, node.get_publishers_info_by_topic
 while found != wanted and time.monotonic() < end:
     time.sleep(0.1)
