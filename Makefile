@@ -91,8 +91,8 @@ test-fast: setup $(VENV)/.compiled ## Run the tests that start no network
 	$(TEST) $(SEVERAL_AT_ONCE) --ignore tests/integration
 
 # What another distribution could break, as briefly as possible: equal to the twin in lockstep, kills and takeovers, real
-# time, strangers, the bag, discovery, watchers that print nothing else.
-ROS_TESTS := $(addprefix tests/integration/test_,lockstep.py bag.py kill.py restart.py realtime.py strangers.py introductions.py markers.py) \
+# time, rejected messages, the bag, discovery, watchers that print nothing else.
+ROS_TESTS := $(addprefix tests/integration/test_,lockstep.py bag.py faults.py restart.py realtime.py rejected_messages.py discovery.py live.py) \
   tests/agents/discovery tests/analysis/common/test_version.py
 
 test-ros: setup ## Run the tests that depend on ROS 2 most: test-ros ROS_DISTRO=kilted
@@ -101,7 +101,7 @@ test-ros: setup ## Run the tests that depend on ROS 2 most: test-ros ROS_DISTRO=
 STRESS ?= 20
 
 stress: setup ## Repeat every random fault 20 times (STRESS=N: N times), run every combination of laws and messages: five minutes
-	STRESS=$(STRESS) $(BIN)/python -m pytest $(SEVERAL_AT_ONCE) --verbose -k "repetition_ or (test_links and (lockstep or real_time))" $(addprefix tests/integration/test_,kill.py restart.py faults.py interrupt.py strangers.py realtime.py hosts.py links.py random_networks.py)
+	STRESS=$(STRESS) $(BIN)/python -m pytest $(SEVERAL_AT_ONCE) --verbose -k "repetition_ or (test_links and (lockstep or real_time))" $(addprefix tests/integration/test_,restart.py faults.py rejected_messages.py realtime.py hosts.py links.py random_networks.py)
 
 fuzz: setup ## Damage 20,000 bags and 20,000 experiment files: only clean errors
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py

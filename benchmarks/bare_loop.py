@@ -27,7 +27,7 @@ from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment
 from msg_agents.nodes.process import prefer_throughput
 from msg_agents.nodes.ros import RCLError
-from msg_agents.process_layout import RECORDER, ProcessPlan, keep_to, place
+from msg_agents.process_layout import RECORDER, ProcessSpec, assign_cores, pin_to_core
 from msg_analysis.common.resources import available_cores
 
 QOS = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE, depth=0)
@@ -165,7 +165,7 @@ def measure(
         ]
         if pin:
             for child, core in zip(children, _cores(agents, processes, recorder), strict=False):
-                keep_to(child.pid, core)
+                pin_to_core(child.pid, core)
         rates = [float(child.stdout.readline()) for child in children if child.stdout]
         for child in children:
             child.communicate(timeout=30)
@@ -175,9 +175,9 @@ def measure(
 def _cores(agents: int, processes: int, recorder: bool) -> list[int]:
     """The core of each process, recorder last, where the real network would have it."""
     bounds = [worker * agents // processes for worker in range(processes + 1)]
-    plans = [ProcessPlan(RECORDER, ())] if recorder else []
-    plans += [ProcessPlan(f"{first}", (), tuple(range(first, end))) for first, end in pairwise(bounds)]
-    placed = list(place(plans, available_cores()).values())
+    plans = [ProcessSpec(RECORDER, ())] if recorder else []
+    plans += [ProcessSpec(f"{first}", (), tuple(range(first, end))) for first, end in pairwise(bounds)]
+    placed = list(assign_cores(plans, available_cores()).values())
     return placed[recorder:] + placed[:recorder]
 
 

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from msg_agents.channel.channel_file import Channel
-from msg_agents.channel.links import Fate, Link
+from msg_agents.channel.links import Link, PacketOutcome
 from msg_agents.run.result import RunResult, conclude
 from msg_agents.run.runner import run_network
 from msg_analysis.errors import InputError
@@ -51,7 +51,7 @@ def losses(channel: Channel, counts: dict[str, Any]) -> tuple[float, bool]:
         sender, receiver, sent, lost = (pair[key] for key in ("sender", "receiver", "sent", "lost"))
         settings = channel.links[sender, receiver]
         link = Link(settings, channel.seed, places[sender], places[receiver])
-        same &= lost == sum(link.carry(0, 0.0)[0] is Fate.LOST for _ in range(sent))
+        same &= lost == sum(link.carry(0, 0.0)[0] is PacketOutcome.LOST for _ in range(sent))
         model = settings.loss
         difference += lost - sent * model.mean
         variance += sent * model.mean * (1.0 - model.mean) * model.inflation

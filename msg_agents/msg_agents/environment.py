@@ -18,16 +18,17 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from msg_agents.discovery.profiles import (
-    INTRODUCED_PROFILE,
+from msg_agents.discovery.relay import DiscoveryRelay
+from msg_agents.discovery.rtps import (
     LOOPBACK_PROFILE,
     PROFILE_VARIABLES,
+    RELAYED_PROFILE,
     UDP_PROFILE,
     domains_for,
+    free_domain,
     has_fast_dds_3,
+    require_loopback,
 )
-from msg_agents.discovery.relay import Introducer
-from msg_agents.discovery.rtps import free_domain, require_loopback
 from msg_analysis.common.resources import SINGLE_THREAD, ros_distribution
 from msg_analysis.errors import InputError
 
@@ -35,7 +36,7 @@ MEMORY = Path("/dev/shm")
 """A page of a file on a disk costs about twice as much to write for the first time, and again after each time the
 system has saved it."""
 
-LEAST = 64 << 10  # bytes; where a page that ROS maps there cannot be had, the processes of a run die of SIGBUS
+LEAST_FREE = 64 << 10  # bytes; where a page that ROS maps there cannot be had, the processes of a run die of SIGBUS
 
 
 def free_space(directory: Path) -> int:
@@ -49,7 +50,7 @@ def free_space(directory: Path) -> int:
 def require_shared_memory(directory: Path = MEMORY) -> None:
     """InputError if it is full. Without it, or where it cannot be written, a run does without."""
     # The library of the tracer LTTng, which rclpy loads, makes a file of one page there and writes to it.
-    if os.access(directory, os.W_OK) and (free := free_space(directory)) < LEAST:
+    if os.access(directory, os.W_OK) and (free := free_space(directory)) < LEAST_FREE:
         raise InputError(
             f"{directory}: full ({free} bytes free): ROS 2 processes would be killed by SIGBUS: remove what is not "
             "used, with `fastdds shm clean` or by hand"
@@ -57,8 +58,8 @@ def require_shared_memory(directory: Path = MEMORY) -> None:
 
 
 # With none of these, rclpy, its libraries and its middleware can only be those of this Python.
-SUSPECTS = ("RMW_IMPLEMENTATION", "PYTHONPATH", "AMENT_PREFIX_PATH", "ROS_DISTRO")
-PATIENCE = 60.0  # s
+FOREIGN_VARIABLES = ("RMW_IMPLEMENTATION", "PYTHONPATH", "AMENT_PREFIX_PATH", "ROS_DISTRO")
+PROBE_TIMEOUT = 60.0  # s
 PROBE = """
 import importlib.util, os, warnings
 warnings.simplefilter("ignore")
@@ -85,7 +86,7 @@ def require_middleware(environment: Mapping[str, str], forked: Callable[[], bool
     ``forked``: whether a process could that was forked from one which has imported all; it saves the imports.
     """
     require_rclpy()
-    present = [name for name in SUSPECTS if environment.get(name)]
+    present = [name for name in FOREIGN_VARIABLES if environment.get(name)]
     if not present or forked():
         return
     try:
@@ -96,7 +97,7 @@ def require_middleware(environment: Mapping[str, str], forked: Callable[[], bool
             capture_output=True,
             text=True,
             errors="replace",
-            timeout=PATIENCE,
+            timeout=PROBE_TIMEOUT,
             check=False,
         )
     except subprocess.TimeoutExpired:
@@ -240,11 +241,7 @@ def without_shared_memory() -> dict[str, str]:
         return {}
     # Both add shared memory to any profile.
     if os.environ.get(RANGE_VARIABLE) == "LOCALHOST" or os.environ.get(LOCALHOST_VARIABLE) == "1":
-        return {
-            RANGE_VARIABLE: "SYSTEM_DEFAULT",
-            LOCALHOST_VARIABLE: "",
-            **profile_variables(LOOPBACK_PROFILE),
-        }
+        return {RANGE_VARIABLE: "SYSTEM_DEFAULT", LOCALHOST_VARIABLE: "", **profile_variables(LOOPBACK_PROFILE)}
     return profile_variables(UDP_PROFILE)
 
 
@@ -252,41 +249,41 @@ ROS_LOGS = "ros"  # folder for nodes that have no other place for the log files 
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
-    """Of one run."""
+class RunEnvironment:
+    """Domain, environment variables and discovery relay of one run."""
 
     domain: int
     environment: dict[str, str]
-    introducer: Introducer | None  # None: the processes look for each other, by the user's profile for example
+    relay: DiscoveryRelay | None  # None: the processes look for each other, by the user's profile for example
 
 
 @contextmanager
-def surroundings(
+def run_environment(
     folder: Path,  # of the run
     domain: int | None,  # None: a free one
     changes: Mapping[str, str],  # of the environment
     participants: int,  # of the run
-) -> Iterator[Surroundings]:
+) -> Iterator[RunEnvironment]:
     """Provide them for a run; InputError: no domain is free, or processes could not meet."""
     with ExitStack() as stack:
         if domain is None:
             domain = stack.enter_context(free_domain(domains_for(participants)))
-        environment = node_environment(domain, INTRODUCED_PROFILE) | dict(changes)
-        introducer = None
-        if will_introduce(changes):
+        environment = node_environment(domain, RELAYED_PROFILE) | dict(changes)
+        relay = None
+        if uses_relay(changes):
             require_loopback()
             try:
-                introducer = stack.enter_context(Introducer(domain))
+                relay = stack.enter_context(DiscoveryRelay(domain))
             except OSError:  # many others are in this domain
                 environment = node_environment(domain) | dict(changes)
         require_discovery(environment)
         require_shared_memory()
         environment |= other_logs(folder / ROS_LOGS)
-        yield Surroundings(domain, environment, introducer)
+        yield RunEnvironment(domain, environment, relay)
 
 
-def will_introduce(changes: Mapping[str, str]) -> bool:
+def uses_relay(changes: Mapping[str, str]) -> bool:
     """Whether the middleware will follow our profile: not if that of the user, or of several hosts, is used."""
-    environment = node_environment(0, INTRODUCED_PROFILE) | dict(changes)
-    ours = environment.get(PROFILE_VARIABLES[-1]) == str(INTRODUCED_PROFILE)
+    environment = node_environment(0, RELAYED_PROFILE) | dict(changes)
+    ours = environment.get(PROFILE_VARIABLES[-1]) == str(RELAYED_PROFILE)
     return ours and environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")

@@ -3,10 +3,8 @@
 
 """Which processes a run has, on which hosts and cores.
 
-A network spread over several hosts: which agents are where, and how the processes find each other.
-
-Every host runs its share of the same plan, from the same run record. The processes find each other at the addresses
-in the hosts file, without multicast, which routers, access points and bridges often do not pass on.
+On several hosts, each runs its part of the same layout, from the same run record. The processes find each other at the
+addresses in the hosts file, without multicast, which routers, access points and bridges often do not pass on.
 """
 
 from __future__ import annotations
@@ -19,12 +17,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Protocol
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from msg_agents.discovery.profiles import MOST_PARTICIPANTS, profile_for_hosts
-from msg_agents.discovery.rtps import PEERS_VARIABLE
+from msg_agents.discovery.rtps import MOST_PARTICIPANTS, PEERS_VARIABLE, profile_for_hosts
 from msg_agents.environment import DISCOVERY_TIMEOUT, LAST_DOMAIN, USER_TIMEOUT, node_environment
 from msg_analysis.bags.stored_file import DEFAULT_STORAGE, MEGABYTE, Storage
 from msg_analysis.common.arrays import BoolArray
@@ -41,14 +38,31 @@ SMALL = 8
 """Of ``processes: auto``: up to so many agents, each has a process of its own; beyond, there is one process per so many
 agents, but not more than the machine has cores."""
 MOST_PROCESSES = 200
-"""Agent processes that ``Introducer`` introduces to each other, which with switcher, recorder and the user's own tools
-fill the ports of two ROS domains."""
+"""Agent processes that ``DiscoveryRelay`` connects: with switcher, recorder and the user's tools they fill the ports of
+two ROS domains."""
 MOST_UNAIDED = 90
 """Agent processes that look for each other: Fast DDS finds ``MOST_PARTICIPANTS``, of which some are for others."""
 
 
+class Process(Protocol):
+    """A started process: what ``subprocess.Popen`` and ``ForkedProcess`` have in common."""
+
+    @property
+    def pid(self) -> int:
+        """Its number."""
+
+    def poll(self) -> int | None:
+        """Its exit code, or minus the signal that killed it; None while it runs."""
+
+    def wait(self) -> int:
+        """The same, once it has ended."""
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal, unless it has ended."""
+
+
 @dataclass(frozen=True, slots=True)
-class ProcessPlan:
+class ProcessSpec:
     """One process of a network."""
 
     name: str
@@ -68,13 +82,13 @@ class ProcessPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Share:
+class HostAssignment:
     """What one host runs of a network that is spread over several hosts."""
 
     agents: tuple[int, ...]  # indices from 0, ascending
-    home: bool  # whether recorder and switcher run here
+    has_recorder: bool  # and the switcher
     discovery_timeout: float  # s for which nodes look for those of other hosts, which the user starts
-    patience: float  # s that companions may be gone before a node ends itself
+    peer_timeout: float  # s that other nodes may be gone before a node ends itself
 
 
 def wanted_processes(experiment: Experiment, agents: int) -> int:
@@ -123,7 +137,7 @@ def discovery_timeout(agents: int, processes: int) -> float:
     return max(DISCOVERY_TIMEOUT, 2.0 * processes + 0.1 * agents)
 
 
-def plan_network(
+def lay_out_network(
     experiment: Experiment,
     run_file: Path,  # run record, read by every node
     bag: Path | None,  # directory to record to; None: no recorder
@@ -132,16 +146,16 @@ def plan_network(
     use_sim_time: bool = False,
     parameter_services: bool = False,
     storage: Storage = DEFAULT_STORAGE,
-    share: Share | None = None,
+    assignment: HostAssignment | None = None,
     readers: Sequence[str] = (),  # nodes that the user starts, and that must read the topics before the run starts
     most: int = MOST_UNAIDED,
     hosts: Sequence[Sequence[int]] = (),  # agents of each host of a channel: a process is on one; empty: no channel
-) -> list[ProcessPlan]:
-    """The processes of a run, in the order in which to start them; with ``share``, those of this host only.
+) -> list[ProcessSpec]:
+    """The processes of a run, in the order in which to start them; with ``assignment``, those of this host only.
 
     InputError: more than ``most`` processes with agents.
     """
-    here = tuple(range(experiment.agents)) if share is None else share.agents
+    here = tuple(range(experiment.agents)) if assignment is None else assignment.agents
     groups = [group for part in hosts or [here] for group in split_agents(experiment, part, most=most)]
     count = len(groups)
     if count > most:
@@ -149,54 +163,54 @@ def plan_network(
     common: tuple[str, ...] = ("--use-sim-time",) if use_sim_time else ()
     if parameter_services:
         common += ("--parameter-services",)
-    timeout = discovery_timeout(experiment.agents, count) if share is None else share.discovery_timeout
+    timeout = discovery_timeout(experiment.agents, count) if assignment is None else assignment.discovery_timeout
     if readers or hosts:  # what a channel loses is sent again
         timeout = max(timeout, USER_TIMEOUT)
     if timeout != DISCOVERY_TIMEOUT:
         common += ("--discovery-timeout", f"{timeout:g}")
-    awaited = ([RECORDER] if bag is not None or share is not None else []) + list(readers)
+    awaited = ([RECORDER] if bag is not None or assignment is not None else []) + list(readers)
     options = common + tuple(part for name in awaited for part in ("--await", name))
     if checkpoints is not None:
         options += ("--checkpoint", str(checkpoints))
-    if share is not None:
-        options += ("--patience", f"{share.patience:g}")
+    if assignment is not None:
+        options += ("--patience", f"{assignment.peer_timeout:g}")
     resumes = checkpoints is not None
-    home = share is None or share.home
-    plans = []
-    if bag is not None and home:
+    central = assignment is None or assignment.has_recorder
+    processes = []
+    if bag is not None and central:
         files: tuple[str, ...] = ("--compression", storage.compression)
         if storage.split_size is not None:
             files += ("--split-size", repr(storage.split_size / MEGABYTE))
-        plans.append(ProcessPlan(RECORDER, ("recorder", str(run_file), "--out", str(bag), *files, *common)))
+        processes.append(ProcessSpec(RECORDER, ("recorder", str(run_file), "--out", str(bag), *files, *common)))
     for agents in groups:
         numbers = [part for agent in agents for part in ("--agent", str(agent + 1))]
         arguments = ("agent", str(run_file), *numbers, *options)
-        plans.append(ProcessPlan(process_name(agents), arguments, agents, resumes))
-    if home:
-        plans.append(ProcessPlan(SWITCHER, ("switcher", str(run_file), *options), resumes=resumes))
-    return plans
+        processes.append(ProcessSpec(process_name(agents), arguments, agents, resumes))
+    if central:
+        processes.append(ProcessSpec(SWITCHER, ("switcher", str(run_file), *options), resumes=resumes))
+    return processes
 
 
-def partners(plans: Sequence[ProcessPlan], listens: BoolArray) -> dict[str, set[str]]:
+def partners(processes: Sequence[ProcessSpec], listens: BoolArray) -> dict[str, set[str]]:
     """The processes that each process exchanges messages with; processes go by their first nodes.
 
-    ``listens``: (m, m), whether agent i ever listens to agent j. Recorder and switcher have to do with all.
+    ``listens``: (m, m), whether agent i ever listens to agent j. Recorder and switcher exchange messages with all.
     """
     exchanges = listens | listens.T
-    names = {plan.first_node for plan in plans}
-    of_agent = {agent: plan.first_node for plan in plans for agent in plan.agents}
-    central = {plan.first_node for plan in plans if not plan.agents}
+    names = {process.first_node for process in processes}
+    of_agent = {agent: process.first_node for process in processes for agent in process.agents}
+    central = {process.first_node for process in processes if not process.agents}
     found = {}
-    for plan in plans:
-        peers = {of_agent[int(j)] for i in plan.agents for j in exchanges[i].nonzero()[0]}
-        found[plan.first_node] = (peers | central if plan.agents else names) - {plan.first_node}
+    for process in processes:
+        peers = {of_agent[int(j)] for i in process.agents for j in exchanges[i].nonzero()[0]}
+        found[process.first_node] = (peers | central if process.agents else names) - {process.first_node}
     return found
 
 
-def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) -> dict[str, int]:
+def assign_cores(processes: Sequence[ProcessSpec], cores: Sequence[int], first: int = 0) -> dict[str, int]:
     """A core for each agent process by name, where they and the recorder outnumber two or more cores; else empty.
 
-    ``plans``: in the order of ``plan_network``, so that neighbours share a core. ``first``: index of the first core.
+    ``processes``: in the order of ``lay_out_network``: neighbours share a core. ``first``: index of the first core.
     """
     # In lockstep every message wakes the process that receives it. To wake it on another core costs an interrupt there,
     # and without pinning the scheduler spreads communicating processes over the cores: with two cores, the demo network
@@ -204,8 +218,8 @@ def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) ->
     # begin at different cores, and so share them evenly. The recorder gets no core: agents wait for each other, so a
     # core that it slows down holds up the others, which then are idle; the scheduler moves it there. The switcher needs
     # hardly any time.
-    loads = {plan.name: len(plan.agents) for plan in plans if plan.agents}
-    recorded = any(plan.name == RECORDER for plan in plans)
+    loads = {process.name: len(process.agents) for process in processes if process.agents}
+    recorded = any(process.name == RECORDER for process in processes)
     if len(cores) < 2 or len(loads) + recorded <= len(cores):
         return {}
     total = sum(loads.values())
@@ -214,7 +228,7 @@ def place(plans: Sequence[ProcessPlan], cores: Sequence[int], first: int = 0) ->
     return {name: cores[(first + int(middle / total * len(cores))) % len(cores)] for name, middle in middles.items()}
 
 
-def keep_to(process: int, core: int) -> None:
+def pin_to_core(process: int, core: int) -> None:
     """Pin a process that has just been started, and its children, to a core; errors are ignored."""
     try:
         os.sched_setaffinity(process, {core})
@@ -222,7 +236,7 @@ def keep_to(process: int, core: int) -> None:
         return
 
 
-VISITORS = 8  # participants on a host besides those of the run, such as tools that watch it
+SPARE_PARTICIPANTS = 8  # participants on a host besides those of the run, such as tools that watch it
 _RANGE = re.compile(r"([0-9]+)-([0-9]+)")
 
 
@@ -248,9 +262,7 @@ class HostSpec(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
     address: str = Field(
-        min_length=1,
-        description="the address at which the other hosts reach this one",
-        examples=["192.0.2.1"],
+        min_length=1, description="the address at which the other hosts reach this one", examples=["192.0.2.1"]
     )
     agents: Annotated[list[int], BeforeValidator(agent_numbers)] = Field(
         default=[], description="the agents that run there", examples=[[1, "3-5"]]
@@ -319,19 +331,19 @@ class Hosts:
         agents = {name: tuple(sorted(number - 1 for number in host.agents)) for name, host in spec.hosts.items()}
         return cls(spec.domain, spec.recorder, addresses, agents)
 
-    def share(self, name: str, *, discovery_timeout: float, patience: float) -> Share:
+    def assignment(self, name: str, discovery_timeout: float, peer_timeout: float) -> HostAssignment:
         """What runs on the host ``name``; times in s. InputError: no such host, or nothing to do on it."""
         if name not in self.agents:
             known = ", ".join(self.agents)
             raise InputError(f"--name: {name}: no such host in the hosts file: expected one of {known}")
         if not self.agents[name] and name != self.recorder:
             raise InputError(f"--name: {name}: has no agents and is not the recorder: there is nothing to run on it")
-        return Share(self.agents[name], name == self.recorder, discovery_timeout, patience)
+        return HostAssignment(self.agents[name], name == self.recorder, discovery_timeout, peer_timeout)
 
     def participants(self, experiment: Experiment) -> int:
         """How many participants to look for on each host: more than run on any."""
         most = max(wanted_processes(experiment, len(agents)) for agents in self.agents.values())
-        return min(most + 2 + VISITORS, MOST_PARTICIPANTS)
+        return min(most + 2 + SPARE_PARTICIPANTS, MOST_PARTICIPANTS)
 
     def profile(self, experiment: Experiment) -> str:
         """The Fast DDS profile with which the processes of all hosts find each other."""
@@ -364,28 +376,22 @@ def assignment_problems(hosts: Mapping[str, Sequence[int]], agents: int) -> list
             where.setdefault(number, []).append(name)
     unknown = sorted(number for number in where if number > agents)
     if unknown:
-        problems.append(
-            problem("agents", _listed(unknown), f"expected numbers from 1 to {agents}", "remove the others")
-        )
+        problems.append(problem("agents", show(unknown), f"expected numbers from 1 to {agents}", "remove the others"))
     twice = {number: names for number, names in where.items() if len(names) > 1}
     if twice:
         number = min(twice)
         problems.append(
             problem(
                 "agents",
-                _listed(sorted(twice)),
+                show(sorted(twice)),
                 "expected each agent once",
                 f"{number} is on {' and '.join(twice[number])}",
             )
         )
     missing = [number for number in range(1, agents + 1) if number not in where]
     if missing:
-        problems.append(problem("agents", _listed(missing), "on no host", "name each agent on one"))
+        problems.append(problem("agents", show(missing), "on no host", "name each agent on one"))
     return problems
-
-
-def _listed(numbers: Sequence[int]) -> str:
-    return show(list(numbers))
 
 
 def this_host() -> str:

@@ -1,23 +1,12 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Taking over from a killed process: checkpoints, stop files.
+"""What a process needs to take over from a killed one: checkpoints of states, stop files, and the right to run a node.
 
-How a run is asked to end early, and at which step it does: two files beside the checkpoints.
-
-They outlive the processes: a switcher that takes over asks for nothing again, and announces the same step.
-
-The last states that an agent has published, in a file that remains when its process is killed.
-
-Every state is written before it is published. A process that takes over from a killed one resumes from there, and
-publishes again what may have been lost on the way. Any agent can also repeat what a restarted peer has missed.
-
-Takeover of a node: the new process removes its killed predecessor from the network at once.
-
-The middleware drops a killed process only after 20 s of silence (its lease); until then writers keep what it never
-acknowledged, and block after 5,000 messages. A shorter lease would also drop processes that are only stopped or
-starved, and lose messages to them. The successor knows that the process is gone: it holds a lock that ends with the
-process that held it. So it sends, in the name of the dead process, the message by which a participant leaves.
+Every state is written to the checkpoint before it is published. A process that takes over resumes from there, and
+publishes again what may have been lost on the way. It also removes its predecessor from the network at once: the
+middleware would drop that only after 20 s of silence (its lease), and until then writers keep what it never
+acknowledged, and block after 5,000 messages.
 """
 
 from __future__ import annotations
@@ -27,7 +16,7 @@ import fcntl
 import mmap
 import os
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from uuid import UUID
 
@@ -39,7 +28,7 @@ from msg_analysis.model.run_record import RunRecord
 
 
 class StopFiles:
-    """The files of a run in its directory of checkpoints."""
+    """How a run is asked to end early, and at which step it does: two files beside the checkpoints."""
 
     def __init__(self, directory: Path, run: UUID) -> None:
         self._asked, self._decided = directory / f"stop_asked.{run}", directory / f"stop.{run}"
@@ -65,12 +54,12 @@ class StopFiles:
         return None
 
 
-MOST_KEPT, LEAST_KEPT, ROOM = RESEND_LIMIT, 256, 1 << 24
-"""States kept of each agent: as many as fit into ROOM bytes, from LEAST_KEPT to MOST_KEPT. Where possible, more than
+MOST_STATES, LEAST_STATES, ROOM = RESEND_LIMIT, 256, 1 << 24
+"""States kept of each agent: as many as fit into ROOM bytes, from LEAST_STATES to MOST_STATES. If possible, more than
 the 5,000 that the middleware keeps of a writer for slow readers; always more steps than agents may be apart."""
 
-# Length of the entry and step + 1; 0 from before the entry is written until it is whole.
-MARK = struct.Struct("<QQ")
+# After each entry: its length and step + 1; 0 from before the entry is written until it is whole.
+FOOTER = struct.Struct("<QQ")
 
 
 def published_size(record: RunRecord) -> int:
@@ -85,8 +74,8 @@ def entry_size(record: RunRecord) -> int:
 
 def room_for(size: int) -> int:
     """Size of the checkpoint file of an agent whose longest entry has ``size`` bytes."""
-    slot = size + MARK.size
-    return slot * max(LEAST_KEPT, min(MOST_KEPT, ROOM // slot))
+    slot = size + FOOTER.size
+    return slot * max(LEAST_STATES, min(MOST_STATES, ROOM // slot))
 
 
 class Checkpoint:
@@ -99,7 +88,7 @@ class Checkpoint:
     def __init__(self, path: Path | None, size: int) -> None:
         self.found = False
         self._size = size
-        self._slot = size + MARK.size
+        self._slot = size + FOOTER.size
         total = room_for(size)
         self.capacity = total // self._slot  # entries
         if path is None:
@@ -128,22 +117,22 @@ class Checkpoint:
     def write(self, step: int, entry: bytes) -> None:
         """Keep the entry of a step; steps must be consecutive."""
         start = step % self.capacity * self._slot
-        MARK.pack_into(self._map, start + self._size, 0, 0)  # who reads meanwhile must not take it for the old one
+        FOOTER.pack_into(self._map, start + self._size, 0, 0)  # a reader meanwhile must not take it for the old entry
         self._map[start : start + len(entry)] = entry
-        MARK.pack_into(self._map, start + self._size, len(entry), step + 1)
+        FOOTER.pack_into(self._map, start + self._size, len(entry), step + 1)
 
     def read(self, first: int = 0) -> list[tuple[int, bytes]]:
         """(step, entry) of the newest consecutive steps, ascending, from step ``first`` on.
 
         The slot after the newest is left out: it may be torn.
         """
-        marks = [MARK.unpack_from(self._map, slot * self._slot + self._size) for slot in range(self.capacity)]
-        newest = max(mark for _, mark in marks) - 1
+        footers = [FOOTER.unpack_from(self._map, slot * self._slot + self._size) for slot in range(self.capacity)]
+        newest = max(number for _, number in footers) - 1
         found: list[tuple[int, bytes]] = []
         for step in range(newest, max(first - 1, newest - self.capacity + 1, -1), -1):
             slot = step % self.capacity
-            length, mark = marks[slot]
-            if mark != step + 1:
+            length, number = footers[slot]
+            if number != step + 1:
                 break
             start = slot * self._slot
             found.append((step, self._map[start : start + length]))
@@ -172,7 +161,9 @@ class Takeover:
         os.pwrite(self._descriptor, prefix, 0)
 
 
-def take_over(directory: Path | None, names: Iterable[str]) -> list[Takeover]:
+def take_over(
+    directory: Path | None, names: Iterable[str], remove: Callable[[bytes, int], object] = remove_participant
+) -> list[Takeover]:
     """Get the right to run these nodes, and remove the processes that ran them before from the network.
 
     ``directory`` has a file per node; None: no takeover. InputError: another process is running one of the nodes.
@@ -182,5 +173,5 @@ def take_over(directory: Path | None, names: Iterable[str]) -> list[Takeover]:
     takeovers = [Takeover(directory / f"{name}.participant") for name in names]
     domain = int(os.environ.get("ROS_DOMAIN_ID") or 0)
     for prefix in {t.predecessor for t in takeovers if len(t.predecessor) == PREFIX_SIZE}:
-        remove_participant(prefix, domain)
+        remove(prefix, domain)
     return takeovers

@@ -28,18 +28,18 @@ COMMAND = re.compile(rf"(?:\$ )?((?:[A-Z_]+=\S+ )*(?:\.venv/bin/)?(?:msg-agents|
 SYNOPSIS = re.compile(r" \[|\.\.\.| (?:EXPERIMENT|SWEEP|RESULT|RUN_RECORD|A B)\b")  # test_pages.py knows their options
 
 TESTED = {  # and where
-    r"msg-agents demo": "tests/integration/test_begin.py",
-    r"msg-agents run lab\.yaml": "tests/integration/test_begin.py",
+    r"msg-agents demo": "tests/integration/test_docs.py",
+    r"msg-agents run lab\.yaml": "tests/integration/test_docs.py",
     r"msg-agents run line_ring\.yaml$|msg-agents run line_ring\.yaml --json": "tests/integration/test_docs.py",
     r"msg-agents run line_ring --no-record": "tests/integration/test_bag.py",
     r"msg-agents run line_ring(\.yaml)? --web": "tests/integration/test_view.py",
-    r"msg-agents run line_ring\.yaml --domain 42$": "tests/integration/test_markers.py",
+    r"msg-agents run line_ring\.yaml --domain 42$": "tests/integration/test_live.py",
     r"msg-agents run line_ring --domain 42 --await my_node": "tests/integration/test_cyclone.py",
     r"msg-agents run line_ring_realtime": "tests/integration/test_realtime.py",
     r"msg-agents run median\.yaml": "tests/integration/test_protocols.py",
     r"msg-agents run \w+ --channel channel\.yaml": "tests/integration/test_channel.py",
     r"msg-agents (live|play)\b": "tests/integration/test_live.py",
-    r"msg-agents markers": "tests/integration/test_markers.py",
+    r"msg-agents markers": "tests/integration/test_live.py",
     r"msg-agents (recorder|agent|switcher)\b": "tests/integration/test_single_nodes.py",
     r"msg-agents host": "tests/integration/test_hosts.py",
     r"msg-agents check$": "tests/integration/test_docs.py",

@@ -24,7 +24,8 @@ from typing import Any
 
 import pytest
 import yaml
-from left_processes import describe, last_words
+from left_processes import describe, last_line
+from networks import assert_equal_to_twin, document, experiment
 from started_processes import started_processes
 
 pytest.importorskip("rclpy")
@@ -37,7 +38,6 @@ from msg_agents.run.supervisor import STEPS
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
 MARK = "MSG_AGENTS_TEST"
@@ -51,20 +51,6 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "repetition" in metafunc.fixturenames:
         count = int(os.environ.get("STRESS", "1"))
         metafunc.parametrize("repetition", range(count), ids=[f"repetition_{i}" for i in range(count)])
-
-
-def document(**changes: Any) -> dict[str, Any]:
-    """Five agents on a line and a ring; ``run`` is merged, other keys are replaced."""
-    run = {"dt": 0.05, "duration": 15, "replicas": 2, "seed": 7} | changes.pop("run", {})
-    return {
-        "name": "net",
-        "problem": "consensus",
-        "time": "continuous",
-        "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}},
-        "switching": {"generator": [[-1, 1], [1, -1]]},
-        **changes,
-        "run": run,
-    }
 
 
 @dataclass(frozen=True)
@@ -184,10 +170,7 @@ class Network:
         """Start ``msg-agents run`` without a verdict."""
         return self.start("run", file, "--out", self.directory / "runs", "--no-analyse", *options, **environment)
 
-    @staticmethod
-    def experiment(**changes: Any) -> Experiment:
-        """See ``document``."""
-        return Experiment.parse(document(**changes))
+    experiment = staticmethod(experiment)
 
     def file(self, name: str = "net.yaml", **changes: Any) -> Path:
         """An experiment file."""
@@ -216,10 +199,7 @@ class Network:
         assert saved.exists() == (result["verdict"] is not None)
         assert not saved.exists() or json.loads(saved.read_text()) == result
         trajectory = read_bag(result["bag"])
-        assert trajectory.completeness.complete
-        assert trajectory.completeness.duplicates == 0
-        outcome = check(trajectory)
-        assert (outcome.difference, outcome.missing) == (None, 0)
+        assert_equal_to_twin(trajectory)
         return result | {"notes": re.findall(r"^note: (.*)", stderr, re.MULTILINE)}
 
     def recorded_bytes(self, out: str = "runs") -> int:
@@ -265,7 +245,7 @@ def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network
         print(describe([process.pid for process in left], [path for path in network.traces if path.is_dir()]))
         for process in left:
             process.kill()
-        print(last_words(network.commands))
+        print(last_line(network.commands))
     assert not left, "processes outlived the test"
     traces = {path for path in network.traces if path.exists()}
     if traces:  # some names are common to all domains: a process of another test may have such a file by now

@@ -15,7 +15,7 @@ import yaml
 from scipy import stats
 from user_namespace import give_up_rights
 
-from msg_agents.channel.namespaces import open_hosts
+from msg_agents.channel.process import open_hosts
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.errors import NotAvailableError
 
@@ -257,14 +257,3 @@ def test_a_limited_rate(network: Any) -> None:
     assert result["channel"]["findings"] == []
     if not possible:
         pytest.skip("this machine does not let users make namespaces: run with the rights of the tests")
-
-
-def test_bad_channel_files_and_options_that_need_other_programs(network: Any) -> None:
-    run = start(network, {}, default={"loss": 2, "delay": 3})
-    _, stderr = run.communicate(timeout=60)
-    assert run.returncode == 2
-    assert "channel.yaml: 2 problems" in stderr
-    run = start(network, {"run": {"pace": "realtime"}}, "--use-sim-time")
-    _, stderr = run.communicate(timeout=60)
-    assert run.returncode == 2
-    assert "--use-sim-time: not with --channel" in stderr

@@ -1,4 +1,4 @@
-"""Cyclone DDS, another vendor's middleware, beside a run: as a reader, as a stranger, and as one of its agents."""
+"""Cyclone DDS, another vendor's middleware, beside a run: as a reader, as a foreign node, and as one of its agents."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
+from networks import assert_equal_to_twin
+
 from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment
-from msg_agents.process_layout import plan_network
-from msg_agents.run.fork_server import NodeServer
+from msg_agents.process_layout import lay_out_network
+from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.supervisor import Supervisor
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.model.run import Run
-from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import new_record
 
 READER = Path(__file__).parents[1] / "support" / "cyclone_reader.py"
@@ -57,9 +58,7 @@ def came(reader: subprocess.Popen[str]) -> dict[str, list[Any]]:
 
 
 def equal_to_the_twin(trajectory: Run) -> None:
-    assert trajectory.completeness.complete
-    outcome = check(trajectory)
-    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert_equal_to_twin(trajectory)
 
 
 def states_of(trajectory: Run, agent: int) -> list[list[int]]:
@@ -124,14 +123,14 @@ def test_a_reader_comes_late_and_another_one_is_killed(network: Any) -> None:
     assert (graphs[-1][2], came_late["end"]) == (steps - 1, [[0, steps]])
 
 
-def test_a_stranger_is_refused(network: Any) -> None:
+def test_a_foreign_node_is_refused(network: Any) -> None:
     what = network.experiment(run={"duration": 50, "processes": 2})
     with free_domain() as domain, cyclone(domain, "--forge") as reader:
         result = network.run(what, domain=domain, readers=["cyclone_reader"])
         came(reader)
     assert result.failures == []
     equal_to_the_twin(result.trajectory)
-    refused = {(stranger["topic"].lstrip("/"), stranger["reason"]) for stranger in result.strangers}
+    refused = {(entry["topic"].lstrip("/"), entry["reason"]) for entry in result.strangers}
     assert {topic for topic, _ in refused} >= {"graph", "end", "progress", "agent_1/state"}
 
 
@@ -146,10 +145,10 @@ def test_an_agent(network: Any, noise: dict[str, Any]) -> None:
     with free_domain() as domain:
         environment = node_environment(domain)
         with (
-            NodeServer(environment, directory / "fork_server.log") as server,
+            ForkServer(environment, directory / "fork_server.log") as server,
             Supervisor(directory, environment, fork_server=server) as nodes,
         ):
-            nodes.start([plan for plan in plan_network(record.experiment, file, bag) if plan.name != "agent_3"])
+            nodes.start([spec for spec in lay_out_network(record.experiment, file, bag) if spec.name != "agent_3"])
             foreign = subprocess.run(
                 [sys.executable, str(AGENT), str(file), "3"],
                 env=os.environ | {"ROS_DOMAIN_ID": str(domain), "CYCLONEDDS_URI": UNICAST},

@@ -8,9 +8,12 @@ import subprocess
 import sys
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pages import EXPERIMENTS, ROOT, blocks, console, experiments, files, missing, python
+
+from msg_analysis.bags.reading import read_record
 
 DOCS = ROOT / "docs"
 NEXT_BLOCK = "next block of the page"
@@ -108,3 +111,20 @@ def test_example(name: str, network) -> None:
     (shown,) = [shown for shown in console(DOCS / "examples.md") if shown.command == f"msg-agents run {name}"]
     printed = ended(started(f"{shown.command} --write-report never", network.directory))
     assert missing(shown.lines, printed) == []
+
+
+SHORT = ("--duration", "2", "--processes", "1", "--no-analyse", "--json", "--out")
+
+
+def test_demo(network: Any) -> None:
+    """An example that needs no file."""
+    result = network.completed(network.start("demo", *SHORT, network.directory / "runs"))
+    assert read_record(Path(result["bag"])).experiment.name == "line_ring"
+
+
+def test_new_experiment(network: Any) -> None:
+    file = network.directory / "lab.yaml"
+    new = network.start("new", file, "--agents", "4", "--graph", "star", "--loss", "0.2")
+    assert (*new.communicate(timeout=60), new.returncode)[1:] == ("", 0)
+    result = network.completed(network.start("run", file, *SHORT, network.directory / "runs"))
+    assert read_record(Path(result["bag"])).experiment.agents == 4

@@ -14,8 +14,7 @@ from typing import Any
 import ill_machines
 import pytest
 
-from msg_agents.discovery.profiles import LOOPBACK_PROFILE
-from msg_agents.discovery.rtps import free_domain
+from msg_agents.discovery.rtps import LOOPBACK_PROFILE, free_domain
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 NAMES = [
@@ -97,22 +96,30 @@ def test_a_foreign_profile(plain_shell: Any, tmp_path: Path) -> None:
     assert (code, checks["round_trip"]["status"]) == (0, "ok")
 
 
-def refused(network: Any, name: str, machine: Sequence[str] = (), **variables: str) -> None:
-    """The doctor has this error, and a run the same, before anything is started; ``machine``: see ``ill_machines``."""
+def refused(network: Any, name: str, machine: Sequence[str] = (), **variables: str) -> str:
+    """The doctor has this error, and a run the same, before anything is made; ``machine``: see ``ill_machines``."""
     code, checks = examined(network.start("doctor", "--json", machine=machine, **variables))
     assert (code, checks[name]["status"], checks["round_trip"]["status"]) == (2, "error", "warning")
-    run = network.start("run", network.file(), "--no-record", machine=machine, **variables)
+    run = network.start("run", network.file(), "--out", network.directory / "runs", machine=machine, **variables)
     stdout, stderr = run.communicate(timeout=60)
     assert (run.returncode, stdout) == (2, "")
     assert stderr == f"error: {checks[name]['text']}\n"
+    assert list((network.directory / "runs").glob("*")) == []
+    return stderr
 
 
 def test_a_foreign_middleware(plain_shell: Any) -> None:
-    refused(plain_shell, "middleware", RMW_IMPLEMENTATION="rmw_none_cpp")
+    said = refused(plain_shell, "middleware", RMW_IMPLEMENTATION="rmw_none_cpp")
+    words = "RMW_IMPLEMENTATION: rmw_none_cpp: this ROS 2 .*: unset it, or install that middleware"
+    assert re.fullmatch(f"error: {words}\n", said)
 
 
 def test_a_sourced_foreign_ros(plain_shell: Any, tmp_path: Path) -> None:
-    refused(plain_shell, "middleware", PYTHONPATH=str(other_rclpy(tmp_path)), ROS_DISTRO="foxy")
+    said = refused(plain_shell, "middleware", PYTHONPATH=str(other_rclpy(tmp_path)), ROS_DISTRO="foxy")
+    words = (
+        r"/rclpy: cannot be used \(ImportError: libpython3.9.so: not found\): PYTHONPATH and ROS_DISTRO may lead to "
+    )
+    assert re.search(words + "another ROS 2: unset them, ", said)
 
 
 def test_no_discovery(plain_shell: Any) -> None:

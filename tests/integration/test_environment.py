@@ -1,4 +1,4 @@
-"""Surroundings in which a run has the same result as anywhere else."""
+"""RunEnvironment in which a run has the same result as anywhere else."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from networks import assert_equal_to_twin
 from programs import without_progress
 
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.twin.check import check
 
 RUN = {"processes": 2, "duration": 5}
 READ_ONLY = 'mount --bind "$1" "$1" && mount -o remount,ro,bind / && shift && exec "$@"'
@@ -27,8 +27,7 @@ def undisturbed(network: Any, run: subprocess.Popen[str]) -> None:
     result = json.loads(stdout)
     assert (result["verdict"], result["failures"], result["restarts"]) == ("agrees", [], [])
     assert Path(result["report"]).stat().st_size > 100_000
-    outcome = check(read_bag(result["bag"]))
-    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert_equal_to_twin(read_bag(result["bag"]))
     assert sorted(path.name for path in (Path(result["bag"]) / "log").iterdir()) == [
         *("agents_1_to_2.log", "agents_3_to_5.log", "recorder.log", "run.json", "switcher.log")
     ]
@@ -88,39 +87,3 @@ def test_no_place_for_temporary_files(network: Any, monkeypatch: pytest.MonkeyPa
     assert (run.returncode, run.stdout) == (2, "")
     assert re.fullmatch(r"error: TMPDIR: No usable temporary directory found in .*: set it to .*\n", run.stderr)
     assert not list((network.directory / "runs").glob("*"))
-
-
-def _foreign(folder: Path, code: str) -> str:
-    """A folder with an rclpy of another ROS 2."""
-    package = folder / "foreign/rclpy"
-    package.mkdir(parents=True)
-    (package / "__init__.py").write_text(code)
-    return str(package.parent)
-
-
-@pytest.mark.parametrize(
-    ("variables", "words"),
-    [
-        (
-            {"RMW_IMPLEMENTATION": "rmw_none_cpp"},
-            "RMW_IMPLEMENTATION: rmw_none_cpp: this ROS 2 .*: unset it, or install that middleware",
-        ),
-        (
-            {"PYTHONPATH": "raise ImportError('libpython3.10.so: not found')", "ROS_DISTRO": "humble"},
-            r".*/foreign/rclpy: cannot be used \(ImportError: libpython3.10.so: not found\): PYTHONPATH and "
-            "ROS_DISTRO may lead to another ROS 2: unset them, .*",
-        ),
-    ],
-    ids=["another middleware", "another rclpy"],
-)
-def test_another_ros(
-    network: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, variables: dict[str, str], words: str
-) -> None:
-    """One error before anything is started; no bag is left."""
-    for name, value in variables.items():
-        monkeypatch.setenv(name, _foreign(tmp_path, value) if name == "PYTHONPATH" else value)
-    run = network.start("run", network.file(run=RUN), "--out", network.directory / "runs", "--json")
-    stdout, stderr = run.communicate(timeout=60)
-    assert (run.returncode, stdout) == (2, "")
-    assert re.fullmatch(f"error: {words}\n", stderr)
-    assert list((network.directory / "runs").iterdir()) == []

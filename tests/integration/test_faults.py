@@ -1,7 +1,12 @@
-"""A recorder that stands still, and a disk that is full."""
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""A process that is killed or stopped, a full disk, a user who ends the run: what is there can be read."""
 
 from __future__ import annotations
 
+import json
+import os
 import random
 import re
 import signal
@@ -12,9 +17,171 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
 
 from msg_analysis.bags.reading import read_bag
+from msg_analysis.runs import read_result
 from msg_analysis.twin.check import check
+
+# 20,000 steps: no test waits for them; of states that are soon seen in the bag
+LONG = {"duration": 1000, "replicas": 16, "processes": 2}
+
+
+@pytest.mark.parametrize("kind", ["agent", "switcher"])
+def test_killed_child_that_may_not_come_back(network: Any, kind: str, rng: random.Random) -> None:
+    run = network.record(network.file(run=LONG), "--restarts", "0")
+    network.wait_until_moving()
+    kill_and_see(network, run, rng.choice(network.processes(kind)))
+
+
+def test_killed_recorder(network: Any, repetition: int, rng: random.Random) -> None:
+    """Every other time between its birth and, likely, the first state; else while states are recorded."""
+    run = network.record(network.file(run=LONG))
+    network.wait_for(lambda: len(network.nodes()) == 4, 60, "four children")
+    early = repetition % 2 == 1
+    if not early:
+        network.wait_until_moving()
+    time.sleep(rng.uniform(0.0, 1.0))
+    kill_and_see(network, run, network.processes("recorder")[0], early=early)
+
+
+def kill_and_see(network: Any, run: subprocess.Popen[str], victim: Any, *, early: bool = False) -> None:
+    """The whole run ends, and says why."""
+    assert network.shared_memory() == set()  # nothing that the victim could leave behind
+    kind = victim.kind
+    victim.kill()
+    _, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3, stderr
+    assert "Traceback" not in stderr
+    assert network.processes() == []
+    first = {1: "agents_1_to_2", 3: "agents_3_to_5"}[victim.agent] if kind == "agent" else kind
+    assert re.search(rf"^failed: {first}: killed by SIGKILL", stderr, re.MULTILINE), stderr
+    failed = re.findall(r"^failed: (agents?_\w+|switcher|recorder): ", stderr, re.MULTILINE)
+    assert failed == [first], stderr
+    (bag,) = (network.directory / "runs").iterdir()
+    assert (bag / "log" / f"{first}.log").exists()
+    recorded = not early or bool(list(bag.glob("*.mcap")))
+    assert ("nothing was recorded" in stderr) == (not recorded)
+    if not recorded:
+        return
+    assert re.search(r"last recorded step: agent 1: (\d+|none), .*agent 5: (\d+|none)$", stderr, re.MULTILINE), stderr
+    assert (bag / "metadata.yaml").exists()
+    assert ("the bag was salvaged" in stderr) == (kind == "recorder")
+    trajectory = read_bag(bag)
+    assert not trajectory.completeness.complete
+    assert early or trajectory.completeness.received > 0
+    assert check(trajectory).difference is None
+
+
+NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
+
+
+def test_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:
+    number = signal.SIGTERM if repetition % 2 else signal.SIGINT
+    run = network.start("run", network.file(run=LONG), "--out", network.directory / "runs", "--json")
+    network.wait_until_moving()
+    time.sleep(rng.uniform(0.0, 1.0) if repetition else 0.0)
+    assert network.shared_memory() == set()
+    run.send_signal(number)
+    stdout, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3, stderr
+    assert network.processes() == []
+    assert re.search(rf"^failed: stopped by {NAMES[number]} at step \d+ of 20000$", stderr, re.M)
+    assert "Traceback" not in stderr
+    assert stdout.count("\n") == 1  # one JSON object
+
+    (bag,) = (network.directory / "runs").iterdir()
+    result = json.loads(stdout)
+    assert (result["verdict"], result["bag"], result["report"]) == ("incomplete", str(bag), None)
+    assert result == json.loads((bag / "result.json").read_text())
+    assert read_result(bag).verdict == "incomplete"  # as `msg-analysis tabulate` does
+    custom = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]["custom_data"]
+    assert custom["complete"] == "false"
+    assert "salvaged" not in custom
+    with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        count = sum(1 for connection, *_ in reader.messages() if connection.topic.endswith("/state"))
+    trajectory = read_bag(bag)
+    assert trajectory.completeness.received == count > 0
+    assert not trajectory.completeness.complete
+    assert check(trajectory).difference is None
+
+
+def test_before_anything_has_begun(network: Any, repetition: int, rng: random.Random) -> None:
+    """While the processes start and look for each other."""
+    run = network.record(network.file(run=LONG))
+    network.wait_for(network.nodes, 60, "a child")
+    time.sleep(rng.uniform(0.0, 1.5) if repetition else 0.0)
+    number = signal.SIGINT if repetition % 2 else signal.SIGTERM
+    run.send_signal(number)
+    _, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3, stderr
+    assert f"failed: stopped by {NAMES[number]} " in stderr
+    assert "Traceback" not in stderr
+    assert network.processes() == []
+
+
+def test_while_the_run_is_compared_with_the_prediction(network: Any) -> None:
+    """The network has ended; the user does not wait for the verdict. The bag is whole, and can be compared later."""
+    graphs = {"line": {"path": list(range(1, 31))}, "ring": {"cycle": list(range(1, 31))}}
+    file = network.file(graphs=graphs, run={"duration": 100, "replicas": 1, "processes": 1})
+    run = network.start("run", file, "--out", network.directory / "runs", "--json")
+    network.wait_for(lambda: list(network.directory.glob("runs/*/log/run.json")), 60, "the end of the network")
+    time.sleep(0.2)
+    run.send_signal(signal.SIGINT)
+    stdout, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3, stderr
+    assert stderr.splitlines()[-1] == "failed: stopped by Ctrl-C while the run was compared with the prediction"
+    (bag,) = (network.directory / "runs").iterdir()
+    result = json.loads(stdout)
+    assert (result["verdict"], result["bag"], result["report"]) == ("incomplete", str(bag), None)
+    assert result == json.loads((bag / "result.json").read_text())
+    assert read_bag(bag).completeness.complete
+
+
+def test_at_any_moment_after_the_network(network: Any) -> None:
+    """As soon as the logs are being kept: whatever is done then, the result is printed, and the bag is whole."""
+    many = {"duration": 5, "replicas": 500}  # so that the comparison takes longer than this test needs to see the logs
+    run = network.start("run", network.file(run=many), "--out", network.directory / "runs", "--json")
+    network.wait_for(lambda: list(network.directory.glob("runs/*/log")), 60, "the end of the network")
+    run.send_signal(signal.SIGINT)
+    stdout, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3, stderr
+    assert stderr.splitlines()[-1].startswith("failed: stopped by Ctrl-C while the ")
+    (bag,) = (network.directory / "runs").iterdir()
+    assert json.loads(stdout)["verdict"] == "incomplete"
+    assert read_bag(bag).completeness.complete
+
+
+def test_agents_that_are_interrupted_say_nothing(network: Any) -> None:
+    """A signal shuts rclpy down between two calls of a callback, and what is then published is no error of ours."""
+    fast = LONG | {"pace": "realtime", "speed": 60.0}
+    run = network.record(network.file(run=fast), "--restarts", "0")
+    network.wait_until_moving()
+    agents = network.processes("agent")
+    for process in agents:
+        os.kill(process.pid, signal.SIGINT)
+    _, stderr = run.communicate(timeout=60)
+    assert run.returncode == 3, stderr
+    (bag,) = (network.directory / "runs").iterdir()
+    for log in (bag / "log").glob("*.log"):
+        assert not re.search("FATAL|Traceback|Error", log.read_text()), log
+
+
+def test_a_killed_runner_takes_everybody_along(network: Any) -> None:
+    run = network.record(network.file(run=LONG))
+    network.wait_until_moving()
+    assert {process.kind for process in network.nodes()} == {"agent", "switcher", "recorder"}
+    run.kill()
+    run.communicate(timeout=60)
+    network.wait_for(lambda: network.processes() == [], 10, "the end of every child")
+    network.traces.clear()  # whoever runs the next network clears its folder away
+    (bag,) = (network.directory / "runs").iterdir()
+    trajectory = read_bag(bag)  # its recorder had the time to close it
+    assert trajectory.completeness.received > 0
+    assert check(trajectory).difference is None
+
 
 PAUSE = 10.0  # s
 

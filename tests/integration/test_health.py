@@ -108,11 +108,7 @@ def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
         assert line.endswith("; no report from agent_2\n")
 
     known = statuses(heard)
-    assert heard_of(heard) == {
-        *(f"agent_{i}: network" for i in range(1, 6)),
-        "switcher: network",
-        "recorder: network",
-    }
+    assert heard_of(heard) == {*(f"agent_{i}: network" for i in range(1, 6)), "switcher: network", "recorder: network"}
     agents = [status for status in known if status["name"].startswith("agent")]
     for status in agents:
         assert int(status["step"]) >= 0
@@ -121,10 +117,10 @@ def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
         refused = any(key.startswith("refused on ") for key in status)  # of a second process
         assert status["level"] == (1 if waits or refused else 0)
         assert waits == ("waiting for" in status["message"])
-    blamed = {
+    waited = {
         s["waiting for"] for s in agents if s["name"] == "agent_1: network" and s["step"] == step and "waiting for" in s
     }
-    assert blamed == {words}
+    assert waited == {words}
     moving = [s for s in agents if re.fullmatch(r"at step \d+", s["message"]) and float(s["steps per second"]) > 0]
     assert moving
 
@@ -141,4 +137,4 @@ def test_an_agent_that_was_not_given_the_end(network: Any) -> None:
     (victim,) = (process for process in network.processes("agent") if process.agent == 2)
     victim.kill(signal.SIGSTOP)
     recorder.kill(signal.SIGCONT)
-    assert network.completed(run)["notes"] == ["agent_2 had not left 10 s after the end of the run: told to end"]
+    assert network.completed(run)["notes"] == ["agent_2 had not left 10 s after the end of the run: interrupted"]

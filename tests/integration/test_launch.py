@@ -162,9 +162,8 @@ def test_two_networks_in_one_launch_file(network: Any, launch: Launch) -> None:
     assert process.returncode == (1 if disagreements else 0)
 
 
-@pytest.mark.parametrize("shutdown", ["true", "false"])
-def test_others_of_the_launch(network: Any, launch: Launch, shutdown: str) -> None:
-    """Another process goes on, unless the network is to end the launch."""
+def beside_another(network: Any, launch: Launch, shutdown: str) -> subprocess.Popen[str]:
+    """A network in a launch file that starts another process, too."""
     file = network.directory / "other.launch.xml"
     arguments = dict(word.split(":=", 1) for word in of_network(network, duration=2, shutdown=shutdown)[2:])
     given = "".join(f'<arg name="{name}" value="{value}"/>' for name, value in arguments.items())
@@ -172,16 +171,27 @@ def test_others_of_the_launch(network: Any, launch: Launch, shutdown: str) -> No
         f'<launch><executable cmd="{sys.executable} -c &quot;import time; time.sleep(600)&quot;"/>'
         f'<include file="$(find-pkg-share msg_agents_bringup)/launch/network.launch.py">{given}</include></launch>'
     )
-    process = launch(file)
-    if shutdown == "false":
-        words = network.wait_for(lambda: [w for p in nodes(network).values() for w in p.command], 30, "nodes")
-        folder = next(Path(word).parent for word in words if word.endswith("run.json"))
-        network.wait_for(lambda: not folder.exists(), 60, "the end of the network, as launch sees it")
-        assert process.poll() is None
-        os.killpg(process.pid, signal.SIGINT)
+    return launch(file)
+
+
+def ends_well(network: Any, process: subprocess.Popen[str]) -> None:
     output, _ = process.communicate(timeout=60)
     assert complete(bags(network)[0])
     assert (process.returncode, errors(output)) == (0, []), output
+
+
+def test_a_network_that_ends_the_launch(network: Any, launch: Launch) -> None:
+    ends_well(network, beside_another(network, launch, "true"))
+
+
+def test_others_of_the_launch_go_on(network: Any, launch: Launch) -> None:
+    process = beside_another(network, launch, "false")
+    words = network.wait_for(lambda: [w for p in nodes(network).values() for w in p.command], 30, "nodes")
+    folder = next(Path(word).parent for word in words if word.endswith("run.json"))
+    network.wait_for(lambda: not folder.exists(), 60, "the end of the network, as launch sees it")
+    assert process.poll() is None
+    os.killpg(process.pid, signal.SIGINT)
+    ends_well(network, process)
 
 
 def test_sigint_to_the_process_group(network: Any, launch: Launch) -> None:
@@ -252,7 +262,7 @@ def test_sigterm_to_launch(network: Any, launch: Launch) -> None:
     ],
 )
 def test_wrong_arguments(network: Any, launch: Launch, file: str, arguments: dict[str, object], words: str) -> None:
-    """All of them: tests/agents/running/test_launch_arguments.py."""
+    """All of them: tests/agents/run/test_launch.py."""
     process = (
         launch(*bringup(f"{file}.launch.py", out=network.directory / "runs", **arguments))
         if (file == "network")

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import yaml
 
-from msg_agents.run import lifeline
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.pool import compare
@@ -57,8 +56,7 @@ class Broken(Protocol):
 
 
 @pytest.mark.parametrize(
-    ("name", "processes"),
-    [("metropolis", "one_per_agent"), ("saturated", 2), ("integral_action", 4)],
+    ("name", "processes"), [("metropolis", "one_per_agent"), ("saturated", 2), ("integral_action", 4)]
 )
 def test_examples(network: Any, name: str, processes: int | str) -> None:
     """Agents alone in their process, several in one, and both, which shows that states of 2 numbers come through each.
@@ -124,12 +122,11 @@ def test_a_protocol_that_ends_its_process(network: Any) -> None:
 @pytest.mark.parametrize("restarts", [3, 0])
 def test_a_protocol_that_hangs(network: Any, monkeypatch: pytest.MonkeyPatch, restarts: int) -> None:
     """Once: its process is ended and comes back. Without restarts the run ends. Nobody waits for ever."""
-    monkeypatch.setattr(lifeline, "HUNG", 3.0)
     packages = _install(network, HANGING)
     monkeypatch.syspath_prepend(packages)
     what = network.experiment(protocol={"name": "broken"}, run={"duration": 60, "start": "zero", "processes": 2})
     environment = {"PYTHONPATH": str(packages), "MSG_AGENTS_HANGING": str(network.directory / "mark")}
-    result = network.run(what, restarts=restarts, environment=environment)
+    result = network.run(what, restarts=restarts, environment=environment, hung_timeout=3.0)
     words = "agents_3_to_5: hung, its main thread has not run for 3 s (stacks in log/agents_3_to_5.log)"
     assert [line.startswith(words) for line in result.restarts] == ([True] if restarts else [])
     assert (words in result.failures) == (not restarts)

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 import yaml
 from mcap.reader import make_reader
+from networks import run_file
 from waiting import participants
 
 from msg_agents.discovery.rtps import free_domain
@@ -58,13 +59,6 @@ def end(process: subprocess.Popen[str], code: int = 0) -> str:
     return stdout
 
 
-def run_record(network: Any, **changes: Any) -> Path:
-    text = end(network.start("prepare", network.file(**changes)))
-    file = network.directory / "run.json"
-    file.write_text(text)
-    return Path(file)
-
-
 def topics(bag: Path) -> Counter[str]:
     """Messages by topic, as mcap's own reader counts them."""
     (file,) = bag.glob("*.mcap")
@@ -82,7 +76,7 @@ def test_parameters_namespace_and_remapping(network: Any) -> None:
     nodes = []
     bags = {"/lab": network.directory / "lab", "/hall": network.directory / "hall"}
     for seed, (namespace, bag) in enumerate(bags.items()):
-        record = run_record(network, run={"seed": seed})
+        record = run_file(network.directory, 5, run={"seed": seed})
         record = record.rename(record.with_stem(bag.name))
         file = network.directory / f"{bag.name}.yaml"
         sections = {
@@ -160,8 +154,8 @@ def test_what_the_launch_files_do(network: Any) -> None:
     launched = LaunchedNetwork(arguments)
     ros = ["--ros-args", "-r", "__ns:=/lab"]
     running = {
-        plan.name: start(plan.arguments[0], *plan.arguments[1:], *ros, environment=environment())
-        for plan in launched.processes
+        spec.name: start(spec.arguments[0], *spec.arguments[1:], *ros, environment=environment())
+        for spec in launched.processes
     }
     for name, process in running.items():
         assert not launched.over
@@ -213,7 +207,7 @@ def test_a_node_of_your_own(network: Any, domain: int) -> None:
 
 def test_a_guest_gets_everything(network: Any, domain: int) -> None:
     """A reader that is no recorder of ours, named to the agents, gets every state, the last one too."""
-    record = run_record(network)
+    record = run_file(network.directory, 5)
     guest = start("python", "-P", "-c", GUEST)
     ros = ["--ros-args", "-p", f"run:={record}", "-p", "await:=[rosbag2_recorder]"]
     nodes = [start("switcher", *ros), start("agent", *ros, "-p", "agents:=[1, 2, 3, 4, 5]")]

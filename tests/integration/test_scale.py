@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from visitor import watched_endpoints
+from joining_node import watched_endpoints
 
 from msg_agents.run.result import read_steps
 from msg_analysis.bags.reading import read_bag
@@ -68,11 +68,8 @@ def assert_cores(network: Any, *, pinned: bool) -> dict[int, set[int]]:
     """Each process keeps to one core, and together to all of them, or none does; the cores, by its first agent."""
     kept = {process.agent: cores_of(process.pid) for process in network.processes("agent")}
     cores = os.sched_getaffinity(0)
-    if pinned:
-        assert {len(own) for own in kept.values()} == {1}
-        assert len(set.union(*kept.values())) == min(len(cores), len(kept))
-    else:
-        assert list(kept.values()) == [cores] * len(kept)
+    assert {len(own) for own in kept.values()} == {1 if pinned else len(cores)}
+    assert len(set.union(*kept.values())) == (min(len(cores), len(kept)) if pinned else len(cores))
     return kept
 
 
@@ -110,10 +107,7 @@ def test_processes_of_one_agent_that_hear_all_others(network: Any) -> None:
 
 @pytest.mark.parametrize(
     ("experiment", "processes", "of_batches", "of_first", "of_last"),
-    [
-        (complete(24), 5, [1, 5, 10, 15, 20], [], []),
-        (first_third_hears_all(24), 3, [1], [*range(9, 25)], []),
-    ],
+    [(complete(24), 5, [1, 5, 10, 15, 20], [], []), (first_third_hears_all(24), 3, [1], [*range(9, 25)], [])],
     ids=["all", "a third"],
 )
 def test_processes_that_hear_most_of_a_network(

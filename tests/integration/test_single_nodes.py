@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from networks import run_file
 
 from msg_agents.discovery.rtps import free_domain
 from msg_analysis.bags.reading import read_bag
@@ -19,20 +20,11 @@ from msg_analysis.twin.check import check
 
 
 @pytest.fixture
-def run_file(network: Any) -> Path:
-    return prepared(network)
+def record(network: Any) -> Path:
+    return run_file(network.directory, 5)
 
 
-def prepared(network: Any, **run: Any) -> Path:
-    prepare = network.start("prepare", network.file(run=run))
-    stdout, stderr = prepare.communicate(timeout=60)
-    assert prepare.returncode == 0, stderr
-    file = network.directory / "run.json"
-    file.write_text(stdout)
-    return Path(file)
-
-
-def test_started_by_hand(network: Any, run_file: Path) -> None:
+def test_started_by_hand(network: Any, record: Path) -> None:
     """In any order, with the environment that ROS has by default but for the domain."""
     bag = network.directory / "mine"
     await_recorder = ("--await", "recorder")
@@ -40,10 +32,10 @@ def test_started_by_hand(network: Any, run_file: Path) -> None:
         nodes: list[subprocess.Popen[str]] = [
             network.start(*command, ROS_DOMAIN_ID=str(domain))
             for command in (
-                ("switcher", run_file, *await_recorder),
-                ("agent", run_file, "--agent", "5", *await_recorder),
-                ("recorder", run_file, "--out", bag),
-                ("agent", run_file, *(p for i in "2413" for p in ("--agent", i)), *await_recorder),
+                ("switcher", record, *await_recorder),
+                ("agent", record, "--agent", "5", *await_recorder),
+                ("recorder", record, "--out", bag),
+                ("agent", record, *(p for i in "2413" for p in ("--agent", i)), *await_recorder),
             )
         ]
         for node in nodes:
@@ -56,9 +48,7 @@ def test_started_by_hand(network: Any, run_file: Path) -> None:
 
 def test_interrupted_again_and_again(network: Any) -> None:
     """Until the last moment of a process: it ends in order, and leaves no shared memory (``network`` looks)."""
-    prepare = network.start("prepare", network.file(run={"duration": 5000}))
-    run_file = network.directory / "run.json"
-    run_file.write_text(prepare.communicate(timeout=60)[0])
+    record = run_file(network.directory, 5, run={"duration": 5000})
     await_recorder = ("--await", "recorder")
     older = set(Path("/dev/shm").glob("fastrtps*"))  # of killed processes of others
     with free_domain() as domain:
@@ -71,9 +61,9 @@ def test_interrupted_again_and_again(network: Any) -> None:
                 env=os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONSAFEPATH": "1"},
             )
             for command in (
-                ("switcher", run_file, *await_recorder),
-                ("agent", run_file, *(p for i in "12345" for p in ("--agent", i)), *await_recorder),
-                ("recorder", run_file, "--out", network.directory / "runs" / "mine"),
+                ("switcher", record, *await_recorder),
+                ("agent", record, *(p for i in "12345" for p in ("--agent", i)), *await_recorder),
+                ("recorder", record, "--out", network.directory / "runs" / "mine"),
             )
         ]
         network.wait_until_moving()
@@ -96,11 +86,11 @@ def test_interrupted_again_and_again(network: Any) -> None:
     ],
     ids=["agent", "switcher"],
 )
-def test_alone(network: Any, run_file: Path, command: tuple[str, ...], missing: list[str]) -> None:
+def test_alone(network: Any, record: Path, command: tuple[str, ...], missing: list[str]) -> None:
     """Nobody comes: exit code 2 (something is wrong with what was started), naming everyone who is missing."""
     kind, *options = command
     with free_domain() as domain:
-        node = network.start(kind, run_file, *options, "--discovery-timeout", "3", ROS_DOMAIN_ID=str(domain))
+        node = network.start(kind, record, *options, "--discovery-timeout", "3", ROS_DOMAIN_ID=str(domain))
         stdout, stderr = node.communicate(timeout=60)
     assert (node.returncode, stdout) == (2, ""), stderr
     error = re.search(r"^error: after 3 s (.*) did not discover: (.*?)\. Are they running", stderr, re.MULTILINE)
@@ -112,16 +102,17 @@ def test_alone(network: Any, run_file: Path, command: tuple[str, ...], missing: 
 
 def test_the_others_end_without_an_agent(network: Any) -> None:
     """A process of agents leaves and does not come back: all end by themselves, and the bag is closed."""
-    run_file, bag = prepared(network, pace="realtime", duration=900, speed=5), network.directory / "runs/mine"
+    record = run_file(network.directory, 5, run={"pace": "realtime", "duration": 900, "speed": 5})
+    bag = network.directory / "runs/mine"
     options = ("--await", "recorder", "--patience", "2")
     with free_domain() as domain:
         *others, leaving = (
             network.start(*command, ROS_DOMAIN_ID=str(domain))
             for command in (
-                ("switcher", run_file, *options),
-                ("agent", run_file, *(p for i in "2345" for p in ("--agent", i)), *options),
-                ("recorder", run_file, "--out", bag, *options[2:]),
-                ("agent", run_file, "--agent", "1", *options),
+                ("switcher", record, *options),
+                ("agent", record, *(p for i in "2345" for p in ("--agent", i)), *options),
+                ("recorder", record, "--out", bag, *options[2:]),
+                ("agent", record, "--agent", "1", *options),
             )
         )
         network.wait_until_moving()
@@ -136,15 +127,15 @@ def test_the_others_end_without_an_agent(network: Any) -> None:
 
 
 @pytest.mark.timeout(150)
-def test_a_missing_agent_is_named_by_the_others(network: Any, run_file: Path) -> None:
+def test_a_missing_agent_is_named_by_the_others(network: Any, record: Path) -> None:
     """The switcher gives up first: the agents are still there, so it misses nobody else."""
     others = [part for number in "1235" for part in ("--agent", number)]
     with free_domain() as domain:
         nodes = [
             network.start(*command, ROS_DOMAIN_ID=str(domain))
             for command in (
-                ("switcher", run_file, "--discovery-timeout", "6"),
-                ("agent", run_file, *others, "--discovery-timeout", "10"),
+                ("switcher", record, "--discovery-timeout", "6"),
+                ("agent", record, *others, "--discovery-timeout", "10"),
             )
         ]
         texts = [node.communicate(timeout=60)[1] for node in nodes]

@@ -13,14 +13,15 @@ from typing import Any
 
 import pytest
 import yaml
+from networks import assert_equal_to_twin
 
+from msg_agents.recovery import StopFiles
 from msg_agents.run.result import RunResult, conclude
-from msg_agents.watch import observer as early_end
-from msg_agents.watch import observer as run_observer
+from msg_agents.watch import observer as watching
+from msg_agents.watch.observer import RunObserver
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.inference import online_errors
 from msg_analysis.model.run_record import Until
-from msg_analysis.twin.check import check
 
 LONG = {"duration": 2000, "replicas": 8, "processes": 2}  # 40,000 steps
 PLANNED = 40_000
@@ -50,9 +51,7 @@ def complete(result: RunResult) -> None:
     """The run of a test in this process is complete, and equal to its twin."""
     assert result.failures == []
     assert result.trajectory is not None
-    assert result.trajectory.completeness.complete
-    outcome = check(result.trajectory)
-    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert_equal_to_twin(result.trajectory)
 
 
 def says_so(result: dict[str, Any], until: str) -> None:
@@ -120,8 +119,8 @@ def test_evidence_ends_a_run_whose_switcher_is_killed(network: Any, monkeypatch:
     other = network.experiment(run=LONG, noise={"process": 0.6})
     announced = []
 
-    def observer(record: Any, checkpoints: Path) -> run_observer.RunObserver:
-        return run_observer.RunObserver(replace(record, experiment=other), checkpoints)
+    def observer(record: Any, checkpoints: Path) -> RunObserver:
+        return RunObserver(replace(record, experiment=other), checkpoints)
 
     def kill(files: Any) -> int | None:
         step = found(files)
@@ -131,9 +130,9 @@ def test_evidence_ends_a_run_whose_switcher_is_killed(network: Any, monkeypatch:
                 process.kill()
         return step
 
-    found = early_end.StopFiles.decided
-    monkeypatch.setattr(early_end, "RunObserver", observer)
-    monkeypatch.setattr(early_end.StopFiles, "decided", kill)
+    found = StopFiles.decided
+    monkeypatch.setattr(watching, "RunObserver", observer)
+    monkeypatch.setattr(StopFiles, "decided", kill)
     result = network.run(experiment, until=Until.parse("decided"))
     complete(result)
     assert result.until["reason"].startswith("evidence against the prediction passed 100 at step ")

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from tests.support.watched_run import whole_sums
 
-from msg_agents.watch import observer as early_end
-from msg_agents.watch import observer as run_observer
+from msg_agents.watch import observer as watching
+from msg_agents.watch.observer import RunObserver
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import Until
@@ -47,14 +47,13 @@ def test_watchers_have_the_evidence_of_the_comparison(
     network: Any, domain: int, law: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The observer of the run by the checkpoints, and `live` by the topics of its replay."""
-    observers: list[run_observer.RunObserver] = []
-    made = run_observer.RunObserver
+    observers: list[RunObserver] = []
 
-    def observer(record: Any, checkpoints: Path) -> run_observer.RunObserver:
-        observers.append(made(record, checkpoints))
+    def observer(record: Any, checkpoints: Path) -> RunObserver:
+        observers.append(RunObserver(record, checkpoints))
         return observers[-1]
 
-    monkeypatch.setattr(early_end, "RunObserver", observer)
+    monkeypatch.setattr(watching, "RunObserver", observer)
     changes = LAWS[law]
     experiment = network.experiment(**changes | {"run": {"duration": 10, "processes": 2} | changes.get("run", {})})
     result = network.run(experiment, until=Until(0.001))

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from msg_agents.environment import node_environment
-from msg_agents.process_layout import ProcessPlan, plan_network
-from msg_agents.run.fork_server import NodeServer
+from msg_agents.process_layout import ProcessSpec, lay_out_network
+from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.supervisor import Supervisor
 from msg_analysis.model.run_record import RunRecord
 
@@ -20,18 +20,18 @@ def network_awaiting(node: str, record: RunRecord, directory: Path, domain: int)
     (directory / "run.json").write_text(record.to_json(with_key=True))
     environment = node_environment(domain)
     with (
-        NodeServer(environment, directory / "fork_server.log") as server,
+        ForkServer(environment, directory / "fork_server.log") as server,
         Supervisor(directory, environment, fork_server=server) as nodes,
     ):
-        recorder, *others = plan_network(record.experiment, directory / "run.json", directory / BAG)
-        nodes.start([recorder, *(_awaiting(node, plan) for plan in others)])
+        recorder, *others = lay_out_network(record.experiment, directory / "run.json", directory / BAG)
+        nodes.start([recorder, *(_awaiting(node, spec) for spec in others)])
         yield nodes
 
 
-def _awaiting(node: str, plan: ProcessPlan) -> ProcessPlan:
-    return dataclasses.replace(plan, arguments=(*plan.arguments, "--await", node))
+def _awaiting(node: str, spec: ProcessSpec) -> ProcessSpec:
+    return dataclasses.replace(spec, arguments=(*spec.arguments, "--await", node))
 
 
 def failures_of(nodes: Supervisor) -> list[tuple[str, str | None, str]]:
     """Processes that have failed: name, how, and the last line that they printed."""
-    return [(child.plan.name, child.failure, child.last_words()) for child in nodes.failures]
+    return [(child.spec.name, child.failure, child.last_line()) for child in nodes.failures]

@@ -1,4 +1,4 @@
-"""A reader, or a stranger, of another vendor's middleware: Cyclone DDS without ROS 2, in a process of its own.
+"""A reader, or a foreign publisher, of another vendor's middleware: Cyclone DDS without ROS 2, in a process of its own.
 
 Prints one JSON document: of every topic what came, in the order in which it came.
 """

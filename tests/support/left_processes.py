@@ -9,7 +9,7 @@ from pathlib import Path
 
 from waiting import state_of
 
-from msg_agents.run.lifeline import SHOW_STACKS
+from msg_agents.run.fork_server import SHOW_STACKS
 
 ANSWER = 0.5  # s that they have to write their stacks
 LONGEST = 6000  # characters of a file
@@ -30,7 +30,7 @@ def describe(pids: Sequence[int], folders: Iterable[Path]) -> str:
     return "\n".join(lines)
 
 
-def last_words(commands: Iterable[subprocess.Popen[str]]) -> str:
+def last_line(commands: Iterable[subprocess.Popen[str]]) -> str:
     """What commands that have been killed had printed and nobody has read."""
     lines = []
     for command in commands:

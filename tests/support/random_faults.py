@@ -14,8 +14,7 @@ from typing import Literal
 from random_networks import random_document
 
 from msg_agents.environment import RESTARTS
-from msg_agents.process_layout import RECORDER, SWITCHER
-from msg_agents.run.fork_server import Process
+from msg_agents.process_layout import RECORDER, SWITCHER, Process
 from msg_agents.run.result import RunResult
 from msg_agents.run.runner import run_network
 from msg_agents.watch.panel import View
@@ -27,7 +26,7 @@ LATEST = 0.7  # of the steps: later, the run might be over before the fault
 LONGEST_WAIT = 0.1  # s between a step and the fault: steps are reported ten times a second
 LONGEST_STOP = 1.5  # s
 ONE_ENDS_IN = 8  # networks
-PATIENCE = 60.0  # s without a step or a restart: three leases of the middleware, or twice the time of discovery
+TIMEOUT = 60.0  # s without a step or a restart: three leases of the middleware, or twice the time of discovery
 CONSEQUENCES = re.compile(r"\S+: killed by SIGKILL|the bag was salvaged: |nothing was recorded: |last recorded step: ")
 
 
@@ -85,10 +84,10 @@ def _moment(draw: random.Random, steps: int) -> int:
 class FaultInjection(View):
     """Kills, stops and continues processes of the run that it views, and ends a run that makes no step any more."""
 
-    def __init__(self, plan: FaultPlan, patience: float = PATIENCE) -> None:
+    def __init__(self, plan: FaultPlan, timeout: float = TIMEOUT) -> None:
         super().__init__(lambda _: None, lambda _: None)
         self._pending = list(plan.faults)
-        self._patience = patience
+        self._timeout = timeout
         self._processes: Mapping[str, Process] = {}
         self._reached: dict[int, float] = {}  # when each step of the plan was seen to have been reached
         self._stopped: list[tuple[float, Process]] = []  # until when
@@ -114,8 +113,8 @@ class FaultInjection(View):
                 self._deliver(fault, now)
         if list(steps) != self._newest:
             self._newest, self._moved = list(steps), now
-        if now > self._moved + self._patience and self.standstill is None:
-            self.standstill = f"ended after {self._patience:g} s without a step{self._note}"
+        if now > self._moved + self._timeout and self.standstill is None:
+            self.standstill = f"ended after {self._timeout:g} s without a step{self._note}"
             signal.raise_signal(signal.SIGINT)  # so that the run ends in order, and its logs are kept
 
     def end(self) -> None:

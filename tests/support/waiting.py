@@ -4,9 +4,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.twin.simulate import new_record
-
 
 def wait_for(condition: Callable[[], object], seconds: float = 30.0) -> None:
     deadline = time.monotonic() + seconds
@@ -33,20 +30,3 @@ def participants(domain: int) -> int:
     lines = Path("/proc/net/udp").read_text().splitlines()[1:]
     ports = {int(line.split()[1].rpartition(":")[2], 16) for line in lines}
     return sum(7400 + 250 * domain + 10 + 2 * number in ports for number in range(119))
-
-
-def record_of_two(directory: Path) -> Path:
-    """File run.json of a run of two agents: one of them waits for the other."""
-    experiment = Experiment.parse(
-        {
-            "name": "waiting",
-            "problem": "consensus",
-            "time": "continuous",
-            "graphs": {"line": {"path": [1, 2]}},
-            "switching": {"generator": [[0]]},
-            "run": {"dt": 0.05, "duration": 1, "start": "zero"},
-        }
-    )
-    file = directory / "run.json"
-    file.write_text(new_record(experiment).to_json(with_key=True))
-    return file

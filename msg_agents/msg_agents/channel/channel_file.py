@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from msg_agents.channel.links import LinkSettings, LossModel
-from msg_agents.channel.namespaces import MOST_HOSTS
 from msg_agents.process_layout import agent_numbers, assignment_problems, process_name, split_agents
 from msg_analysis.common.arrays import BoolArray, FloatArray
 from msg_analysis.experiment.experiment import Experiment
@@ -26,6 +25,7 @@ from msg_analysis.experiment.problems import ExperimentError, problem, translate
 BASE = "base"
 """The host of recorder and switcher."""
 
+MOST_HOSTS = 250  # of agents
 MTU = 65535  # bytes; every message of a run is then one packet
 SECOND = 1e3  # ms
 

@@ -1,13 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Links of a channel: delay, loss and rate of each datagram, and what was counted.
-
-The active graph, for the channel: which one it is, as the switcher says, and to whom it does not apply meanwhile.
-
-Numbers in a mapped file, read for every packet.
-
-What one direction between two hosts does to a packet: loss, rate with a finite queue, delay.
+"""What a channel does to packets: loss, rate with a finite queue and delay of each direction, and the forwarder.
 
 Every random number is a function of (seed, pair of hosts, number of the packet): the same seed loses the same packets
 of a pair, whatever their times are.
@@ -17,10 +11,8 @@ from __future__ import annotations
 
 import heapq
 import json
-import mmap
 import os
 import select
-import struct
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -29,44 +21,10 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from math import inf
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-from msg_agents.channel.namespaces import device_overflow
 from msg_analysis.arithmetic.reproducible import Stream, generator, link_number
 from msg_analysis.common.files import write_whole
-
-_MODE = struct.Struct("<q")
-
-
-class ActiveGraphFile:
-    """The mode of the active graph, from 0; -1 before the first step, when every packet passes; and a byte per host."""
-
-    def __init__(self, path: Path) -> None:
-        with path.open("r+b") as stream:
-            self._map = mmap.mmap(stream.fileno(), 0)
-
-    @classmethod
-    def create(cls, path: Path, hosts: int) -> Self:
-        """Make the file, which says -1, and nothing of the hosts."""
-        path.write_bytes(_MODE.pack(-1) + bytes(hosts))
-        return cls(path)
-
-    @property
-    def mode(self) -> int:
-        """The newest mode that was written."""
-        return int(_MODE.unpack_from(self._map)[0])
-
-    def tell(self, mode: int) -> None:
-        """Say that the graph with this mode is active now."""
-        _MODE.pack_into(self._map, 0, mode)
-
-    def lets_through(self, host: int) -> bool:
-        """Whether all packets from and to a host, from 0, pass."""
-        return bool(self._map[_MODE.size + host])
-
-    def let_through(self, host: int, *, all_packets: bool) -> None:
-        """Say whether they do."""
-        self._map[_MODE.size + host] = all_packets
 
 
 @dataclass(slots=True)
@@ -170,7 +128,7 @@ class LinkSettings:
     queue: int = 100  # packets that wait for the one that is being sent; those that find it full are dropped
 
 
-class Fate(Enum):
+class PacketOutcome(Enum):
     """What became of a packet."""
 
     PASSED = auto()
@@ -193,17 +151,17 @@ class Link:
         self._latest = -inf  # when the newest packet arrives
         self.waited = 0  # packets that found another one being sent
 
-    def carry(self, size: int, now: float) -> tuple[Fate, float]:
+    def carry(self, size: int, now: float) -> tuple[PacketOutcome, float]:
         """Take a packet of so many bytes at time ``now`` [s]: what becomes of it, and when it arrives [s]."""
         lost, jitter = self._draw()
         sent = self._send(size, now)
         if sent is None:
-            return Fate.DROPPED, now
+            return PacketOutcome.DROPPED, now
         if lost:
-            return Fate.LOST, now
+            return PacketOutcome.LOST, now
         settings = self._settings
         self._latest = max(self._latest, sent + settings.delay + settings.jitter * (2 * jitter - 1))
-        return Fate.PASSED, self._latest
+        return PacketOutcome.PASSED, self._latest
 
     def skip(self) -> None:
         """Leave out a packet, which has a number like all others."""
@@ -237,6 +195,7 @@ class Link:
         return sent
 
 
+DEVICE = "channel"  # of each host
 LONGEST_PACKET = 1 << 16
 AT_ONCE = 32  # packets of one host before the next one has its turn
 REPORT_PERIOD = 0.5  # s between two reports
@@ -265,6 +224,16 @@ def destinations(packet: bytes, sender: int, places: dict[bytes, int]) -> Sequen
         return [place for place in places.values() if place != sender] if packet[9] == _UDP else ()
     place = places.get(packet[16:20])
     return () if place is None or place == sender else (place,)
+
+
+def device_overflow(statistics: int) -> int:
+    """Packets that a host's device has dropped, since the channel did not take them in time."""
+    os.lseek(statistics, 0, os.SEEK_SET)
+    for line in os.read(statistics, 1 << 16).decode().splitlines():
+        name, _, numbers = line.partition(":")
+        if name.strip() == DEVICE:
+            return int(numbers.split()[11])  # of the fields of transmission: bytes, packets, errs, drop
+    return 0
 
 
 class Forwarder:
@@ -322,11 +291,11 @@ class Forwarder:
             link.skip()
             counts.cut += 1
             return
-        fate, due = link.carry(len(packet), now)
+        outcome, due = link.carry(len(packet), now)
         counts.queued = link.waited
-        if fate is Fate.LOST:
+        if outcome is PacketOutcome.LOST:
             counts.lost += 1
-        elif fate is Fate.DROPPED:
+        elif outcome is PacketOutcome.DROPPED:
             counts.dropped += 1
         elif due <= now and not self._waiting:
             self._pass(receiver, packet, due)

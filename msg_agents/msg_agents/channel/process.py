@@ -1,104 +1,206 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The process of the channel: what the run tells it, and its work until the run closes their socket.
+"""The hosts of a channel and its process.
 
-The socket is also its lifeline: it ends with the process that holds the other end, for whatever reason.
+A host is a network namespace with one TUN device, known by descriptors only: when the last process and descriptor of
+one is gone, the kernel removes it with its device, whatever was killed. Linux only. The run hands the hosts to the
+process over a socket, and the process ends when that socket is closed, for whatever reason.
 """
 
 from __future__ import annotations
 
-import contextlib
+import ctypes
+import errno
+import fcntl
 import json
-import math
+import mmap
 import os
 import signal
 import socket
-from collections.abc import Callable, Mapping
+import struct
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
-from msg_agents.channel.channel_file import Channel
-from msg_agents.channel.links import ActiveGraphFile, ChannelCounts, Forwarder, Link, LinkSettings, LossModel, Port
-from msg_agents.channel.namespaces import Host
+from msg_agents.channel.links import DEVICE, ChannelCounts, Forwarder, Link, LinkSettings, LossModel, Port
 from msg_analysis.common.arrays import BoolArray
-from msg_analysis.common.text import counted, percent
+from msg_analysis.errors import NotAvailableError
 
 if TYPE_CHECKING:
-    from msg_analysis.inference.timing import LostMessages
+    from msg_agents.channel.channel_file import Channel
+
+TUN = "/dev/net/tun"
+NETWORK = "10.77.0.0/16"  # in no other namespace: it disturbs no network of this machine
+MASK = "255.255.0.0"
+QUEUE_LENGTH = 10_000  # packets that the kernel keeps until the channel takes them
+_CLONE_NEWNET = 0x40000000  # of linux/sched.h
+_TUNSETIFF = 0x400454CA  # of linux/if_tun.h, like the flags of a device of IP packets without a header before them
+_IFF_TUN, _IFF_NO_PI = 0x0001, 0x1000
+_SIOCGIFFLAGS, _SIOCSIFFLAGS, _SIOCSIFADDR = 0x8913, 0x8914, 0x8916  # of linux/sockios.h
+_SIOCSIFNETMASK, _SIOCSIFMTU, _SIOCSIFTXQLEN = 0x891C, 0x8922, 0x8943
+_IFF_UP = 1
+
+REMEDY = (
+    "run it as root, or in namespaces of your own: `unshare --user --map-root-user --net msg-agents run ...`; "
+    "a container needs --cap-add NET_ADMIN,SYS_ADMIN and --device /dev/net/tun"
+)
 
 
-MOST_Z = 5.0  # of the packets that a pair lost; by chance, any of 1000 pairs is beyond it in 0.06 % of all runs
-SHOWN_PAIRS = 3
+@dataclass(slots=True)
+class Host:
+    """A host, by descriptors; -1: closed."""
+
+    address: str
+    namespace: int  # to be entered by its processes
+    device: int  # IP packets from and to the host
+    statistics: int  # /proc/net/dev of the host
+
+    def close_device(self) -> None:
+        """Leave the device to the process that has a copy of it."""
+        for descriptor in (self.device, self.statistics):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self.device = self.statistics = -1
+
+    def close(self) -> None:
+        """Close all; the host is gone when no process is on it."""
+        self.close_device()
+        os.close(self.namespace)
 
 
-def channel_findings(
-    channel: Mapping[str, Any], unheard: LostMessages | None = None, period_ms: float | None = None
-) -> list[str]:
-    """Sentences about ``channel``, as in the result of a run, and about the messages of its log in real time."""
-    pairs = channel["pairs"]
-    found = [words for pair in pairs if (words := _unlike_the_file(pair))]
-    full = sorted((pair for pair in pairs if pair["dropped"]), key=lambda pair: -pair["dropped"] / pair["sent"])
-    found += [
-        f"{percent(pair['dropped'] / pair['sent'])} of the packets from {pair['sender']} to {pair['receiver']} were "
-        "dropped by the full queue: more traffic than its rate_mbit carries"
-        for pair in full
-    ]
-    left_out = len(found) - SHOWN_PAIRS
-    if left_out > 0:
-        found = [*found[:SHOWN_PAIRS], f"the same is true of {left_out} more of these pairs"]
-    if channel["overflowed"]:
-        found.append(
-            f"{counted(channel['overflowed'], 'packet')} came faster than the channel could take them: it lost more "
-            "than its file says"
-        )
-    late = channel["late_ms"]
-    if late and period_ms and late["mean"] > period_ms / 10:
-        found.append(
-            f"packets were passed on {late['mean']:.1f} ms later than the file says, on average, with a period of "
-            f"{period_ms:.3g} ms: the machine is too busy for this channel"
-        )
-    if unheard is not None and unheard.words():
-        found.append(_messages(channel, unheard))
-    return [f"{words[:1].upper()}{words[1:]}." for words in found]
+def host_address(index: int) -> str:
+    """The IPv4 address of a host, from 0."""
+    return f"10.77.0.{index + 1}"
 
 
-def _unlike_the_file(pair: Mapping[str, Any]) -> str | None:
-    """That a pair lost another share at random than the file says; that is rare where it does what it should."""
-    sent, loss = pair["sent"], pair["loss"]
-    spread = math.sqrt(sent * loss * (1.0 - loss) * pair["inflation"])
-    if abs(pair["lost"] - sent * loss) <= max(MOST_Z * spread, 0.5):
-        return None
-    return (
-        f"{percent(pair['lost'] / sent)} of the {sent} packets from {pair['sender']} to {pair['receiver']} were lost "
-        f"at random, not {percent(loss)}"
-    )
+@contextmanager
+def open_hosts(names: Sequence[str], mtu: int) -> Iterator[dict[str, Host]]:
+    """Make hosts; at the end, this process closes its descriptors. NotAvailableError: rights are missing, or TUN is."""
+    with ExitStack() as stack:
+        hosts = {}
+        for index, name in enumerate(names):
+            hosts[name] = host = _make_host(host_address(index), mtu)
+            stack.callback(host.close)
+        yield hosts
 
 
-def _messages(channel: Mapping[str, Any], unheard: LostMessages) -> str:
-    """Why messages were not heard in time: the losses of the experiment, those of the channel, and the rest."""
-    host = {agent - 1: name for name, host in channel["hosts"].items() for agent in host["agents"]}
-    losses = {(pair["sender"], pair["receiver"]): pair["loss"] for pair in channel["pairs"]}
-    by_channel = by_both = 0.0
-    rows = zip(unheard.links.tolist(), unheard.messages.tolist(), unheard.probability.tolist(), strict=True)
-    for (receiver, sender), messages, probability in rows:
-        loss = losses.get((host[sender], host[receiver]), 0.0)
-        by_channel += messages * (1.0 - probability) * loss
-        by_both += messages * (probability + (1.0 - probability) * loss)
-    share, interval, expected = unheard.share()
-    total = int(unheard.messages.sum())
-    words = (
-        f"of the messages between agents, {percent(share)} ({100 * interval[0]:.3g} to {100 * interval[1]:.3g} %) were "
-        f"not heard in time: the experiment loses {percent(expected)}, the channel {percent(by_channel / total)} more"
-    )
-    if interval[0] > by_both / total:
-        return f"{words}; the others were late or dropped"
-    if interval[1] < by_both / total:
-        return f"{words}; lost messages were sent again in time"
-    return words
+def _make_host(address: str, mtu: int) -> Host:
+    """In a thread, which is then in the new namespace and ends: nothing else of this process moves."""
+    made: list[Host] = []
+    failed: list[OSError] = []
+
+    def make() -> None:
+        try:
+            made.append(_enter_new_host(address, mtu))
+        except OSError as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=make, name="host")
+    thread.start()
+    thread.join()
+    if failed:
+        raise NotAvailableError(f"--channel: {_reason(failed[0])}: {REMEDY}") from failed[0]
+    return made[0]
 
 
-LONGEST = 1 << 16  # bytes of a message that describes a host
+def _reason(error: OSError) -> str:
+    text = error.strerror or str(error)
+    if sys.platform != "linux":
+        return "network namespaces exist on Linux only"
+    if error.filename == TUN:
+        return f"{TUN}: cannot be opened ({text})"
+    if error.errno in (errno.EPERM, errno.EACCES):
+        return f"no right to make network namespaces and TUN devices ({text})"
+    return f"network namespaces or TUN devices cannot be made ({text})"
+
+
+def _enter_new_host(address: str, mtu: int) -> Host:
+    """Move this thread into a new namespace, and set its devices up."""
+    _call("unshare", _CLONE_NEWNET)
+    opened = []
+    try:
+        opened.append(os.open(TUN, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC))
+        fcntl.ioctl(opened[-1], _TUNSETIFF, struct.pack("16sH22x", DEVICE.encode(), _IFF_TUN | _IFF_NO_PI))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
+            _set_up(control, b"lo")
+            for request, value in ((_SIOCSIFADDR, address), (_SIOCSIFNETMASK, MASK)):
+                place = struct.pack("16sHH4s8x", DEVICE.encode(), socket.AF_INET, 0, socket.inet_aton(value))
+                fcntl.ioctl(control, request, place)
+            fcntl.ioctl(control, _SIOCSIFMTU, struct.pack("16si20x", DEVICE.encode(), mtu))
+            with suppress(PermissionError):  # in a user's own namespaces it stays at 500
+                fcntl.ioctl(control, _SIOCSIFTXQLEN, struct.pack("16si20x", DEVICE.encode(), QUEUE_LENGTH))
+            _set_up(control, DEVICE.encode())
+        for file in ("ns/net", "net/dev"):
+            opened.append(os.open(f"/proc/thread-self/{file}", os.O_RDONLY | os.O_CLOEXEC))
+    except OSError:
+        for descriptor in opened:
+            os.close(descriptor)
+        raise
+    device, namespace, statistics = opened
+    return Host(address, namespace, device, statistics)
+
+
+def _set_up(control: socket.socket, device: bytes) -> None:
+    found = fcntl.ioctl(control, _SIOCGIFFLAGS, struct.pack("16sH22x", device, 0))
+    flags = struct.unpack("16sH22x", found)[1]
+    fcntl.ioctl(control, _SIOCSIFFLAGS, struct.pack("16sH22x", device, flags | _IFF_UP))
+
+
+def _call(function: str, *arguments: int) -> None:
+    """Call the C library."""
+    if sys.platform != "linux":
+        raise OSError(errno.ENOSYS, "not on this system")
+    if getattr(ctypes.CDLL(None, use_errno=True), function)(*arguments):
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+def enter(namespace: int) -> None:
+    """Move this process into the network namespace of a descriptor; before it has any thread that uses sockets."""
+    _call("setns", namespace, _CLONE_NEWNET)
+    os.close(namespace)
+
+
+_MODE = struct.Struct("<q")
+
+
+class ActiveGraphFile:
+    """The mode of the active graph, from 0; -1 before the first step, when every packet passes; and a byte per host."""
+
+    def __init__(self, path: Path) -> None:
+        with path.open("r+b") as stream:
+            self._map = mmap.mmap(stream.fileno(), 0)
+
+    @classmethod
+    def create(cls, path: Path, hosts: int) -> Self:
+        """Make the file: mode -1, no host is let through."""
+        path.write_bytes(_MODE.pack(-1) + bytes(hosts))
+        return cls(path)
+
+    @property
+    def mode(self) -> int:
+        """The newest mode that was written."""
+        return int(_MODE.unpack_from(self._map)[0])
+
+    def set_mode(self, mode: int) -> None:
+        """The graph with this mode is active now."""
+        _MODE.pack_into(self._map, 0, mode)
+
+    def lets_through(self, host: int) -> bool:
+        """Whether all packets from and to a host, from 0, pass."""
+        return bool(self._map[_MODE.size + host])
+
+    def let_through(self, host: int, *, all_packets: bool) -> None:
+        """Set whether they do."""
+        self._map[_MODE.size + host] = all_packets
+
+
+LARGEST_MESSAGE = 1 << 16  # bytes of a message that describes a host
 PRIORITY = -10  # a delay is that of the link, not that of the scheduler
 
 
@@ -110,7 +212,7 @@ def hand_over(
     active_graph: Path | None,  # file to read, with ``joined``
     joined: BoolArray | None,
 ) -> None:
-    """Tell a new process of the channel what to do; afterwards the devices are its own."""
+    """Give a new process of the channel its orders; afterwards the devices are its own."""
     orders = {
         "seed": channel.seed,
         "counts": str(counts),
@@ -149,7 +251,7 @@ def _settings_from_json(document: dict[str, Any]) -> LinkSettings:
 def serve(descriptor: int) -> None:
     """Be the channel: ``descriptor`` is its end of the socket. Returns when the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run ends it, after all others
-    with contextlib.suppress(OSError):
+    with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
     with socket.socket(fileno=descriptor) as control:
         received = _receive(control)
@@ -166,7 +268,7 @@ def serve(descriptor: int) -> None:
         counts = Path(orders["counts"])
 
         def report(found: ChannelCounts) -> None:
-            with contextlib.suppress(OSError):  # a full disk, or the run was killed and its folder is gone
+            with suppress(OSError):  # a full disk, or the run was killed and its folder is gone
                 found.write(counts)
 
         Forwarder(ports, links, _gate(orders)).run(descriptor, report)
@@ -176,7 +278,7 @@ def _receive(control: socket.socket) -> tuple[list[Port], dict[str, Any]] | None
     """The hosts, in order, and what to do; None if the run has ended meanwhile."""
     ports: list[Port] = []
     while True:
-        message, descriptors, _, _ = socket.recv_fds(control, LONGEST, 2)
+        message, descriptors, _, _ = socket.recv_fds(control, LARGEST_MESSAGE, 2)
         if not message:
             return None
         document = json.loads(message)

@@ -20,7 +20,7 @@ import click
 
 from msg_agents.environment import LAST_DOMAIN, check_domain, tolerate_warnings
 from msg_agents.nodes.parameters import GIVES_PARAMETERS, PROCESS, given, mention_qos, merge, name_of, options_of
-from msg_agents.run.lifeline import hold_lock
+from msg_agents.run.fork_server import exit_with_lock
 from msg_agents.terminal import exit_on_signals
 from msg_analysis.cli.options import PATH
 
@@ -58,7 +58,7 @@ class RosCommand(click.Command):
         """As in click; without ``--domain``, ROS_DOMAIN_ID is checked first."""
         tolerate_warnings()
         if (folder := ctx.params.pop("lifeline_lock", None)) is not None:
-            hold_lock(folder)
+            exit_with_lock(folder)
         if ctx.params.get("domain") is None:
             check_domain()
         return super().invoke(ctx)

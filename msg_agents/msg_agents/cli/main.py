@@ -216,7 +216,7 @@ def run(
 
         channel = Channel.load(channel_file, what)
     with page(web, web_host) as served:
-        with RunView(what, served, tells_domain=not as_json) as view:
+        with RunView(what, served, prints_domain=not as_json) as view:
             if served is not None:
                 announce(served, web_host, view.note)
             result = run_network(
@@ -315,7 +315,7 @@ def host(
     does; the others end with the run.
     """
     from msg_agents.process_layout import Hosts, this_host
-    from msg_agents.run.folder import workshop
+    from msg_agents.run.folder import temporary_directory
     from msg_agents.run.runner import run_network
     from msg_agents.watch.panel import RunView
     from msg_analysis.common.text import agent_name
@@ -328,10 +328,10 @@ def host(
     if only_profile:
         click.echo(places.profile(what), nl=False)
         return
-    share = places.share(name or this_host(), discovery_timeout=discovery_timeout, patience=patience)
-    mine = show([agent_name(agent + 1, what.names) if what.names else agent + 1 for agent in share.agents])
-    with workshop() as folder, RunView(what) as view:
-        also = " and the recorder" if share.home else ""
+    assignment = places.assignment(name or this_host(), discovery_timeout, patience)
+    mine = show([agent_name(agent + 1, what.names) if what.names else agent + 1 for agent in assignment.agents])
+    with temporary_directory() as folder, RunView(what) as view:
+        also = " and the recorder" if assignment.has_recorder else ""
         view.note(f"this host runs agents {mine}{also} in ROS_DOMAIN_ID {places.domain}")
         result = run_network(
             what,
@@ -343,11 +343,11 @@ def host(
             view=view,
             environment=places.environment(what, folder),
             record=record,
-            share=share,
+            assignment=assignment,
             interruption=interruption,
         )
     finish(result, as_json, interruption=interruption, analyse=not no_analyse, report=write_report, verbose=verbose)
-    if not share.home and not as_json:
+    if not assignment.has_recorder and not as_json:
         click.echo(f"the run has ended: its verdict is on {places.recorder}")
 
 

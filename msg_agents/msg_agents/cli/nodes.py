@@ -18,7 +18,7 @@ from click.shell_completion import CompletionItem
 
 from msg_agents.cli.entry_points import RosCommand
 from msg_agents.environment import DISCOVERY_TIMEOUT
-from msg_agents.run.lifeline import hold_pipe
+from msg_agents.run.fork_server import exit_with_pipe
 from msg_analysis.cli.console import examples
 from msg_analysis.cli.options import (
     PATH,
@@ -33,7 +33,7 @@ from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
     from msg_agents.nodes.base import NetworkNode
-    from msg_agents.stepping.newest_values import ClockOffsets
+    from msg_agents.stepping.monitoring import ClockOffsets
     from msg_analysis.bags.stored_file import Compression
     from msg_analysis.model.run_record import RunRecord
 
@@ -213,9 +213,9 @@ def switcher(
     def tell_channel(file: Path | None) -> Callable[[int], None]:
         if file is None:
             return lambda _: None
-        from msg_agents.channel.links import ActiveGraphFile
+        from msg_agents.channel.process import ActiveGraphFile
 
-        return ActiveGraphFile(file).tell
+        return ActiveGraphFile(file).set_mode
 
     def nodes() -> list[NetworkNode]:
         from msg_agents.nodes.base import ACK_TIMEOUT
@@ -278,18 +278,22 @@ def _run_nodes(
     lifeline: int | None,
     namespace: int | None,
     parameter_services: bool,  # noqa: ARG001  see LeanNode
+    account: Path | None,
+    introduction: int | None,
+    patience: float | None = None,
     **options: Any,  # of ``run_nodes``
 ) -> None:
     if namespace is not None:
-        from msg_agents.channel.namespaces import enter
+        from msg_agents.channel.process import enter
 
         enter(namespace)
     if lifeline is not None:
-        hold_pipe(lifeline)
+        exit_with_pipe(lifeline)
     from msg_agents.nodes.process import run_nodes
 
     executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")
     throughput = record.experiment.run.pace == "lockstep"
+    options |= {"status_file": account, "relay": introduction, "peer_timeout": patience}
     if not run_nodes(nodes, executor=executor, throughput=throughput, **options):
         sys.exit(ExitCode.INCOMPLETE)
 

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Introduces the processes of a run on one machine to each other: those that exchange messages, as soon as they can.
+"""The discovery relay forwards announcements of the processes of a run on one machine to their partners.
 
-Left to itself, every process announces itself to every other, again with every process that it meets, and then tells
-it of each endpoint as it makes them: messages grow with the third power of the processes. So they have a profile
-(introduced.xml) by which they announce themselves only to the numbers of visitors, one of which is taken here. When a
-process has all its endpoints, its announcement is passed on, as it is, to those that it has to do with, and no other
-process of the run ever hears of it. Visitors, such as the user's tools, are introduced to all.
+By default every process announces itself to every other, again with every process that it discovers, and then sends it
+each endpoint as it is made: messages grow with the third power of the processes. So the profile relayed.xml makes them
+announce themselves only at the first participant numbers, one of which is taken here. When a process has all its
+endpoints, its announcement is forwarded unchanged to its partners; other processes of the run never get it. Joining
+participants (the user's tools, for example) are connected to all.
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ import threading
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Self
 
-from msg_agents.discovery.profiles import FIRST_INTRODUCED
 from msg_agents.discovery.rtps import (
     FAST_DDS,
+    FIRST_RELAYED,
     LOOPBACK,
     PREFIX_SIZE,
     Announcement,
@@ -36,19 +35,19 @@ from msg_agents.discovery.rtps import (
     read_announcement,
 )
 
-REPEAT = 10.0  # s after which an announcement is passed on again: it was lost, or a stopped process has been given up
+REPEAT = 10.0  # s after which an announcement is forwarded again: it was lost, or its lease has ended
 FRESH = 10.0  # s for which an announcement is valid; a participant repeats it every 3 s
-PATIENCE = 5.0  # s after which a participant that is not of the run, but has a number like those, is a visitor
+JOINING_AFTER = 5.0  # s after which a participant with a number of the run that reported nothing counts as joining
 PERIOD, LEASE = 3.0, 20  # s between announcements of this program itself, and for which others remember it
 HOST = slice(0, 4)  # the part of a prefix that is the same for all participants of a vendor on a machine
 MOST_KNOWN = 1000  # participants
 LARGEST = 1 << 16  # bytes of a datagram
 
 
-def write_introduction(descriptor: int, name: str, prefix: bytes) -> None:
-    """Tell the introducer, once, that a process is ready: the name of its first node, and the prefix of its GUIDs.
+def report_ready(descriptor: int, name: str, prefix: bytes) -> None:
+    """Report to the relay, once, that a process is ready: the name of its first node, and the prefix of its GUIDs.
 
-    Without a prefix it stays a stranger, who is introduced to all.
+    Without a prefix it counts as a joining participant, which is connected to all.
     """
     with contextlib.suppress(OSError):  # it has gone, and so has the run
         if prefix:
@@ -67,26 +66,36 @@ def _pipe(opened: contextlib.ExitStack) -> tuple[int, int]:
 @dataclass(slots=True)
 class _Known:
     announcement: Announcement
-    first: float  # when it was first heard [s]
-    heard: float  # when it was last heard [s]
-    passed: float = float("-inf")  # when it was last passed on [s]
+    first: float  # when it was first received [s]
+    last: float  # when it was last received [s]
+    forwarded: float = float("-inf")  # when it was last forwarded [s]
 
 
-class Introducer:
-    """A thread that introduces processes to each other; to be used with ``with``, which takes a port for visitors.
+class DiscoveryRelay:
+    """A thread that forwards announcements; a context, which takes a port of the joining participants.
 
-    ``descriptor``: where processes write their introductions (``write_introduction``). OSError: no port is left, or no
-    descriptor.
+    ``descriptor``: where processes report that they are ready (``report_ready``). OSError: no port is left, or no
+    descriptor. The times and ``most_known`` are as the constants of this module.
     """
 
-    def __init__(self, domain: int) -> None:
-        self._domain = domain
+    def __init__(
+        self,
+        domain: int,
+        *,
+        period: float = PERIOD,
+        repeat: float = REPEAT,
+        fresh: float = FRESH,
+        joining_after: float = JOINING_AFTER,
+        most_known: int = MOST_KNOWN,
+    ) -> None:
+        self._domain, self._period, self._repeat, self._fresh = domain, period, repeat, fresh
+        self._joining_after, self._most_known = joining_after, most_known
         self._partners: Mapping[str, Collection[str]] = {}
         self._prefixes: dict[str, bytes] = {}  # of processes that are ready, by name
         self._known: dict[bytes, _Known] = {}  # by prefix
         self._own_prefix: bytes | None = None  # once the machine is known
         self._announced = float("-inf")  # when this program last announced itself [s]
-        self._thread = threading.Thread(target=self._serve, daemon=True, name="introducer")
+        self._thread = threading.Thread(target=self._serve, daemon=True, name="discovery relay")
         self._opened = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
@@ -104,22 +113,20 @@ class Introducer:
         return self
 
     def _bind(self) -> None:
-        for participant in range(FIRST_INTRODUCED):
+        for participant in range(FIRST_RELAYED):
             try:
                 self._socket.bind((LOOPBACK, discovery_port(self._domain, participant)))
             except OSError:
-                if participant == FIRST_INTRODUCED - 1:
+                if participant == FIRST_RELAYED - 1:
                     raise
             else:
                 return
 
-    def introduce(self, partners: Mapping[str, Collection[str]]) -> None:
-        """From now on, introduce these: the names of those that a process exchanges messages with, by its name."""
+    def connect(self, partners: Mapping[str, Collection[str]]) -> None:
+        """From now on, connect these: the names of those that a process exchanges messages with, by its name."""
         self._partners = partners
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         os.write(self._stopped, b".")
         self._thread.join()
         self._opened.close()
@@ -127,40 +134,41 @@ class Introducer:
     def _serve(self) -> None:
         rest = b""
         while True:
-            ready = [key.fileobj for key, _ in self._selector.select(timeout=PERIOD)]
+            ready = [key.fileobj for key, _ in self._selector.select(timeout=self._period)]
             if self._stop in ready:
                 self._leave()
                 return
             if self._socket in ready:
                 with contextlib.suppress(OSError):
-                    self._hear(self._socket.recv(LARGEST))
+                    self._receive(self._socket.recv(LARGEST))
             if self._reports in ready:
                 *lines, rest = (rest + os.read(self._reports, LARGEST)).split(b"\n")
                 for line in lines:
                     self._read_report(line.decode(errors="replace"))
-            if time.monotonic() >= self._announced + PERIOD:
+            if time.monotonic() >= self._announced + self._period:
                 self._announce()
 
     def _announce(self) -> None:
-        """Make visitors announce themselves to this program."""
-        # A visitor answers the first announcement of a process, once, and a process that has just been made may not
-        # hear it: it would not know the visitor for 3 s, which is longer than many runs. So they are made to answer
-        # this program, a participant without endpoints, which tells every process of them as soon as that is ready.
+        """Make joining participants announce themselves to this program."""
+        # A joining participant answers the first announcement of a process, once, and a process that has just been made
+        # may not receive it: it would not know the other for 3 s, which is longer than many runs. So they are made to
+        # answer this program, a participant without endpoints, which forwards their announcements to every process as
+        # soon as that is ready.
         if self._own_prefix is not None:
             self._announced = time.monotonic()
             port = self._socket.getsockname()[1]
             message = announcement_message(self._own_prefix, port, LEASE)
-            self._tell_visitors(message)
+            self._send_to_joining(message)
             announce_here(message, self._domain)
 
     def _leave(self) -> None:
         if self._own_prefix is not None:
             message = disposal_message(self._own_prefix)
-            self._tell_visitors(message)
+            self._send_to_joining(message)
             announce_here(message, self._domain)
 
-    def _tell_visitors(self, datagram: bytes) -> None:
-        for participant in range(FIRST_INTRODUCED):
+    def _send_to_joining(self, datagram: bytes) -> None:
+        for participant in range(FIRST_RELAYED):
             with contextlib.suppress(OSError):  # nobody has that number
                 self._socket.sendto(datagram, (LOOPBACK, discovery_port(self._domain, participant)))
 
@@ -169,60 +177,58 @@ class Introducer:
         with contextlib.suppress(ValueError):
             self._prefixes[name] = bytes.fromhex(prefix)
             if self._prefixes[name] in self._known:
-                self._pass_on(self._known[self._prefixes[name]])
+                self._forward(self._known[self._prefixes[name]])
 
-    def _hear(self, datagram: bytes) -> None:
-        heard = read_announcement(datagram, self._own_prefix)
-        if heard is None:
+    def _receive(self, datagram: bytes) -> None:
+        found = read_announcement(datagram, self._own_prefix)
+        if found is None or found.prefix == self._own_prefix:
             return
-        if not heard.port:
-            self._known.pop(heard.prefix, None)
+        if not found.port:
+            self._known.pop(found.prefix, None)
             return
-        if heard.prefix == self._own_prefix:
-            return
-        if self._own_prefix is None and self._has_number_of_run(heard):
-            self._own_prefix = heard.prefix[HOST] + os.urandom(PREFIX_SIZE - HOST.stop)
+        if self._own_prefix is None and self._has_number_of_run(found):
+            self._own_prefix = found.prefix[HOST] + os.urandom(PREFIX_SIZE - HOST.stop)
         now = time.monotonic()
-        known = self._known.setdefault(heard.prefix, _Known(heard, now, now))
-        known.announcement, known.heard = heard, now
-        if len(self._known) > MOST_KNOWN:
-            del self._known[min(self._known, key=lambda prefix: self._known[prefix].heard)]
-        if now >= known.passed + REPEAT:
-            self._pass_on(known)
+        known = self._known.setdefault(found.prefix, _Known(found, now, now))
+        known.announcement, known.last = found, now
+        if len(self._known) > self._most_known:
+            del self._known[min(self._known, key=lambda prefix: self._known[prefix].last)]
+        if now >= known.forwarded + self._repeat:
+            self._forward(known)
 
     def _has_number_of_run(self, announcement: Announcement) -> bool:
         """Whether it comes from a Fast DDS participant with a number like those of the run."""
-        numbered = announcement.port >= discovery_port(self._domain, FIRST_INTRODUCED)
+        numbered = announcement.port >= discovery_port(self._domain, FIRST_RELAYED)
         return numbered and announcement.vendor == FAST_DDS
 
-    def _visits(self, known: _Known) -> bool:
+    def _is_joining(self, known: _Known) -> bool:
         """Whether a participant is not of the run: has another number, or is not ready for long."""
-        if self._has_number_of_run(known.announcement) and time.monotonic() <= known.first + PATIENCE:
+        if self._has_number_of_run(known.announcement) and time.monotonic() <= known.first + self._joining_after:
             return False
         return known.announcement.prefix not in self._prefixes.values()
 
-    def _pass_on(self, known: _Known) -> None:
-        """Pass an announcement on to those that should know it, and to a process of the run those of the visitors.
+    def _forward(self, known: _Known) -> None:
+        """Forward an announcement to its partners, and to a process of the run those of the joining participants.
 
-        Whoever hears one announces itself to its sender.
+        A participant that receives one announces itself to its sender.
         """
         names = [name for name, prefix in self._prefixes.items() if prefix == known.announcement.prefix]
         if names:
             others = {partner for name in names for partner in self._partners.get(name, ())}
-            for visitor in self._known.values():
-                if self._visits(visitor) and time.monotonic() < visitor.heard + FRESH:
-                    self._send(visitor, names[0])
-        elif self._visits(known):
+            for joining in self._known.values():
+                if self._is_joining(joining) and time.monotonic() < joining.last + self._fresh:
+                    self._send(joining, names[0])
+        elif self._is_joining(known):
             others = set(self._prefixes)
         else:  # a process of the run that is not ready yet
             return
-        known.passed = time.monotonic()
+        known.forwarded = time.monotonic()
         for name in others:
             self._send(known, name)
 
     def _send(self, known: _Known, name: str) -> None:
         """Send an announcement to the process of this name, if that is there."""
         other = self._known.get(self._prefixes.get(name, b""))
-        if other and other is not known and time.monotonic() < other.heard + FRESH:
+        if other and other is not known and time.monotonic() < other.last + self._fresh:
             with contextlib.suppress(OSError):  # it has just gone
                 self._socket.sendto(known.announcement.datagram, (LOOPBACK, other.announcement.port))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""RTPS: domains and their ports, datagrams of discovery, loopback and multicast."""
+"""Discovery by RTPS: profiles of Fast DDS, domains and their ports, datagrams, loopback and multicast."""
 
 from __future__ import annotations
 
@@ -12,14 +12,93 @@ import random
 import socket
 import struct
 import tempfile
-from collections.abc import Iterator
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
-from msg_agents.discovery.profiles import FIRST_INTRODUCED, MOST_INTRODUCED
+from msg_analysis.common.resources import ros_distribution
 from msg_analysis.errors import InputError
+
+
+def has_fast_dds_3(distribution: str) -> bool:
+    """Whether a ROS 2, by its name, comes with Fast DDS 3 or newer: from Kilted on; they are named alphabetically."""
+    return distribution > "jazzy"
+
+
+# Fast DDS 3 refuses a profile with an element that it has renamed, and Fast DDS 2 one with the new name.
+PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")  # old name, new name
+_PLACE = Path(__file__).parent / ("fast_dds_3" if has_fast_dds_3(ros_distribution()) else "")
+LOOPBACK_PROFILE = _PLACE / "loopback.xml"
+MOST_PARTICIPANTS = 100  # that find each other in a domain on one machine: maxInitialPeersRange of loopback.xml
+RELAYED_PROFILE = _PLACE / "relayed.xml"
+FIRST_RELAYED = 32  # participantID of relayed.xml; the numbers below are left to all others
+MOST_RELAYED = 206  # participants that the relay connects: they fill the ports of two domains
+NUMBERS_OF_DOMAIN = 119  # of participants whose ports are those of their domain; from there on, of the next one
+UDP_PROFILE = Path(__file__).with_name("udp.xml")
+
+LEASE = 60.0
+"""s of silence after which a participant on another host counts as gone, and messages on their way to it are lost: the
+longest time for which a host may be cut off."""
+
+ANNOUNCEMENT = 3.0  # s between two announcements of a participant to other hosts
+_NAMESPACE = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
+
+
+def has_profile_for(topic: str) -> bool:
+    """Whether the profile of this process, if there is one, says something of a topic, by its resolved name."""
+    for variable in PROFILE_VARIABLES:
+        with contextlib.suppress(OSError, ET.ParseError):
+            tree = ET.parse(os.environ.get(variable, ""))
+            return tree.find(f".//{{*}}data_writer[@profile_name='{topic}']") is not None
+    return False
+
+
+def domains_for(participants: int) -> int:
+    """How many domains in a row have the ports of so many participants that the relay connects."""
+    return -(-(FIRST_RELAYED + participants) // NUMBERS_OF_DOMAIN)
+
+
+def profile_for_hosts(
+    addresses: Sequence[str] = (),  # of all hosts, at which participants are looked for; empty: by multicast
+    participants: int = MOST_PARTICIPANTS,  # to look for at each address
+    *,
+    lease: float = LEASE,  # s
+) -> str:
+    """A profile, as XML, for participants on several hosts: UDP at all their interfaces."""
+    ET.register_namespace("", _NAMESPACE)
+    tree = ET.parse(LOOPBACK_PROFILE)  # drops its comments, which are about another profile
+
+    def find(path: str) -> ET.Element:
+        found = tree.find(f".//{{*}}{path.replace('/', '/{*}')}")
+        assert found is not None, path
+        return found
+
+    find("maxInitialPeersRange").text = str(participants)
+    find("transport_descriptor").remove(find("interfaceWhiteList"))  # messages go to other hosts
+    for each in find("profiles").findall("./*"):
+        if each.get("profile_name", "").startswith("/"):  # batches stay small: a link that loses parts loses the whole
+            find("profiles").remove(each)
+    discovery = ET.Element(_tag("discovery_config"))
+    find("builtin").insert(0, discovery)
+    for key, seconds in (("leaseDuration", lease), ("leaseAnnouncement", ANNOUNCEMENT)):
+        ET.SubElement(ET.SubElement(discovery, _tag(key)), _tag("sec")).text = f"{seconds:.0f}"
+    peers = find("initialPeersList")
+    peers.clear()
+    for address in addresses:
+        locator = ET.SubElement(ET.SubElement(peers, _tag("locator")), _tag("udpv4"))
+        ET.SubElement(locator, _tag("address")).text = address
+    if not addresses:
+        find("builtin").remove(peers)
+    ET.indent(tree, "  ")
+    return ET.tostring(tree.getroot(), encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _tag(name: str) -> str:
+    return f"{{{_NAMESPACE}}}{name}"
+
 
 DOMAINS = range(1, 102)
 """0 is the default of every ROS program; above 101 the ports are among the ephemeral ports of Linux."""
@@ -51,14 +130,14 @@ def _open_lock(path: Path) -> int:
 
 
 @contextmanager
-def free_domain(count: int = 1) -> Iterator[int]:
+def free_domain(count: int = 1, domains: Sequence[int] = DOMAINS) -> Iterator[int]:
     """Hold a ROS_DOMAIN_ID that no other run holds and whose ports are unused; InputError if there is none.
 
     ``count``: as many in a row, for a network that needs their ports; the first one is its domain. They are held by
     locks on files, which the system releases when this process ends, however it ends.
     """
     busy = domains_with_ports_in_use()
-    free = [domain for domain in DOMAINS if domain not in busy]
+    free = [domain for domain in domains if domain not in busy]
     candidates = [first for first in free if set(range(first, first + count)) <= set(free)]
     random.shuffle(candidates)
     for first in candidates:
@@ -66,13 +145,13 @@ def free_domain(count: int = 1) -> Iterator[int]:
             if all(_lock(domain, locks) for domain in range(first, first + count)):
                 yield first
                 return
-    raise InputError(f"no free ROS domain among {DOMAINS[0]}..{DOMAINS[-1]}: end some runs or give --domain")
+    raise InputError(f"no free ROS domain among {domains[0]}..{domains[-1]}: end some runs or give --domain")
 
 
-def held_domains() -> list[int]:
+def held_domains(domains: Sequence[int] = DOMAINS) -> list[int]:
     """The domains that runs on this machine hold."""
     names = (file.stem.rpartition("_")[2] for file in Path(tempfile.gettempdir()).glob(_lock_name("*")))
-    return sorted(domain for domain in map(int, filter(str.isdecimal, names)) if domain in DOMAINS and is_held(domain))
+    return sorted(domain for domain in map(int, filter(str.isdecimal, names)) if domain in domains and is_held(domain))
 
 
 def is_held(domain: int) -> bool:
@@ -107,7 +186,7 @@ _MAGIC, _HEADER_SIZE = b"RTPS", 20
 FAST_DDS = b"\x01\x0f"  # the vendor (8.3.3.1.3)
 _HEADER = _MAGIC + b"\x02\x03" + FAST_DDS  # version 2.3
 _DATA, _TO_ONE = 0x15, 0x0E  # submessages
-_ANYBODY = bytes(PREFIX_SIZE)  # as the addressee: all that hear it (8.3.7.6)
+_ANYBODY = bytes(PREFIX_SIZE)  # as the addressee: all that receive it (8.3.7.6)
 _LITTLE_ENDIAN, _INLINE_QOS, _WITH_DATA = 0x01, 0x02, 0x04  # flags
 _PARTICIPANT, _PARTICIPANT_WRITER = b"\x00\x00\x01\xc1", b"\x00\x01\x00\xc2"
 _KEY_HASH, _STATUS_INFO, _SENTINEL, _DISCOVERY_LOCATOR = 0x70, 0x71, 0x01, 0x32
@@ -119,18 +198,18 @@ _LATE = 1 << 30  # sequence number: higher than that of any announcement that th
 
 
 def discovery_port(domain: int, participant: int) -> int:
-    """Port at which a participant of this number hears announcements (9.6.1.1)."""
+    """Port at which a participant of this number receives announcements (9.6.1.1)."""
     return PORT_BASE + PORTS_PER_DOMAIN * domain + 10 + 2 * participant
 
 
 def multicast_port(domain: int) -> int:
-    """Port of the group at which all participants of a domain hear announcements (9.6.1.1)."""
+    """Port of the group at which all participants of a domain receive announcements (9.6.1.1)."""
     return PORT_BASE + PORTS_PER_DOMAIN * domain
 
 
 def discovery_ports(domain: int) -> range:
     """Those of all participants that there can be; the last domain has fewer."""
-    first, end = discovery_port(domain, 0), discovery_port(domain, FIRST_INTRODUCED + MOST_INTRODUCED)
+    first, end = discovery_port(domain, 0), discovery_port(domain, FIRST_RELAYED + MOST_RELAYED)
     return range(first, min(end, 1 << 16), 2)
 
 
@@ -139,7 +218,7 @@ class Announcement:
     """What a participant says of itself to those that do not know it yet."""
 
     prefix: bytes  # of its GUID
-    port: int  # at which it hears announcements; 0: it leaves
+    port: int  # at which it receives announcements; 0: it leaves
     datagram: bytes
 
     @property
@@ -206,7 +285,7 @@ def _parameters(body: bytes, position: int) -> Iterator[tuple[int, int, int]]:
 def announcement_message(prefix: bytes, port: int, lease: int) -> bytes:
     """The message by which a participant without endpoints announces itself.
 
-    ``prefix``: of its GUID, 12 bytes. ``port``: of the loopback address, at which it hears others. ``lease``: time [s]
+    ``prefix``: of its GUID, 12 bytes. ``port``: of the loopback address, for announcements of others. ``lease``: s
     without a message after which others forget it.
     """
     locator = struct.pack("<iI12x4s", _UDP_V4, port, socket.inet_aton(LOOPBACK))
@@ -257,7 +336,7 @@ def remove_participant(prefix: bytes, domain: int, *, repeats: int = 3) -> None:
                     sender.sendto(message, place)
 
 
-PATIENCE = 1.0  # s; in the kernel, a message is there at once
+LOOPBACK_TIMEOUT = 1.0  # s; in the kernel, a message is there at once
 WORD = b"msg_agents"
 
 
@@ -289,7 +368,7 @@ def loopback_has_multicast() -> bool:
 
 def _exchange(receiver: socket.socket, address: str) -> None:
     """Send a message over loopback, and receive it; OSError: that was not possible."""
-    receiver.settimeout(PATIENCE)
+    receiver.settimeout(LOOPBACK_TIMEOUT)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(LOOPBACK))
         sender.sendto(WORD, (address, receiver.getsockname()[1]))
@@ -301,12 +380,12 @@ LOOPBACK_INTERFACES = ("lo", "lo0")  # on Linux, elsewhere
 
 
 def announce_here(datagram: bytes, domain: int) -> None:
-    """Send an announcement to the participants on this machine that hear a domain's group at an interface.
+    """Send an announcement to the participants on this machine that receive a domain's group at an interface.
 
-    One of Cyclone DDS has no number by default, and hears of others only there.
+    One of Cyclone DDS has no number by default, and discovers others only there.
     """
     for index, name in socket.if_nameindex():
-        if name in LOOPBACK_INTERFACES:  # the processes of the run hear the group there, and would all answer
+        if name in LOOPBACK_INTERFACES:  # the processes of the run receive the group there, and would all answer
             continue
         with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)

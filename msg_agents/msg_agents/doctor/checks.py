@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from msg_agents.discovery.profiles import INTRODUCED_PROFILE
+from msg_agents.discovery.rtps import RELAYED_PROFILE
 from msg_agents.environment import (
     LOGS_VARIABLE,
     MEMORY,
@@ -225,7 +225,7 @@ def check_middleware() -> Check:
     """Whether that ROS 2 and its middleware can be loaded."""
     name = "middleware"
     wanted = os.environ.get("RMW_IMPLEMENTATION")
-    environment = node_environment(0, INTRODUCED_PROFILE) | other_logs(Path(tempfile.gettempdir()))
+    environment = node_environment(0, RELAYED_PROFILE) | other_logs(Path(tempfile.gettempdir()))
     if found := refusal(name, lambda: require_middleware(environment)):
         return found
     warning = None

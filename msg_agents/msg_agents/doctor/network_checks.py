@@ -8,12 +8,12 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from msg_agents.discovery.profiles import PROFILE_VARIABLES
 from msg_agents.discovery.rtps import (
     DOMAINS,
+    PROFILE_VARIABLES,
     domains_with_ports_in_use,
     free_domain,
     is_held,
@@ -240,7 +240,7 @@ def check_free_domains() -> Check:
     return Check(name, "ok", f"{free} of {len(DOMAINS)}, with their UDP ports{which}", free)
 
 
-OF_SYSTEM = (
+CHECKS: tuple[Callable[[], Check], ...] = (
     checks.check_python,
     checks.check_cores,
     checks.check_clock,
@@ -249,18 +249,8 @@ OF_SYSTEM = (
     checks.check_shared_memory,
     checks.check_logs,
     checks.check_temporary_directory,
-)
-OF_NETWORK = (
-    check_loopback,
-    check_multicast,
-    check_buffers,
-)
-OF_SHELL = (
-    checks.check_rclpy,
-    check_profiles,
-    check_range,
-    check_server,
-    check_peers,
+    *(check_loopback, check_multicast, check_buffers),
+    *(checks.check_rclpy, check_profiles, check_range, check_server, check_peers),
 )
 LATER = (  # each with the checks that it needs to be without an error
     ("middleware", checks.check_middleware, {"rclpy", "temporary_directory"}),
@@ -272,7 +262,7 @@ LATER = (  # each with the checks that it needs to be without an error
 def examine() -> Iterator[Check]:
     """Make one check after the other; the last ones are not tried where an error before says more."""
     failed: set[str] = set()
-    for check in (*OF_SYSTEM, *OF_NETWORK, *OF_SHELL):
+    for check in CHECKS:
         found = check()
         failed |= {found.name} if found.status == "error" else set()
         yield found

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The agent node: one row of the MJLS on topics. What depends on the pace: ``lockstep_agent``, ``realtime_agent``."""
+"""The agent node: one row of the MJLS on topics. What depends on the pace: ``paced_agents``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -21,8 +21,7 @@ from msg_agents.nodes.base import NetworkNode
 from msg_agents.nodes.ros import after
 from msg_agents.process_layout import RECORDER
 from msg_agents.recovery import Checkpoint, entry_size, published_size
-from msg_agents.stepping.stall_detection import StallDetector
-from msg_agents.stepping.synchronizer import TurnQueue
+from msg_agents.stepping.monitoring import StallDetector
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.protocols import ProtocolError
 from msg_analysis.messages import topics
@@ -33,47 +32,13 @@ from msg_analysis.model.agent_law import agent_law
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import Wiring
 
+if TYPE_CHECKING:
+    from msg_agents.nodes.agent_group import AgentGroup
+
 RETURN_TIME = 2.0  # s for which states are not repeated yet, because a reader is missing
 RETURN_POLL = 0.02  # s
 PASSIVE_GRACE = 0.3  # s that a reader with best effort has for the last state before its writer leaves
 ANSWER_PERIOD = 0.5  # s between two repetitions of states for peers
-
-
-class Group(Protocol):
-    """What an agent needs from the agents of its process together: see AgentGroup."""
-
-    turns: TurnQueue
-    progress_period: float
-
-    def record_state(self, message: bytes) -> None:
-        """See AgentGroup."""
-
-    def record_truth(self, message: bytes) -> None:
-        """See AgentGroup."""
-
-    def record_contradiction(self, message: bytes, state: bytes) -> None:
-        """See AgentGroup."""
-
-    def send_batches(self) -> None:
-        """See AgentGroup."""
-
-    def missing_recorder(self) -> list[str]:
-        """See AgentGroup."""
-
-    def report(self, agent: int, step: int) -> None:
-        """See AgentGroup."""
-
-    def ask_again(self, agent: int, step: int) -> None:
-        """See AgentGroup."""
-
-    def reached(self) -> frozenset[str]:
-        """See AgentGroup."""
-
-    def hears_all(self) -> bool:
-        """See AgentGroup."""
-
-    def fail(self, error: Exception) -> None:
-        """See AgentGroup."""
 
 
 class Agent(NetworkNode):
@@ -83,8 +48,8 @@ class Agent(NetworkNode):
     part of it), the exact one is published on ``truth``, for the log and the live node.
     """
 
-    hears: Qos | None = None  # of its subscriptions to the states of others; None: that of the topic
-    hears_batches = False  # whether it may hear them by the batches of their processes instead
+    state_qos: Qos | None = None  # of its subscriptions to the states of others; None: that of the topic
+    reads_batches = False  # whether it may receive them in the batches of their processes instead
 
     def __init__(
         self,
@@ -92,11 +57,11 @@ class Agent(NetworkNode):
         record: RunRecord,
         model: Wiring,
         agent: int,  # index from 0
-        peers: Sequence[int],  # every other agent that it hears or is heard by at any time, ascending
-        colleagues: Collection[int],  # agents of its process, itself included
+        peers: Sequence[int],  # every other agent that it exchanges states with at any time, ascending
+        local_agents: Collection[int],  # agents of its process, itself included
         readers: Sequence[str],  # other nodes that must read the states before the run starts
         checkpoints: Path | None,  # directory of the published states, from which it resumes after a restart
-        group: Group,
+        group: AgentGroup,
     ) -> None:
         super().__init__(agent_node_name(agent), record=record)
         experiment = record.experiment
@@ -113,24 +78,24 @@ class Agent(NetworkNode):
         self._group = group
         self._inputs = [self._law.neighbours(mode) for mode in range(model.modes)]
         self._peers = list(peers)
-        near = set(peers).intersection(colleagues)
-        self.far = [j for j in peers if j not in near]
-        self._near = [j for j in peers if j in near]
+        local = set(peers).intersection(local_agents)
+        self.remote = [j for j in peers if j not in local]
+        self._local = [j for j in peers if j in local]
         self._listeners: list[Callable[[int, int, int, bytes, bytes], str | None]] = []
-        self._peer_names = list(map(agent_node_name, self.far))
+        self._peer_names = list(map(agent_node_name, self.remote))
         # The recorder reads the batches of the process instead, and in the middle of a run none of these is awaited.
         self._others = [name for name in readers if name != RECORDER and self._resumed is None]
         self._next_progress = 0.0
         self._reported = -1  # step of the last report
         self._stall = StallDetector()
-        self._far_states: list[Subscription] = []
+        self._remote_states: list[Subscription] = []
         self._last_sent = 0.0  # time at which the last state was sent [s of the monotonic clock]
-        self._owed: int | None = None  # step from which on states are to be repeated
+        self._repeat_from: int | None = None  # step from which on states are to be repeated
         self._answered = -ANSWER_PERIOD  # time at which they were repeated last [s of the monotonic clock]
         self._states = self.publisher_of(topics.STATE, agent)
-        self._truth: Publisher | None = None
+        self._exact: Publisher | None = None
         if experiment.truth:
-            self._truth = self.publisher_of(topics.TRUTH, agent)
+            self._exact = self.publisher_of(topics.TRUTH, agent)
 
     @property
     def number(self) -> int:
@@ -152,14 +117,14 @@ class Agent(NetworkNode):
             "start": self._law.step,
         }
 
-    def connect(self, colleagues: Mapping[int, Agent]) -> None:
+    def connect(self, local_agents: Mapping[int, Agent]) -> None:
         """Connect to the peers in this process (by index) by direct calls."""
-        self._listeners = [colleagues[j].hear for j in self._near]
+        self._listeners = [local_agents[j].receive for j in self._local]
 
-    def subscribe_to_far(self) -> None:
+    def subscribe_to_remote(self) -> None:
         """Connect to the peers in other processes by their topics."""
-        for j in self.far:
-            self._far_states.append(self.subscribe(topics.STATE, self._receiver(j), agent=j, qos=self.hears))
+        for j in self.remote:
+            self._remote_states.append(self.subscribe(topics.STATE, self._receiver(j), agent=j, qos=self.state_qos))
 
     def create_shared(self, agents: Sequence[Agent]) -> None:
         """Create what a process needs only once. Called on its first agent, with all its agents."""
@@ -167,7 +132,8 @@ class Agent(NetworkNode):
     def discovered_all(self) -> bool:
         """See NetworkNode. One that comes back will ask for messages at once, so it must be ready for them."""
         if self.resumed and not (
-            all(states.get_publisher_count() for states in self._far_states) and self._group.hears_all()
+            all(states.get_publisher_count() for states in self._remote_states)
+            and self._group.links.batches_discovered()
         ):
             return False
         expected = self._awaited() + self._others
@@ -179,13 +145,13 @@ class Agent(NetworkNode):
 
     def _awaited(self) -> list[str]:
         """Names of the peers that must read its topic: not those that its batches reach."""
-        reached = self._group.reached()
+        reached = self._group.links.reached()
         return [name for name in self._peer_names if name not in reached] if reached else self._peer_names
 
     def finish(self, *, complete: bool, deadline: float) -> None:
         """See NetworkNode. Waits only for readers outside the run: at the end, those of the run have everything."""
         self._group.send_batches()
-        for writer in (self._states, self._truth) if complete else ():
+        for writer in (self._states, self._exact) if complete else ():
             if writer is None:
                 continue
             if self.has_other_readers(writer):
@@ -196,19 +162,19 @@ class Agent(NetworkNode):
     def begin(self) -> None:
         """Publish x(0); after a takeover, repeat what others may have missed, and ask the peers to repeat theirs."""
         if self._published.found:
-            # All that is kept, for the recorder and for readers outside the run; peers have what is older.
-            self._repeat(0, heard_since=0 if self.has_other_readers(self._states) else self._missed_since())
-            self._ask_again(self.far)
+            # All stored states, for the recorder and for readers outside the run; peers have what is older.
+            self._repeat(0, peers_since=0 if self.has_other_readers(self._states) else self._first_missed())
+            self._request_states(self.remote)
         if not self._law.step:
             self._publish_state(0)
         self._report()
 
     def rejoin(self) -> bool:
-        """See NetworkNode. All that is kept goes to the recorder again, and what peers may lack to them."""
+        """See NetworkNode. All stored states go to the recorder again, and what peers may lack to them."""
         if self._group.missing_recorder():
             return False
-        self._repeat(0, heard_since=self._missed_since())
-        self._ask_again(self.far)
+        self._repeat(0, peers_since=self._first_missed())
+        self._request_states(self.remote)
         return True
 
     def _take_over(self) -> bytes | None:
@@ -228,12 +194,12 @@ class Agent(NetworkNode):
 
     def _publish_state(self, mode: int) -> None:
         law = self._law
-        self._keep_and_send(mode, self._codec.wrap(law.step, mode, law.state, law.heard))
+        self._store_and_send(mode, self._codec.wrap(law.step, mode, law.state, law.heard))
 
-    def _keep_and_send(self, mode: int, message: bytes) -> None:
+    def _store_and_send(self, mode: int, message: bytes) -> None:
         """Publish the newest state, when it is in the checkpoint."""
         law = self._law
-        value = law.published(law.step, law.state) if self._truth is not None else b""
+        value = law.published(law.step, law.state) if self._exact is not None else b""
         self._published.write(law.step, message + value)
         self._send(law.step, mode, law.state, message, value)
 
@@ -242,21 +208,22 @@ class Agent(NetworkNode):
         length = len(entry) - self._beside
         return entry[:length], entry[length:]
 
-    def _send(self, step: int, mode: int, state: bytes, message: bytes, value: bytes, *, heard: bool = True) -> None:
-        """Publish a state: exactly on ``truth``, if there is one, and to the others as they hear it, ``value``.
+    def _send(self, step: int, mode: int, state: bytes, message: bytes, value: bytes, *, to_peers: bool = True) -> None:
+        """Publish a state: exactly on ``truth``, if that topic is used, and to the others what they receive, ``value``.
 
-        Without ``heard``, to the recorder only.
+        Without ``to_peers``, to the recorder only.
         """
-        if self._truth is not None:
-            if heard:
-                self.publish(self._truth, message)
-            self._group.record_truth(message)
+        if self._exact is not None:
+            if to_peers:
+                self.publish(self._exact, message)
+            assert self._group.exact_states is not None
+            self._group.exact_states.add(message)
             message, state = with_state(message, value, len(state)), value
-        if heard:
+        if to_peers:
             self.publish(self._states, message)
-        self._group.record_state(message)
-        for hear in self._listeners if heard else ():
-            hear(self._law.agent, step, mode, state, message)
+        self._group.states.add(message)
+        for receive in self._listeners if to_peers else ():
+            receive(self._law.agent, step, mode, state, message)
         if step == self._last:
             self._last_sent = time.monotonic()
             self._group.send_batches()
@@ -266,49 +233,49 @@ class Agent(NetworkNode):
         """See NetworkNode. It goes on from a state that an earlier process published."""
         return self._resumed is not None
 
-    def send_again(self, since: int) -> None:
+    def resend(self, since: int) -> None:
         """Repeat the states from step ``since`` on, for a peer that may have missed them, once all readers are there.
 
         One that has come back, and asks, may not have been matched yet. Requests are latched, and may be old. In a
-        dense network that has stood still, many ask: they are answered together.
+        dense network after a stall, many ask: they are answered together.
         """
-        since = max(since, self._missed_since())
-        if self._owed is not None:
-            self._owed = min(self._owed, since)
+        since = max(since, self._first_missed())
+        if self._repeat_from is not None:
+            self._repeat_from = min(self._repeat_from, since)
             return
-        self._owed = since
-        self._send_owed(time.monotonic() + RETURN_TIME)
+        self._repeat_from = since
+        self._repeat_when_ready(time.monotonic() + RETURN_TIME)
 
-    def _send_owed(self, deadline: float) -> None:
+    def _repeat_when_ready(self, deadline: float) -> None:
         now = time.monotonic()
         too_soon = now < self._answered + ANSWER_PERIOD
         if too_soon or (now < deadline and not self.has_readers(self._states, self._awaited())):
-            after(self, RETURN_POLL, partial(self._send_owed, deadline))
+            after(self, RETURN_POLL, partial(self._repeat_when_ready, deadline))
             return
         self._answered = now
-        since, self._owed = self._owed, None
+        since, self._repeat_from = self._repeat_from, None
         assert since is not None
         self._repeat(since)
 
-    def _repeat(self, since: int, heard_since: int = 0) -> None:
-        """Repeat the kept states from step ``since`` on, as they were published.
+    def _repeat(self, since: int, peers_since: int = 0) -> None:
+        """Repeat the stored states from step ``since`` on, as they were published.
 
-        Those before ``heard_since`` go to the recorder only.
+        Those before ``peers_since`` go to the recorder only.
         """
         for step, entry in self._published.read(since):
             message, value = self._parts(entry)
             frame = self._whole.unwrap(message)
             assert frame is not None, "written by this software"
-            self._send(step, frame[2], frame[3], message, value, heard=step >= heard_since)
+            self._send(step, frame[2], frame[3], message, value, to_peers=step >= peers_since)
         self._group.send_batches()
 
-    def _ask_again(self, agents: Sequence[int]) -> None:
+    def _request_states(self, agents: Sequence[int]) -> None:
         """Ask those of these agents that are in other processes for states that may have been missed."""
         for j in agents:
-            if j not in self._near:
-                self._group.ask_again(j, self._missed_since())
+            if j not in self._local:
+                self._group.request_states(j, self._first_missed())
 
-    def _missed_since(self) -> int:
+    def _first_missed(self) -> int:
         """The first step whose state a peer may still need after a restart, of this agent or of itself."""
         raise NotImplementedError
 
@@ -316,10 +283,10 @@ class Agent(NetworkNode):
         """The callback for a peer's states."""
         topic = topics.STATE.of(peer)
         return state_receiver(
-            self.record, peer, self._frame, self.hear, lambda reason: self.refuse(reason, topic), possible=True
+            self.record, peer, self._frame, self.receive, lambda reason: self.refuse(reason, topic), possible=True
         )
 
-    def hear(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:
+    def receive(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:
         """Take x_peer(step), from a topic or a direct call; the reason if refused, else None. ``peer``: from 0."""
         raise NotImplementedError
 

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The states of the agents of a process on their way to the recorder: few messages with many states each.
+"""The agents of a process: states pass directly between them, and in batches to the recorder.
 
-Processes that hear most of a network read them, too: see ``batch_links``.
+A batch is a message with many states. Processes that need most of the states of a network read them, too.
 """
 
 from __future__ import annotations
@@ -17,12 +17,10 @@ from pathlib import Path
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
-from msg_agents.discovery.profiles import has_profile_for
-from msg_agents.discovery.rtps import PREFIX_SIZE
+from msg_agents.discovery.rtps import PREFIX_SIZE, has_profile_for
 from msg_agents.nodes.agent import Agent
 from msg_agents.nodes.base import NOT_AN_AGENT, NetworkNode
-from msg_agents.nodes.lockstep_agent import LockstepAgent
-from msg_agents.nodes.realtime_agent import RealtimeAgent
+from msg_agents.nodes.paced_agents import LockstepAgent, RealtimeAgent
 from msg_agents.nodes.ros import every
 from msg_agents.process_layout import RECORDER
 from msg_agents.stepping.synchronizer import TurnQueue
@@ -80,32 +78,32 @@ class StateBatches:
 
 ONLY_TOPICS = "MSG_AGENTS_ONLY_TOPICS"  # variable that turns this off where it is set, for comparison
 FEWEST = 16
-"""Agents of other processes that a process must hear to read batches: below, it reads a topic of each, which is seen in
-the ROS graph, and costs little."""
+"""Agents of other processes whose states a process must need to read batches: below, it reads a topic of each, which is
+seen in the ROS graph, and costs little."""
 
 FRESH = 0.02  # s for which what was found out about other processes is not looked up again
 
 
 @dataclass(frozen=True, slots=True)
 class Listener:
-    """An agent of this process that hears one of another process."""
+    """An agent of this process that receives the states of one of another process."""
 
-    hear: Callable[[int, int, int, bytes, bytes], str | None]  # see ``Agent.hear``
+    receive: Callable[[int, int, int, bytes, bytes], str | None]  # see ``Agent.receive``
     refuse: Callable[[str, str], None]  # see ``NetworkNode.refuse``
 
 
-def hears_most(far: int, others: int) -> bool:
-    """Whether a process that hears ``far`` of ``others`` agents in other processes is to read the batches of all.
+def reads_most(remote: int, others: int) -> bool:
+    """Whether a process that needs ``remote`` of ``others`` agents in other processes is to read the batches of all.
 
     It then reads at most twice as many states as it needs, in as many messages as there are processes.
     """
-    return far >= FEWEST and 2 * far > others and ONLY_TOPICS not in os.environ
+    return remote >= FEWEST and 2 * remote > others and ONLY_TOPICS not in os.environ
 
 
 class BatchLinks:
-    """Of one process, on the node ``host``: whom it hears by batches, and who hears it by the batches it publishes.
+    """Of one process, on the node ``host``: whose batches it reads, and which processes read those it publishes.
 
-    Processes are told apart by the GUIDs of their endpoints, since other nodes do not say which agents they run with.
+    Processes are distinguished by the GUIDs of their endpoints: nodes do not publish which agents they run with.
     """
 
     def __init__(self, host: NetworkNode, publisher: Publisher, agents: Iterable[int]) -> None:
@@ -117,13 +115,13 @@ class BatchLinks:
         self._graphs = len(host.record.experiment.graph_list)
         self._listeners: Mapping[int, Sequence[Listener]] = {}
         self._subscription: Subscription | None = None
-        self.heard = False  # whether agents of other processes have ever been found to hear this one by batches
+        self.read = False  # whether another process has ever been found to read the batches of this one
         self._reached: frozenset[str] = frozenset()
         self._looked = -FRESH
 
     def listen(self, listeners: Mapping[int, Sequence[Listener]]) -> bool:
-        """Hear these agents (indices from 0) by batches, if that pays; otherwise False."""
-        if not hears_most(len(listeners), len(self._others)):
+        """Read the states of these agents (indices from 0) in batches, if that pays; otherwise False."""
+        if not reads_most(len(listeners), len(self._others)):
             return False
         self._listeners = listeners
         self._subscription = self._host.subscribe(STATES, self._receive)
@@ -135,7 +133,7 @@ class BatchLinks:
         if len(self._others) >= FEWEST and now >= self._looked + FRESH:
             self._looked = now
             self._reached = self._find_reached()
-            self.heard = self.heard or bool(self._reached)
+            self.read = self.read or bool(self._reached)
         return self._reached
 
     def _find_reached(self) -> frozenset[str]:
@@ -145,8 +143,8 @@ class BatchLinks:
             return frozenset()
         return frozenset(agent_node_name(i) for i in self._others if self._runs_in(i, processes))
 
-    def hears_all(self) -> bool:
-        """Whether all processes that are to be heard by batches, if any, have been discovered."""
+    def batches_discovered(self) -> bool:
+        """Whether all processes whose batches are to be read, if any, have been discovered."""
         if self._subscription is None:
             return True
         writers = self._host.get_publishers_info_by_topic(self._publisher.topic_name)
@@ -187,7 +185,7 @@ class BatchLinks:
         topic = self._names[number - 1]
         fault = fault_of(step, mode, state, self._graphs)
         for listener in listeners:
-            reason = fault or listener.hear(number - 1, step, mode, state, message)
+            reason = fault or listener.receive(number - 1, step, mode, state, message)
             if reason:
                 listener.refuse(reason, topic)
 
@@ -224,20 +222,21 @@ class AgentGroup:
                 model=model,
                 agent=i,
                 peers=[int(j) for j in exchanges[i].nonzero()[0]],
-                colleagues=agents,
+                local_agents=agents,
                 readers=readers,
                 checkpoints=checkpoints,
                 group=self,
             )
         self.nodes = list(self._agents.values())  # in the order of ``agents``
         self._host = self.nodes[0]
-        self._states = StateBatches(self._host, topics.STATES)
-        self._links = BatchLinks(self._host, self._states.publisher, agents)
+        self.states = StateBatches(self._host, topics.STATES)  # as other agents receive them
+        self.links = BatchLinks(self._host, self.states.publisher, agents)
         self._connect()
         self._host.create_shared(self.nodes)
         self._progress = self._host.publisher_of(topics.PROGRESS)
         self._awaits_recorder = RECORDER in readers
-        self._truths = StateBatches(self._host, topics.TRUTHS) if record.experiment.truth else None
+        exact = record.experiment.truth  # whether the exact states are others
+        self.exact_states = StateBatches(self._host, topics.TRUTHS) if exact else None
         self._resend: Publisher | None = None
         self._sending = False  # whether ``_send_states`` will be called
         self._asked: dict[int, int] = {}  # agents (from 0) that are to be asked for their states from a step on
@@ -253,20 +252,20 @@ class AgentGroup:
         listeners: dict[int, list[Listener]] = {}
         for agent in self.nodes:
             agent.connect(self._agents)
-            for j in agent.far:
-                listeners.setdefault(j, []).append(Listener(agent.hear, agent.refuse))
-        if not (self._host.hears_batches and self._links.listen(listeners)):
+            for j in agent.remote:
+                listeners.setdefault(j, []).append(Listener(agent.receive, agent.refuse))
+        if not (self._host.reads_batches and self.links.listen(listeners)):
             for agent in self.nodes:
-                agent.subscribe_to_far()
+                agent.subscribe_to_remote()
 
     def _end_turns(self) -> None:
-        if self._links.heard and not self._sending:  # other processes wait for these states
+        if self.links.read and not self._sending:  # other processes wait for these states
             self._sending = True
             self._defer(self._send_states)  # after what has come meanwhile, which may let others step
 
     def _send_states(self) -> None:
         self._sending = False
-        self._states.send()
+        self.states.send()
 
     def _defer(self, callback: Callable[[], None]) -> None:
         self._host.executor.create_task(callback)
@@ -276,26 +275,17 @@ class AgentGroup:
         for agent in self.nodes:
             agent.fail(error)
 
-    def record_state(self, message: bytes) -> None:
-        """Send a state as other agents hear it to the recorder."""
-        self._states.add(message)
-
-    def record_truth(self, message: bytes) -> None:
-        """Send the exact state, where that is another one."""
-        assert self._truths is not None
-        self._truths.add(message)
-
     def record_contradiction(self, message: bytes, state: bytes) -> None:
-        """Tell the recorder that an agent has heard two states of one step, this message and another ``state``.
+        """Send the recorder both states of one step that an agent has received: this message, and another ``state``.
 
-        One of them is forged, and nobody can know which: in the bag are both, so that nothing is concluded from them.
+        One of them is forged, and nobody can know which: with both in the bag, the step counts as missing.
         """
-        self._states.add(with_state(message, state))
-        self._states.add(message)
+        self.states.add(with_state(message, state))
+        self.states.add(message)
 
     def send_batches(self) -> None:
         """Send to the recorder at once what has been collected for it."""
-        for batches in (self._states, self._truths):
+        for batches in (self.states, self.exact_states):
             if batches is not None:
                 batches.send()
 
@@ -303,14 +293,14 @@ class AgentGroup:
         """The recorder, if it is awaited and has not been discovered."""
         if not self._awaits_recorder:
             return []
-        return self._states.missing_nodes() + (self._truths.missing_nodes() if self._truths else [])
+        return self.states.missing_nodes() + (self.exact_states.missing_nodes() if self.exact_states else [])
 
     def report(self, agent: int, step: int) -> None:
         """Tell the switcher which step an agent (index from 0) has reached."""
         self._host.publish(self._progress, self._host.progress(topics.PROGRESS, agent + 1, step))
 
-    def ask_again(self, agent: int, step: int) -> None:
-        """Ask an agent of another process (index from 0) for its states from a step on, once for all that hear it."""
+    def request_states(self, agent: int, step: int) -> None:
+        """Ask an agent of another process (index from 0) for its states from a step on, once for all that need it."""
         if not self._asked:
             self._defer(self._send_requests)
         self._asked[agent] = min(step, self._asked.get(agent, step))
@@ -319,19 +309,11 @@ class AgentGroup:
         asked, self._asked = self._asked, {}
         if self._resend is None:  # rarely needed; latched, so a late discovery only takes its time
             self._resend = self._host.publisher_of(topics.RESEND)
-        if hears_most(len(asked), self._host.record.experiment.agents - len(self.nodes)):
+        if reads_most(len(asked), self._host.record.experiment.agents - len(self.nodes)):
             self._host.publish(self._resend, self._host.progress(topics.RESEND, NOT_AN_AGENT, min(asked.values())))
             return
         for agent, step in asked.items():
             self._host.publish(self._resend, self._host.progress(topics.RESEND, agent + 1, step))
-
-    def reached(self) -> frozenset[str]:
-        """Names of the agents of other processes that hear those of this one by batches."""
-        return self._links.reached()
-
-    def hears_all(self) -> bool:
-        """Whether all processes that this one hears by batches have been discovered."""
-        return self._links.hears_all()
 
     def _receive_resend(self, data: bytes) -> None:
         request = self._host.decode_progress(data, topics.RESEND)
@@ -339,7 +321,7 @@ class AgentGroup:
             return
         for agent in self.nodes:
             if request.agent in (NOT_AN_AGENT, agent.number):
-                agent.send_again(request.step)
+                agent.resend(request.step)
 
     def _receive_stop(self, data: bytes) -> None:
         stop = self._host.decode_progress(data, topics.STOP)

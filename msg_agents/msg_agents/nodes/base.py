@@ -1,29 +1,30 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What all nodes of a network share."""
+"""What all nodes of a network have in common: messages of their run, discovery, health, presence of their peers."""
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import TypeVar
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.duration import Duration
-from rclpy.node import NodeNameNonExistentError
+from rclpy.node import Node, NodeNameNonExistentError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.task import Future
 
 from msg_agents.environment import discovery_scope
-from msg_agents.nodes.diagnostics import Health
-from msg_agents.nodes.ros import LeanNode, every
+from msg_agents.nodes.ros import LeanNode, every, until_shutdown
 from msg_agents.process_layout import RECORDER, SWITCHER
+from msg_agents.run.result import write_status
 from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.errors import InputError
 from msg_analysis.messages import topics
@@ -32,39 +33,35 @@ from msg_analysis.messages.messages import ActiveGraph, Progress
 from msg_analysis.messages.topics import Topic, agent_node_name
 from msg_analysis.model.run_record import RunRecord
 
-SIGEV_THREAD = 2  # of <signal.h>: the C library calls a function in a thread of its own
+DIAGNOSTICS_PERIOD = 1.0  # s
+CLOCK_BOUND = "clock ahead of the switcher's by at most [ms]"  # a value of agents in real time
 
 
-class _Event(ctypes.Structure):
-    """``struct sigevent`` of Linux, 64 bytes."""
+@dataclass(slots=True)
+class Health:
+    """The health of a node."""
 
-    _fields_ = (
-        ("value", ctypes.c_void_p),
-        ("signal", ctypes.c_int),
-        ("notify", ctypes.c_int),
-        ("function", ctypes.c_void_p),
-        ("attributes", ctypes.c_void_p),
-        ("padding", ctypes.c_byte * 32),
-    )
+    message: str  # one line
+    waiting: bool = False  # cannot continue, or cannot keep up, at present
+    values: dict[str, str] = field(default_factory=dict)
 
+    def to_status(self, node: Node, refused: Mapping[tuple[str, str], int], repeated: int) -> DiagnosticStatus:
+        """The diagnostic message about a node; ``refused`` counts messages by (topic, reason).
 
-def exit_after(seconds: int) -> None:
-    """End this process with exit code 0 in so many seconds, unless it has ended by then.
-
-    Neither the interpreter's lock nor the interpreter is needed. C libraries without such timers do nothing.
-    """
-    library = ctypes.CDLL(None, use_errno=True)
-    if not hasattr(library, "timer_create"):
-        return
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(AttributeError, OSError, ValueError):  # there is none, or nobody reads it any more
-            stream.flush()
-    function = ctypes.cast(library._exit, ctypes.c_void_p)
-    event = _Event(notify=SIGEV_THREAD, function=function.value)  # its value, 0, is what _exit is called with
-    timer = ctypes.c_void_p()
-    in_time = (ctypes.c_long * 4)(0, 0, seconds, 0)  # interval and time to the end, each in s and ns
-    if library.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0:
-        library.timer_settime(timer, 0, in_time, None)
+        Refused messages are a warning: other nodes publish on the topics of the run.
+        """
+        warn = self.waiting or bool(refused)
+        counts = {f"refused on {topic}: {reason}": str(count) for (topic, reason), count in refused.items()}
+        values = self.values | counts
+        if repeated:
+            values[Refusal.REPEATED] = str(repeated)
+        return DiagnosticStatus(
+            level=DiagnosticStatus.WARN if warn else DiagnosticStatus.OK,
+            name=f"{node.get_fully_qualified_name().lstrip('/')}: network",
+            message=self.message,
+            hardware_id="",
+            values=[KeyValue(key=key, value=value) for key, value in values.items()],
+        )
 
 
 ACK_TIMEOUT = 4.0  # s for readers to acknowledge the last messages; more than Fast DDS's default heartbeat period, 3 s
@@ -264,8 +261,39 @@ class NetworkNode(LeanNode):
         return missing
 
 
+class HealthReporter:
+    """Publishes the health of all nodes of a process once a second, and writes its status file.
+
+    The nodes need a method ``health() -> Health`` and the counters ``refused`` and ``repeated``.
+    """
+
+    def __init__(self, nodes: Sequence[LeanNode], status_file: Path | None = None) -> None:
+        self._nodes = nodes
+        self._status_file = status_file
+        self._waiting: dict[str, str] = {}
+        self._publisher = nodes[0].publisher_of(topics.DIAGNOSTICS)
+        every(nodes[0], DIAGNOSTICS_PERIOD, self._report)
+
+    def _report(self) -> None:
+        healths = [(node, node.health()) for node in self._nodes]
+        array = DiagnosticArray(
+            status=[health.to_status(node, node.refused, node.repeated) for node, health in healths]
+        )
+        array.header.stamp = self._nodes[0].get_clock().now().to_msg()
+        with until_shutdown(self._nodes[0]):
+            self._publisher.publish(array)
+        self._waiting = {node.get_name(): health.message if health.waiting else "" for node, health in healths}
+        self.write_status_file()
+
+    def write_status_file(self) -> None:
+        """Write the status file atomically, if there is one."""
+        if self._status_file is not None:
+            refused = [(node.get_name(), *what, count) for node in self._nodes for what, count in node.refused.items()]
+            write_status(self._status_file, refused, self._waiting)
+
+
 CHECK_PERIOD = 1.0  # s between two checks
-FAREWELL = 2.0  # s that the others have to acknowledge that this process leaves
+SHUTDOWN_TIMEOUT = 2.0  # s that the others have to acknowledge that this process leaves
 
 
 class PeersLostError(InputError):
@@ -273,16 +301,16 @@ class PeersLostError(InputError):
 
 
 class PeerPresence:
-    """Ends the process of some nodes when one of the required peers of the first has been gone for ``patience`` s.
+    """Ends the process of some nodes when one of the required peers of the first has been gone for ``timeout`` s.
 
-    A peer is gone when it has left the network or its lease has ended; ``patience`` allows for a restart. One that has
+    A peer is gone when it has left the network or its lease has ended; the timeout allows for a restart. One that has
     said that it leaves does not come back. (RTPS says that once, best effort, so it is not enough.)
     """
 
     # On one machine the supervisor ends all processes when one is lost; across hosts nothing else does.
 
-    def __init__(self, nodes: Sequence[NetworkNode], patience: float) -> None:
-        self._nodes, self._node, self._patience = nodes, nodes[0], patience
+    def __init__(self, nodes: Sequence[NetworkNode], timeout: float) -> None:
+        self._nodes, self._node, self._timeout = nodes, nodes[0], timeout
         self._since: dict[str, float] = {}  # monotonic time [s] since which a peer is gone, by name
         self._left: set[str] = set()  # names that have said that they leave
         self._returning: list[NetworkNode] = []  # nodes of this process that have to make good what was missed
@@ -298,13 +326,13 @@ class PeerPresence:
         numbers = {node.number for node in self._nodes}
         for number in numbers:
             self._node.publish(self._publisher, self._node.progress(topics.LEAVE, number, 0))
-        self._publisher.wait_for_all_acked(Duration(seconds=FAREWELL))
+        self._publisher.wait_for_all_acked(Duration(seconds=SHUTDOWN_TIMEOUT))
 
     def _receive(self, data: bytes) -> None:
         message = self._node.decode_progress(data, topics.LEAVE)
         if message is not None:
-            of_home = message.agent == NOT_AN_AGENT  # where one of them is, the other is, too
-            self._left |= {SWITCHER, RECORDER} if of_home else {agent_node_name(message.agent - 1)}
+            central = message.agent == NOT_AN_AGENT  # where one of them is, the other is, too
+            self._left |= {SWITCHER, RECORDER} if central else {agent_node_name(message.agent - 1)}
             self._check()
 
     def _check(self) -> None:
@@ -315,18 +343,18 @@ class PeerPresence:
         now = time.monotonic()
         gone = self._node.undiscovered(required)
         if gone:
-            self._introduce_again()
+            self._announce_again()
         if self._since.keys() - gone:
             self._returning = list(self._nodes)
         self._since = {name: self._since.get(name, now) for name in gone}
         self._returning = [node for node in self._returning if not node.rejoin()]
-        if now - min(self._since.values(), default=now) > self._patience:
-            self._fail(list(self._since), f" and did not return within {self._patience:g} s")
+        if now - min(self._since.values(), default=now) > self._timeout:
+            self._fail(list(self._since), f" and did not return within {self._timeout:g} s")
 
-    def _introduce_again(self) -> None:
-        """Make ROS tell the others the names of our nodes: who had given us up does not ask for them.
+    def _announce_again(self) -> None:
+        """Make ROS send the others the names of our nodes: a node whose lease for us had ended does not ask for them.
 
-        It tells them with every new endpoint; to a reader that it takes for a known one, DDS repeats nothing.
+        It does so with every new endpoint; to a reader that it takes for a known one, DDS repeats nothing.
         """
         self._node.destroy_publisher(self._node.publisher_of(topics.LEAVE))
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Actions of ``launch`` for the decisions of ``running/launch_support.py``. Only the launch files import this."""
+"""Actions of ``launch`` for the decisions of ``run/launch.py``. Only the launch files import this."""
 
 from __future__ import annotations
 
@@ -66,13 +66,13 @@ class _Group:
 
     def actions(self) -> list[Action]:
         """What starts them, and follows their ends."""
-        for plan in self._launched.processes:
-            self._nodes[plan.name] = Node(
+        for spec in self._launched.processes:
+            self._nodes[spec.name] = Node(
                 package="msg_agents",
-                executable=plan.arguments[0],
-                arguments=list(plan.arguments[1:]),
+                executable=spec.arguments[0],
+                arguments=list(spec.arguments[1:]),
                 namespace=self._launched.namespace or None,
-                exec_name=plan.name,
+                exec_name=spec.name,
                 additional_env=environment(),
                 output="screen",
             )
@@ -93,18 +93,14 @@ class _Group:
         if not launched.over:
             if context.is_shutdown:  # launch stops them itself
                 return []
-            told = [LogInfo(msg=f"{launched.reason}: stopping the other processes")] if failed else []
-            return told + [action for name in launched.to_stop() for action in self._stop(self._nodes[name])]
+            said = [LogInfo(msg=f"{launched.reason}: stopping the other processes")] if failed else []
+            return said + [action for name in launched.to_stop() for action in self._stop(self._nodes[name])]
         if (arguments := launched.analysis()) is not None:
             analysis = ExecuteProcess(
                 cmd=[ExecutableInPackage(executable="msg-analysis", package="msg_analysis"), *arguments],
                 output="screen",
             )
-            return [
-                LogInfo(msg=f"the run is complete: {arguments[1]}"),
-                self._at_end_of(ANALYSIS, analysis),
-                analysis,
-            ]
+            return [LogInfo(msg=f"the run is complete: {arguments[1]}"), self._at_end_of(ANALYSIS, analysis), analysis]
         launched.close()
         for timer in self._timers:
             timer.cancel()

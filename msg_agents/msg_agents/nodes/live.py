@@ -142,7 +142,7 @@ class Live(Watcher):
         if over and not self.done.done():
             self.done.set_result(None)
 
-    def conclude(self) -> None:
+    def take_outcome(self) -> None:
         """See Watcher."""
         self.outcome = self.watched()
 

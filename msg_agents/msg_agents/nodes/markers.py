@@ -59,7 +59,7 @@ class Markers(Watcher):
         self._rate, self._replica, self._frame = rate, replica, frame
         self._newest: list[bytes | None] = []  # raw messages by agent: most are never decoded
         self._places: list[tuple[float, float]] = []
-        self._links: list[list[list[int]]] = []  # agents heard, by mode and agent, all from 0
+        self._links: list[list[list[int]]] = []  # neighbours, by mode and agent, all from 0
         self._square = 0.0  # mean square of the distance from the middle
         self._drawn: list[int] = []  # steps of the last picture
         self._moved = time.monotonic()
@@ -73,10 +73,10 @@ class Markers(Watcher):
         agents = experiment.agents
         self._newest, self._places = [None] * agents, circle(agents)
         for graph in experiment.graph_list:
-            heard: list[list[int]] = [[] for _ in range(agents)]
+            neighbours: list[list[int]] = [[] for _ in range(agents)]
             for source, target, _ in graph.arcs:
-                heard[target - 1].append(source - 1)
-            self._links.append(heard)
+                neighbours[target - 1].append(source - 1)
+            self._links.append(neighbours)
         self._subscribe_to_states(topics.STATE, topics.PASSIVE_NEWEST, whole=False)
         self._moved = time.monotonic()
         every(self, 1.0 / self._rate, self._draw)
@@ -111,7 +111,7 @@ class Markers(Watcher):
         return marker
 
     def _agents(self, states: Sequence[AgentState | None]) -> Marker:
-        """A sphere for each agent that has been heard, coloured by its distance from the mean (or the reference)."""
+        """A sphere for each agent with a state, coloured by its distance from the mean (or the reference)."""
         assert self.record is not None
         values = [None if state is None else float(state.state[self._replica]) for state in states]
         known = [value for value in values if value is not None]
@@ -129,7 +129,7 @@ class Markers(Watcher):
         return marker
 
     def _edges(self, states: Sequence[AgentState | None]) -> Marker:
-        """A line for each pair of which one heard the other in the step that led to its state."""
+        """A line for each pair of which one used the other in the step that led to its state."""
         links = {
             (min(agent, other), max(agent, other))
             for agent, state in enumerate(states)

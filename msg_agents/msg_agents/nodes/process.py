@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The life of one process of a network: nodes, start gate, spin, end."""
+"""The life of one process of a network: nodes, start gate, spin, end, which a hanging middleware does not prevent."""
 
 from __future__ import annotations
 
@@ -23,15 +23,13 @@ from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedE
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from msg_agents.discovery.relay import write_introduction
+from msg_agents.discovery.relay import report_ready
 from msg_agents.discovery.rtps import PREFIX_SIZE, remove_participant
 from msg_agents.environment import discovery_scope
-from msg_agents.nodes.base import ACK_TIMEOUT, NetworkNode, PeerPresence, exit_after
-from msg_agents.nodes.diagnostics import HealthReporter
+from msg_agents.nodes.base import ACK_TIMEOUT, HealthReporter, NetworkNode, PeerPresence
 from msg_agents.nodes.parameters import ros_arguments
 from msg_agents.recovery import Takeover
-from msg_agents.run.fork_server import ends_at_once
-from msg_agents.run.lifeline import show_stacks_when_asked
+from msg_agents.run.fork_server import ends_at_once, show_stacks_when_asked
 from msg_analysis.errors import InputError
 
 FIRST_POLL, GATE_POLL = 0.005, 0.2  # s; a tight loop on the ROS graph starves discovery where many processes look
@@ -41,6 +39,41 @@ GC_THRESHOLD = 50_000  # objects; the hot path makes no cycles, so young collect
 LEAVE_GRACE = 5  # s
 INTERRUPTED_GRACE = 15  # s; longer, because a process that ends by it has failed
 USE_SIM_TIME = ["--ros-args", "-p", "use_sim_time:=true"]
+
+
+SIGEV_THREAD = 2  # of <signal.h>: the C library calls a function in a thread of its own
+
+
+class _Event(ctypes.Structure):
+    """``struct sigevent`` of Linux, 64 bytes."""
+
+    _fields_ = (
+        ("value", ctypes.c_void_p),
+        ("signal", ctypes.c_int),
+        ("notify", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("attributes", ctypes.c_void_p),
+        ("padding", ctypes.c_byte * 32),
+    )
+
+
+def exit_after(seconds: int) -> None:
+    """End this process with exit code 0 in so many seconds, unless it has ended by then.
+
+    Neither the interpreter's lock nor the interpreter is needed. C libraries without such timers do nothing.
+    """
+    library = ctypes.CDLL(None, use_errno=True)
+    if not hasattr(library, "timer_create"):
+        return
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(AttributeError, OSError, ValueError):  # there is none, or nobody reads it any more
+            stream.flush()
+    function = ctypes.cast(library._exit, ctypes.c_void_p)
+    event = _Event(notify=SIGEV_THREAD, function=function.value)  # its value, 0, is what _exit is called with
+    timer = ctypes.c_void_p()
+    in_time = (ctypes.c_long * 4)(0, 0, seconds, 0)  # interval and time to the end, each in s and ns
+    if library.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0:
+        library.timer_settime(timer, 0, in_time, None)
 
 
 _LEFT: list[object] = []  # what must not be taken down before the end of the process
@@ -82,49 +115,47 @@ def run_nodes(
     discovery_timeout: float,  # s
     throughput: bool = True,  # see ``prefer_throughput``
     use_sim_time: bool = False,
-    account: Path | None = None,  # status file, written once a second and at the end
-    introduction: int | None = None,  # descriptor for what ``Introducer`` wants to know
-    patience: float | None = None,  # s, see ``PeerPresence``; None: no limit
+    status_file: Path | None = None,  # written once a second and at the end
+    relay: int | None = None,  # descriptor of ``DiscoveryRelay``
+    peer_timeout: float | None = None,  # s, see ``PeerPresence``; None: no limit
 ) -> bool:
-    """Run nodes until each has done its part; False if the process was told to stop (SIGINT, SIGTERM) before.
+    """Run nodes until each has done its part; False if the process was stopped (SIGINT, SIGTERM) before.
 
     NotFoundError: names the missing nodes. InputError: names that several nodes have, or what a node failed with.
     """
     show_stacks_when_asked()
     # Python's own handler would raise KeyboardInterrupt anywhere, in the middle of a write for example. ROS's handler,
     # installed on top, ends the spin between two callbacks.
-    told: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, _: told.append(number))
+    signals: list[int] = []
+    signal.signal(signal.SIGINT, lambda number, _: signals.append(number))
     if throughput:
         prefer_throughput()
     arguments = [*sys.argv, *(USE_SIM_TIME if use_sim_time else [])]
     handlers = SignalHandlerOptions.ALL
-    if (
-        patience is not None
-    ):  # with ROS's handler, nothing could be published after a signal: see ``PeerPresence.leave``
-        signal.signal(signal.SIGTERM, lambda number, _: told.append(number))
+    if peer_timeout is not None:  # with ROS's handler, nothing could be published after a signal: see ``leave``
+        signal.signal(signal.SIGTERM, lambda number, _: signals.append(number))
         handlers = SignalHandlerOptions.NO
     with ros_arguments():
         rclpy.init(args=arguments, signal_handler_options=handlers)
     nodes: Sequence[NetworkNode] = []
-    prefix = b""  # of a process that was introduced
+    prefix = b""  # of a process that the relay connects
     reporter: HealthReporter | None = None
     presence: PeerPresence | None = None
     spinner: Executor | None = None
     complete = False
     try:
-        if told:  # before ROS's handler was there
+        if signals:  # before ROS's handler was there
             raise ExternalShutdownException
         nodes = make_nodes()
-        if introduction is not None:
+        if relay is not None:
             prefix = own_prefix(nodes[0])
-            write_introduction(introduction, nodes[0].get_name(), prefix)
-        reporter = HealthReporter(nodes, account)
-        presence = None if patience is None else PeerPresence(nodes, patience)
+            report_ready(relay, nodes[0].get_name(), prefix)
+        reporter = HealthReporter(nodes, status_file)
+        presence = None if peer_timeout is None else PeerPresence(nodes, peer_timeout)
         spinner = make_executor(executor)
         for node in nodes:
             spinner.add_node(node)
-        _gate(nodes, discovery_timeout, told)
+        _gate(nodes, discovery_timeout, signals)
         # All objects made so far live until the end: the garbage collector need not scan them again and again.
         gc.collect()
         gc.freeze()
@@ -135,7 +166,7 @@ def run_nodes(
             presence.begin()
         for node in nodes:
             while not node.done.done():
-                if told:
+                if signals:
                     raise ExternalShutdownException
                 spinner.spin_until_future_complete(node.done, timeout_sec=SPIN_SLICE)
             node.done.result()
@@ -173,7 +204,7 @@ def _ignore_interrupts() -> None:
 def own_prefix(node: Node) -> bytes:
     """The prefix of the GUIDs of this process, read from the endpoints of one of its nodes.
 
-    Empty if that cannot be told, since another node has the same name.
+    Empty if it is not known, since another node has the same name.
     """
     own = (node.get_name(), node.get_namespace())
     endpoints = [p for topic in node.publishers for p in node.get_publishers_info_by_topic(topic.topic_name)]
@@ -191,7 +222,7 @@ def store_participant(takeovers: Sequence[Takeover], node: Node) -> None:
 def leave(nodes: Sequence[Node], executor: Executor | None, *, complete: bool) -> None:
     """Remove the nodes from the network, so that no other node waits for them, and make sure that the process ends.
 
-    As long as an executor has a node, the middleware keeps it, and the others are not told.
+    As long as an executor has a node, the middleware keeps it, and the others are not informed.
     """
     # When many participants leave at once, Fast DDS 2.14 can deadlock in DomainParticipant::set_listener, with the
     # interpreter's lock held or after the interpreter has gone. Then only C code helps. Nothing is lost, because a
@@ -210,7 +241,7 @@ def leave(nodes: Sequence[Node], executor: Executor | None, *, complete: bool) -
 def leave_at_once(nodes: Sequence[Node], executor: Executor | None, prefix: bytes) -> None:
     """Let the end of this process be its removal from the network, in one message to each of the others.
 
-    For processes that the introducer knows, which have no shared memory. Otherwise each endpoint's end would be told to
+    For processes that the relay knows, which have no shared memory. Otherwise each endpoint's end would be announced to
     each of them: in a large network more messages than all the rest.
     """
     _LEFT.extend([executor, *nodes])
@@ -218,10 +249,10 @@ def leave_at_once(nodes: Sequence[Node], executor: Executor | None, prefix: byte
     rclpy.try_shutdown()
 
 
-def _gate(nodes: Sequence[NetworkNode], timeout: float, told: Sequence[int]) -> None:
+def _gate(nodes: Sequence[NetworkNode], timeout: float, signals: Sequence[int]) -> None:
     """Wait until the publishers of all nodes have found their readers, and every name belongs to one node only.
 
-    ``told``: signals that end the wait.
+    ``signals``: end the wait.
 
     Readers are identified by name: with duplicates, a run might start without the node that belongs to it.
     """
@@ -247,6 +278,6 @@ def _gate(nodes: Sequence[NetworkNode], timeout: float, told: Sequence[int]) -> 
                 f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} did not discover: "
                 f"{', '.join(missing)}. Are they running {discovery_scope()}?"
             )
-        if told or not rclpy.ok():
+        if signals or not rclpy.ok():
             raise ExternalShutdownException
         time.sleep(min(max(FIRST_POLL, PAUSE_PER_LOOK * (time.monotonic() - begun)), GATE_POLL))

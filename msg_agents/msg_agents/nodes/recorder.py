@@ -14,8 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from msg_agents.nodes.base import NOT_AN_AGENT, NetworkNode
-from msg_agents.nodes.diagnostics import Health
+from msg_agents.nodes.base import NOT_AN_AGENT, Health, NetworkNode
 from msg_agents.nodes.ros import every
 from msg_agents.stepping.state_receiver import StateReceiver
 from msg_analysis.bags.stored_file import DEFAULT_STORAGE, Storage
@@ -79,8 +78,8 @@ class Recorder(NetworkNode):
         every(self, LOOK_PERIOD, self._look_for_others)
 
     def health(self) -> Health:
-        """Number of recorded messages. One that has everything says so again, as agents that stand do."""
-        self._tell_if_complete()
+        """Number of recorded messages. One that has everything reports so again, as stalled agents do."""
+        self._report_if_complete()
         values = {"messages": str(self.bag.messages), "topics without their last message": str(len(self._awaiting))}
         return Health(f"{self.bag.messages} messages recorded", values=values)
 
@@ -162,7 +161,7 @@ class Recorder(NetworkNode):
         for kind, newest in zip(self._kinds, self._newest, strict=True):
             there += [kind.names[agent] for agent in np.flatnonzero(newest >= self._last).tolist()]
         self._awaiting.difference_update(there)
-        self._tell_if_complete()
+        self._report_if_complete()
 
     def _record_experiment(self, data: bytes) -> None:
         known = self._root + topics.EXPERIMENT.name not in self._awaiting
@@ -190,9 +189,9 @@ class Recorder(NetworkNode):
     def _received_last(self, topic: str) -> None:
         if topic in self._awaiting:
             self._awaiting.remove(topic)
-            self._tell_if_complete()
+            self._report_if_complete()
 
-    def _tell_if_complete(self) -> None:
+    def _report_if_complete(self) -> None:
         if not self._awaiting:
             self.publish(self._progress, self.progress(topics.PROGRESS, NOT_AN_AGENT, self._last))
 

@@ -104,7 +104,7 @@ class DueTimer:
 
 
 def every(node: Node, period: float, callback: Callable[[], None]) -> None:
-    """Call back every ``period`` s of wall time, from the node's executor, even while the node's clock stands still."""
+    """Call back every ``period`` s of wall time, from the node's executor, even while the node's clock is stopped."""
     node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 

@@ -18,12 +18,12 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 from rclpy.serialization import deserialize_message
 
-from msg_agents.nodes.base import ACK_TIMEOUT, NOT_AN_AGENT, NetworkNode
-from msg_agents.nodes.diagnostics import CLOCK_BOUND, Health
+from msg_agents.nodes.base import ACK_TIMEOUT, CLOCK_BOUND, NOT_AN_AGENT, Health, NetworkNode
 from msg_agents.nodes.ros import DueTimer, every
 from msg_agents.process_layout import RECORDER, SWITCHER
 from msg_agents.recovery import StopFiles
-from msg_agents.stepping.newest_values import MILLISECOND, ClockOffsets, Schedule
+from msg_agents.stepping.monitoring import MILLISECOND, ClockOffsets
+from msg_agents.stepping.newest_values import Schedule
 from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.messages import topics
@@ -63,7 +63,7 @@ class Switcher(NetworkNode):
         readers: list[str],  # nodes other than the agents that must be discovered before the run starts
         on_progress: Callable[[Sequence[int]], None] = lambda _: None,  # newest step of every agent, -1: none yet
         on_graph: Callable[[int], None] = lambda _: None,  # mode, from 0, of the graph that is active from now on
-        checkpoints: Path | None = None,  # directory for a mark; finding one there means a takeover
+        checkpoints: Path | None = None,  # directory of the switcher's state; a file there means a takeover
         ack_timeout: float = ACK_TIMEOUT,  # s to wait for acknowledgements of the end
         on_clocks: Callable[[ClockOffsets, str | None], None] | None = None,  # with several hosts: see RealtimeSwitcher
     ) -> None:
@@ -73,7 +73,7 @@ class Switcher(NetworkNode):
         self._steps = record.experiment.steps
         self._reached = [-1] * model.agents
         self._slowest = -1
-        self._heard = False  # from an agent since the last call of on_progress
+        self._new_progress = False  # from an agent since the last call of on_progress
         self._records = RECORDER in readers
         self._recorder_reached = -1  # last step of the run of which the recorder has everything
         self._on_progress, self._on_graph, self._on_clocks = on_progress, on_graph, on_clocks
@@ -82,8 +82,8 @@ class Switcher(NetworkNode):
         if record.until:
             self._stop = self.publisher_of(topics.STOP)
             self._stops = StopFiles(checkpoints, record.run) if checkpoints else None
-        self._mark = checkpoints and checkpoints / f"switcher.{record.run}"
-        if self._mark and self._mark.exists():  # in the middle of a run, none of the user's nodes is awaited
+        self._state_file = checkpoints and checkpoints / f"switcher.{record.run}"
+        if self._state_file and self._state_file.exists():  # in the middle of a run, no node of the user is awaited
             readers = [name for name in readers if name == RECORDER]
         self._expected = [agent_node_name(i) for i in range(model.agents)] + readers
         self._experiment = self.publisher_of(topics.EXPERIMENT)
@@ -148,7 +148,7 @@ class Switcher(NetworkNode):
             self._recorder_reached = progress.step
         else:
             self._reached[progress.agent - 1] = max(progress.step, self._reached[progress.agent - 1])
-            self._heard = True
+            self._new_progress = True
         slowest = min(self._reached)
         if slowest > self._slowest:
             self._slowest = slowest
@@ -183,8 +183,8 @@ class Switcher(NetworkNode):
 
     def _report(self) -> None:
         self._look_for_stop()
-        if self._heard:
-            self._heard = False
+        if self._new_progress:
+            self._new_progress = False
             self._on_progress(self._reached)
 
     def _publish_sojourn(self, sojourn: Sojourn) -> int:
@@ -199,8 +199,8 @@ class LockstepSwitcher(Switcher):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        # A mark means that part of the path has been published; how much is not known.
-        self._behind = bool(self._mark and self._mark.exists())
+        # A state file means that part of the path has been published; how much is not known.
+        self._behind = bool(self._state_file and self._state_file.exists())
         self._ahead: deque[Sojourn] = deque()  # published sojourns that the slowest agent has not reached
         self._most_ahead = MOST_AHEAD
 
@@ -210,8 +210,8 @@ class LockstepSwitcher(Switcher):
 
     def begin(self) -> None:
         """Publish the experiment and the beginning of the path."""
-        if self._mark:
-            self._mark.touch()
+        if self._state_file:
+            self._state_file.touch()
         super().begin()
         self._moved()
 
@@ -270,7 +270,7 @@ class RealtimeSwitcher(Switcher):
             name = agents.get(status.name.partition(":")[0])
             bounds = [float(value.value) for value in status.values if value.key == CLOCK_BOUND]
             if name not in (None, SWITCHER, RECORDER) and bounds:
-                self._clocks.hear(name, sent, now, bounds[0] * MILLISECOND)
+                self._clocks.add(name, sent, now, bounds[0] * MILLISECOND)
         run = self.record.experiment.run
         apart = self._clocks.warning(self.record.experiment.step_length / run.speed * SECOND)
         if apart and not self._apart:
@@ -290,7 +290,7 @@ class RealtimeSwitcher(Switcher):
     def begin(self) -> None:
         """Publish the experiment and, after a takeover, the epoch and the path so far."""
         super().begin()
-        text = self._mark.read_text(encoding="ascii") if self._mark and self._mark.exists() else ""
+        text = self._state_file.read_text(encoding="ascii") if self._state_file and self._state_file.exists() else ""
         if text:
             self._start(int(text))
 
@@ -307,10 +307,10 @@ class RealtimeSwitcher(Switcher):
         now = self._timer.now()
         if self._schedule is None and self._slowest >= 0 and now:
             epoch = now + EPOCH_DELAY
-            if self._mark:  # whole or not at all: a process that takes over must go on with this epoch
-                draft = self._mark.with_suffix(".draft")
+            if self._state_file:  # whole or not at all: a process that takes over must go on with this epoch
+                draft = self._state_file.with_suffix(".draft")
                 draft.write_text(str(epoch), encoding="ascii")
-                draft.replace(self._mark)
+                draft.replace(self._state_file)
             self._start(epoch)
 
     def _start(self, epoch: int) -> None:

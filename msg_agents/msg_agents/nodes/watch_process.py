@@ -87,7 +87,7 @@ class Watcher(LeanNode):
         """Wait until the readers of this node's own topic have the last message."""
         self._writer.wait_for_all_acked(Duration(seconds=self.ack_timeout))
 
-    def conclude(self) -> None:
+    def take_outcome(self) -> None:
         """Prepare the final result from what has been received; must be quick, since leaving has a time limit."""
 
     def _receive_experiment(self, data: bytes) -> None:
@@ -197,7 +197,7 @@ def run_watcher(
         pass
     finally:
         for node in nodes:
-            node.conclude()
+            node.take_outcome()
         if all(node.done.done() for node in nodes):
             _stop_reading(nodes, executor)
         else:

@@ -29,14 +29,14 @@ YOUTH = 60.0  # s; younger folders may belong to a run that has not locked its o
 
 
 @contextmanager
-def workshop(room: int | None = None) -> Iterator[Path]:
+def temporary_directory(room: int | None = None, memory: Path = MEMORY) -> Iterator[Path]:
     """A folder that is removed at the end; those that killed runs left behind are removed first.
 
     A lock, which ends with its process, marks folders in use. ``room``: bytes that will be mapped into memory; the
     folder is then in memory, if there is plenty.
     """
-    _clear_abandoned()
-    parent = MEMORY if room is not None and free_space(MEMORY) > SPARE * room else None
+    _clear_abandoned(memory)
+    parent = memory if room is not None and free_space(memory) > SPARE * room else None
     path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
     lock = os.open(path, os.O_RDONLY)
     try:
@@ -47,8 +47,8 @@ def workshop(room: int | None = None) -> Iterator[Path]:
         os.close(lock)
 
 
-def _clear_abandoned() -> None:
-    for path in [path for parent in (Path(tempfile.gettempdir()), MEMORY) for path in parent.glob(f"{PREFIX}*")]:
+def _clear_abandoned(memory: Path) -> None:
+    for path in [path for parent in (Path(tempfile.gettempdir()), memory) for path in parent.glob(f"{PREFIX}*")]:
         with suppress(OSError):  # gone already, another user's, or locked
             if time.time() - path.stat().st_mtime < YOUTH:
                 continue

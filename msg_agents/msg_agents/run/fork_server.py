@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The fork server of a network: a process that has imported everything and forks the processes of nodes.
+"""Processes of nodes: forked from a fork server, which has imported everything, and ended with their parent.
 
 Every forked process is a child of the process that asked for it, which waits for it as for any other: the fork server
 may end, or be killed, at any time.
@@ -12,8 +12,11 @@ from __future__ import annotations
 import atexit
 import contextlib
 import ctypes
+import faulthandler
+import fcntl
 import functools
 import gc
+import io
 import json
 import os
 import signal
@@ -26,8 +29,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, NoReturn, Protocol, Self
+from typing import Any, NoReturn, Self
 
 PROGRAM = [sys.executable, "-m", "msg_agents.cli.node_server"]  # calls ``serve``
 LONGEST_TITLE = 200  # bytes; ROS names a log file by the title, and a longer name than 255 cannot be written
@@ -38,26 +40,11 @@ ANSWER_TIMEOUT = 60.0  # s; the first answer comes after all imports
 TRIAL = "try the middleware"  # instead of a command
 TRIAL_TIMEOUT = 30.0  # s
 TRIAL_POLL = 1e-3  # s
+EXIT_TIMEOUT = 5.0  # s that a process has to end when its parent has ended
+SHOW_STACKS = signal.SIGUSR1  # makes a node write what its threads are doing
 CANNOT_FLUSH = 120  # Python's exit code where the last of stdout or stderr cannot be written
 PR_SET_CHILD_SUBREAPER, PR_GET_CHILD_SUBREAPER = 36, 37  # of linux/prctl.h
 _ending_at_once = False  # see ``ends_at_once``
-
-
-class Process(Protocol):
-    """A started process: what ``subprocess.Popen`` and ``ForkedProcess`` share."""
-
-    @property
-    def pid(self) -> int:
-        """Its number."""
-
-    def poll(self) -> int | None:
-        """Its exit code, or minus the signal that killed it; None while it runs."""
-
-    def wait(self) -> int:
-        """The same, once it has ended."""
-
-    def send_signal(self, sig: int) -> None:
-        """Send a signal, unless it has ended."""
 
 
 class ForkedProcess:
@@ -93,6 +80,42 @@ class ForkedProcess:
                 self._code = os.waitstatus_to_exitcode(status) if pid else None
 
 
+def exit_with_pipe(descriptor: int) -> None:
+    """End this process when the other end of a pipe closes: its parent has ended."""
+
+    def wait() -> None:
+        while os.read(descriptor, 1):
+            pass
+
+    _end_after(wait)
+
+
+def exit_with_lock(folder: Path) -> None:
+    """End this process when a folder (``temporary_directory``) is no longer locked, or gone: its parent has ended."""
+
+    def wait() -> None:
+        with contextlib.suppress(OSError):
+            fcntl.flock(os.open(folder, os.O_RDONLY), fcntl.LOCK_SH)
+
+    _end_after(wait)
+
+
+def _end_after(wait: Callable[[], None]) -> None:
+    def watch() -> None:
+        wait()
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(EXIT_TIMEOUT)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True, name="parent").start()
+
+
+def show_stacks_when_asked() -> None:
+    """Let this process, and what it forks, write the stacks of its threads to stderr when it gets SHOW_STACKS."""
+    with contextlib.suppress(RuntimeError, io.UnsupportedOperation):  # it has no stderr
+        faulthandler.register(SHOW_STACKS)
+
+
 @dataclass(frozen=True, slots=True)
 class NodeStart:
     """A process that is to be started."""
@@ -103,7 +126,7 @@ class NodeStart:
     core: int | None  # to which it keeps
 
 
-class NodeServer:
+class ForkServer:
     """The fork server of a network, as seen by the process that runs it: a context, at whose end the server is gone.
 
     It imports while its user goes on; the first fork waits for that. It leaves no process behind but those that it has
@@ -177,9 +200,7 @@ class NodeServer:
             self._process.kill()
             self._process.wait()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop()
         if self._adopted is False:
             _adopt_orphans(adopt=False)

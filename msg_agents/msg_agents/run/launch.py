@@ -1,12 +1,10 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Runs under `ros2 launch`: arguments, and processes that launch starts.
+"""Runs under `ros2 launch`, without ``launch``: arguments, which processes, what the end of each means, what follows.
 
-What the launch files do, without ``launch``: which processes, what the end of each one means, what follows the run.
-
-The plan is that of ``msg-agents run`` (``process_plan``). ``launch`` itself starts the processes and handles signals
-and output (``nodes/launch_actions.py``). Killed processes are not started again here.
+The processes are those of ``msg-agents run``. ``launch`` itself starts them and handles signals and output
+(``nodes/launch_actions.py``). Killed processes are not started again here.
 """
 
 from __future__ import annotations
@@ -21,9 +19,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from msg_agents.process_layout import RECORDER, ProcessPlan, plan_network
+from msg_agents.process_layout import RECORDER, ProcessSpec, lay_out_network
 from msg_agents.replay import parse_rate
-from msg_agents.run.folder import load_with_overrides, make_bag_directory, workshop
+from msg_agents.run.folder import load_with_overrides, make_bag_directory, temporary_directory
 from msg_agents.run.supervisor import failure_of
 from msg_analysis.bags.stored_file import MEGABYTE, SMALLEST_SPLIT, Storage
 from msg_analysis.common.files import REPORT_FILE
@@ -176,25 +174,25 @@ class LaunchFailedError(Exception):
 class LaunchedProcesses:
     """Processes that ``launch`` starts together: when one fails, the others are stopped; then ``reason`` says why.
 
-    ``launch`` is told to pass on the end of each process, and to ask ``to_stop`` and ``analysis`` then.
+    The actions of ``launch`` pass on the end of each process, and ask ``to_stop`` and ``analysis`` then.
     """
 
     def __init__(self, namespace: str) -> None:
         self.namespace = namespace.strip()
         self._stack = ExitStack()
-        # Its lock is the lifeline of the processes: SIGTERM ends launch without a word to them.
-        self._folder = self._stack.enter_context(workshop())
+        # The processes end when its lock is released: SIGTERM ends launch without a signal to them.
+        self._folder = self._stack.enter_context(temporary_directory())
         atexit.register(self.close)
-        self.processes: list[ProcessPlan] = []
+        self.processes: list[ProcessSpec] = []
         self.reason: str | None = None  # why these processes have failed
         self._interruption: str | None = None  # why launch has stopped them
         self._running: set[str] = set()
         self._stopped: set[str] = set()
 
-    def _plan(self, processes: Sequence[ProcessPlan]) -> None:
-        lifeline = ("--lifeline-lock", str(self._folder))
-        self.processes = [replace(plan, arguments=plan.arguments + lifeline) for plan in processes]
-        self._running = {plan.name for plan in processes}
+    def _set(self, processes: Sequence[ProcessSpec]) -> None:
+        lock = ("--lifeline-lock", str(self._folder))
+        self.processes = [replace(spec, arguments=spec.arguments + lock) for spec in processes]
+        self._running = {spec.name for spec in processes}
 
     @property
     def over(self) -> bool:
@@ -253,12 +251,12 @@ class LaunchedNetwork(LaunchedProcesses):
         self._run_file = self._folder / "run.json"
         self._run_file.write_text(new_record(experiment).to_json(with_key=True), encoding="utf-8")
         try:
-            plan_network(experiment, self._run_file, None)  # rejects too many processes before anything is made
+            lay_out_network(experiment, self._run_file, None)  # rejects too many processes before anything is made
             if record:
                 out = Path(arguments["out"]).expanduser().absolute()
                 self.bag = make_bag_directory(experiment, out, option="out:=")
             # Of each, ``arguments[0]`` is the executable.
-            plans = plan_network(
+            processes = lay_out_network(
                 experiment,
                 self._run_file,
                 self.bag,
@@ -266,7 +264,7 @@ class LaunchedNetwork(LaunchedProcesses):
                 parameter_services=services,
                 storage=storage,
             )
-            self._plan(plans)
+            self._set(processes)
         except BaseException:
             self.close()
             raise
@@ -302,7 +300,7 @@ class LaunchedNetwork(LaunchedProcesses):
         return ": the run is not complete" + (f"; its data so far are in {self.bag}" if self._recorded else "")
 
     def close(self) -> None:
-        """See LaunchedProcesses; the run record is kept with the bag."""
+        """See LaunchedProcesses; the run record is stored with the bag."""
         if self.bag is not None:
             if self._recorded and self._run_file.exists():
                 with suppress(OSError):
@@ -324,10 +322,13 @@ class LaunchedReplay(LaunchedProcesses):
         live = flag(arguments, "live")
         super().__init__(arguments["namespace"])
         if live:
-            plans = [ProcessPlan("live", ("live", "--reliable")), ProcessPlan("player", (*player, "--await", "live"))]
+            processes = [
+                ProcessSpec("live", ("live", "--reliable")),
+                ProcessSpec("player", (*player, "--await", "live")),
+            ]
         else:
-            plans = [ProcessPlan("player", player)]
-        self._plan(plans)
+            processes = [ProcessSpec("player", player)]
+        self._set(processes)
 
 
 def environment() -> dict[str, str]:

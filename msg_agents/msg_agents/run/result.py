@@ -3,7 +3,7 @@
 
 """Files in which the processes of a run report to the runner: neither side ever waits for the other.
 
-Account files have refused messages and what the nodes wait for; the file of steps, how far every agent is; that of
+Status files have refused messages and what the nodes wait for; the file of steps, how far every agent is; that of
 clocks, how far those of several hosts are apart.
 """
 
@@ -32,13 +32,13 @@ Refused = tuple[str, str, str, int]  # node, topic, reason, count
 
 
 @dataclass(slots=True)
-class Account:
-    """Sum of the account files of a run."""
+class StatusSummary:
+    """Sum of the status files of a run."""
 
     refused: Counter[tuple[str, str, str]] = field(default_factory=Counter)  # by (node, topic, reason)
     waiting: dict[str, str] = field(default_factory=dict)  # by node, what it waits for; only nodes that wait
 
-    def strangers(self) -> list[dict[str, Any]]:
+    def rejected_messages(self) -> list[dict[str, Any]]:
         """Key ``strangers`` of result.json: refused messages by node, topic and reason, with their counts."""
         return [
             {"node": node, "topic": topic, "reason": reason, "count": count}
@@ -46,8 +46,8 @@ class Account:
         ]
 
 
-def write_account(path: Path, refused: Sequence[Refused], waiting: Mapping[str, str]) -> None:
-    """Replace the account file of one process atomically; an error such as a full disk is ignored."""
+def write_status(path: Path, refused: Sequence[Refused], waiting: Mapping[str, str]) -> None:
+    """Replace the status file of one process atomically; an error such as a full disk is ignored."""
     _replace(path, {"refused": refused, "waiting": waiting})
 
 
@@ -85,21 +85,21 @@ def _replace(path: Path, document: Any) -> None:
         temporary.replace(path)
 
 
-def read_accounts(paths: Iterable[Path]) -> Account:
-    """Add up account files, given in the order of the starts; missing or damaged files are left out."""
-    account = Account()
+def read_status_files(paths: Iterable[Path]) -> StatusSummary:
+    """Add up status files, given in the order of the starts; missing or damaged files are left out."""
+    status = StatusSummary()
     waiting: dict[str, str] = {}
     for path in paths:
         with contextlib.suppress(OSError, ValueError):
             document = json.loads(path.read_text(encoding="utf-8"))
             for *what, count in document["refused"]:
-                account.refused[tuple(what)] += count
+                status.refused[tuple(what)] += count
             waiting |= document["waiting"]  # later processes are more recent; "": does not wait
-    account.waiting = {node: message for node, message in waiting.items() if message}
-    return account
+    status.waiting = {node: message for node, message in waiting.items() if message}
+    return status
 
 
-_ACCOUNT_EVERY = 1.0  # s between two looks at the files of refused messages
+_STATUS_PERIOD = 1.0  # s between two readings of the status files
 
 
 class EventLog:
@@ -112,7 +112,7 @@ class EventLog:
         self._events, self._clock = events, clock
         self._absent: dict[str, tuple[Sequence[int], int]] = {}  # by node: its agents from 0, their step
         self._refused: set[tuple[str, str, str]] = set()
-        self._next_account = clock()
+        self._next_status = clock()
         self._newest = 0
 
     def killed(self, node: str, agents: Sequence[int], step: int, words: str) -> None:
@@ -124,17 +124,17 @@ class EventLog:
             self._absent[node] = agents, step
         self._add("killed", step if agents else self._newest, node, words)
 
-    def look(self, steps: Sequence[int], account: Callable[[], Account], *, last: bool = False) -> None:
+    def look(self, steps: Sequence[int], status: Callable[[], StatusSummary], *, last: bool = False) -> None:
         """Note who is back and what is refused, given the newest step of every agent; ``last``: at the end."""
         newest = self._newest = max(steps, default=0)
         for node, (agents, step) in list(self._absent.items()):
             if steps and min(steps[agent] for agent in agents) > step:
                 del self._absent[node]
                 self._add("back", newest, node, f"{node}: back")
-        if self._clock() < self._next_account and not last:
+        if self._clock() < self._next_status and not last:
             return
-        self._next_account = self._clock() + _ACCOUNT_EVERY
-        for key in sorted(set(account().refused) - self._refused):
+        self._next_status = self._clock() + _STATUS_PERIOD
+        for key in sorted(set(status().refused) - self._refused):
             self._refused.add(key)
             node, topic, reason = key
             self._add("refused", newest, node, f"{node}: refused on {topic}: {reason} (first noticed)")
@@ -169,7 +169,7 @@ class RunResult:
     strangers
         messages that the nodes refused: dictionaries with "node", "topic", "reason", "count"
     events
-        when processes were killed and back, and messages first refused: see ``running.event_log``
+        when processes were killed and back, and messages first refused: see ``EventLog``
     reached
         newest step of the slowest agent, as last reported; -1: none
     until
@@ -287,7 +287,7 @@ def conclude(result: RunResult, report: ReportWhen = "always") -> None:
 
     comparison = compare(result.trajectory)
     if result.channel is not None and comparison.timing is not None:
-        from msg_agents.channel.process import channel_findings
+        from msg_agents.run.run_channel import channel_findings
 
         timing = comparison.timing
         result.channel["findings"] = channel_findings(result.channel, timing.lost_messages, timing.period_ms)

@@ -1,36 +1,41 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The channel of a run: hosts, environment, process, and what it did."""
+"""The channel of a run: hosts, environment, process, and what it did, in numbers and in sentences."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from msg_agents.channel.channel_file import BASE, Channel
-from msg_agents.channel.links import ActiveGraphFile, read_counts
-from msg_agents.channel.namespaces import Host, open_hosts
-from msg_agents.channel.process import channel_findings, hand_over
-from msg_agents.discovery.profiles import LEASE, profile_for_hosts
-from msg_agents.discovery.rtps import PEERS_VARIABLE
+from msg_agents.channel.links import read_counts
+from msg_agents.channel.process import ActiveGraphFile, Host, hand_over, open_hosts
+from msg_agents.discovery.rtps import LEASE, PEERS_VARIABLE, profile_for_hosts
 from msg_agents.environment import channel_environment
-from msg_agents.process_layout import SWITCHER, ProcessPlan
+from msg_agents.process_layout import SWITCHER, ProcessSpec
 from msg_agents.run.supervisor import Supervisor
+from msg_analysis.common.text import counted, percent
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.validation import heard_links
 from msg_analysis.model.step_model import Wiring
 from msg_analysis.theory.prediction import predict
 
+if TYPE_CHECKING:
+    from msg_analysis.inference.timing import LostMessages
+
 STANDS = 1.5  # s without a step in lockstep after which the graph cuts nothing, until one is made
 CUT_LEASE = 600.0  # s; that the graph cuts a link is no reason to give a host up
+MOST_Z = 5.0  # of the packets that a pair lost; by chance, any of 1000 pairs is beyond it in 0.06 % of all runs
+SHOWN_PAIRS = 3
 
 
 @dataclass(slots=True)
@@ -56,16 +61,20 @@ class RunChannel:
         peers = " ".join(host.address for host in self.hosts.values())
         return channel_environment(profile) | {PEERS_VARIABLE: peers}
 
-    def start(self, supervisor: Supervisor, plans: Sequence[ProcessPlan], wiring: Wiring, *, lockstep: bool) -> None:
+    def start(
+        self, supervisor: Supervisor, processes: Sequence[ProcessSpec], wiring: Wiring, *, lockstep: bool
+    ) -> None:
         """Start its process, and say on which host each of the others is to be."""
         self._lockstep = lockstep
         control = supervisor.start_channel()
-        counts = supervisor.channel_account
+        counts = supervisor.channel_status
         active_graph = counts.with_name("active_graph") if self.channel.graph else None
         if active_graph is not None:
             self._active = ActiveGraphFile.create(active_graph, len(self.hosts))
             supervisor.options = {SWITCHER: ("--active-graph", str(active_graph))}
-        supervisor.namespaces = {plan.name: self.hosts[self.channel.host_of(plan.agents)].namespace for plan in plans}
+        supervisor.namespaces = {
+            spec.name: self.hosts[self.channel.host_of(spec.agents)].namespace for spec in processes
+        }
         joined = self.channel.joined(wiring.links) if self.channel.graph else None
         hand_over(control, self.channel, self.hosts, counts, active_graph, joined)
 
@@ -80,7 +89,7 @@ class RunChannel:
         if supervisor.steps != self._steps or not self._lockstep:
             self._steps, self._since = supervisor.steps, time.monotonic()
         stands = time.monotonic() > self._since + STANDS
-        starting = {self.channel.host_of(child.plan.agents) for child in supervisor.starting_again}
+        starting = {self.channel.host_of(child.spec.agents) for child in supervisor.starting_again}
         for place, host in enumerate(self.hosts):
             self._active.let_through(place, all_packets=stands or host in starting)
 
@@ -90,7 +99,7 @@ class RunChannel:
             name: {"address": host.address, "agents": [agent + 1 for agent in self.channel.hosts[name]]}
             for name, host in self.hosts.items()
         }
-        counts = read_counts(supervisor.channel_account) or {"pairs": [], "overflowed": 0, "late_ms": None}
+        counts = read_counts(supervisor.channel_status) or {"pairs": [], "overflowed": 0, "late_ms": None}
         for pair in counts["pairs"]:
             model = self.channel.links[pair["sender"], pair["receiver"]].loss
             pair |= {"loss": model.mean, "inflation": model.inflation}
@@ -101,7 +110,7 @@ class RunChannel:
 
 
 def predicted_errors(channel: Channel, experiment: Experiment) -> dict[str, Any] | None:
-    """Errors predicted before the run: in place of what the channel loses, the last value heard; nothing is late.
+    """Errors predicted before the run: in place of what the channel loses, the last value received; nothing is late.
 
     None where that is not what happens (lockstep, reliable delivery, losses in the experiment itself, packets that the
     graph cuts, bursts, which are of packets and not of the messages of a link), or where it has no prediction.
@@ -112,8 +121,7 @@ def predicted_errors(channel: Channel, experiment: Experiment) -> dict[str, Any]
     if any(link.loss.good != link.loss.bad for link in channel.links.values()):
         return None
     document = experiment.to_document()
-    heard = heard_links(experiment.graph_list, experiment.time)
-    probability = channel.agent_loss(experiment.agents) * heard
+    probability = channel.agent_loss(experiment.agents) * heard_links(experiment.graph_list, experiment.time)
     arcs = [[j + 1, i + 1, float(probability[i, j])] for i, j in np.argwhere(probability).tolist()]
     if arcs:
         document["noise"] |= {"loss": {"arcs": arcs}, "on_loss": "hold"}
@@ -132,3 +140,69 @@ def run_channel(channel: Channel | None) -> Iterator[RunChannel | None]:
         return
     with open_hosts(list(channel.hosts), channel.mtu) as hosts:
         yield RunChannel(channel, hosts)
+
+
+def channel_findings(
+    channel: Mapping[str, Any], lost: LostMessages | None = None, period_ms: float | None = None
+) -> list[str]:
+    """Sentences about ``channel``, as in the result of a run, and about the messages of its log in real time."""
+    pairs = channel["pairs"]
+    found = [words for pair in pairs if (words := _unlike_the_file(pair))]
+    full = sorted((pair for pair in pairs if pair["dropped"]), key=lambda pair: -pair["dropped"] / pair["sent"])
+    found += [
+        f"{percent(pair['dropped'] / pair['sent'])} of the packets from {pair['sender']} to {pair['receiver']} were "
+        "dropped by the full queue: more traffic than its rate_mbit carries"
+        for pair in full
+    ]
+    left_out = len(found) - SHOWN_PAIRS
+    if left_out > 0:
+        found = [*found[:SHOWN_PAIRS], f"the same is true of {left_out} more of these pairs"]
+    if channel["overflowed"]:
+        found.append(
+            f"{counted(channel['overflowed'], 'packet')} came faster than the channel could take them: it lost more "
+            "than its file says"
+        )
+    late = channel["late_ms"]
+    if late and period_ms and late["mean"] > period_ms / 10:
+        found.append(
+            f"packets were passed on {late['mean']:.1f} ms later than the file says, on average, with a period of "
+            f"{period_ms:.3g} ms: the machine is too busy for this channel"
+        )
+    if lost is not None and lost.words():
+        found.append(_messages(channel, lost))
+    return [f"{words[:1].upper()}{words[1:]}." for words in found]
+
+
+def _unlike_the_file(pair: Mapping[str, Any]) -> str | None:
+    """That a pair lost another fraction at random than the file says; that is rare where it does what it should."""
+    sent, loss = pair["sent"], pair["loss"]
+    spread = math.sqrt(sent * loss * (1.0 - loss) * pair["inflation"])
+    if abs(pair["lost"] - sent * loss) <= max(MOST_Z * spread, 0.5):
+        return None
+    return (
+        f"{percent(pair['lost'] / sent)} of the {sent} packets from {pair['sender']} to {pair['receiver']} were lost "
+        f"at random, not {percent(loss)}"
+    )
+
+
+def _messages(channel: Mapping[str, Any], lost: LostMessages) -> str:
+    """Why messages were not received in time: the losses of the experiment, those of the channel, and the rest."""
+    host = {agent - 1: name for name, host in channel["hosts"].items() for agent in host["agents"]}
+    losses = {(pair["sender"], pair["receiver"]): pair["loss"] for pair in channel["pairs"]}
+    by_channel = by_both = 0.0
+    rows = zip(lost.links.tolist(), lost.messages.tolist(), lost.probability.tolist(), strict=True)
+    for (receiver, sender), messages, probability in rows:
+        loss = losses.get((host[sender], host[receiver]), 0.0)
+        by_channel += messages * (1.0 - probability) * loss
+        by_both += messages * (probability + (1.0 - probability) * loss)
+    fraction, (low, high), expected = lost.share()
+    total = int(lost.messages.sum())
+    words = (
+        f"of the messages between agents, {percent(fraction)} ({100 * low:.3g} to {100 * high:.3g} %) were not "
+        f"received in time: the experiment loses {percent(expected)}, the channel {percent(by_channel / total)} more"
+    )
+    if low > by_both / total:
+        return f"{words}; the others were late or dropped"
+    if high < by_both / total:
+        return f"{words}; lost messages were sent again in time"
+    return words

@@ -14,24 +14,24 @@ from dataclasses import replace
 from pathlib import Path
 
 from msg_agents.channel.channel_file import Channel
-from msg_agents.environment import RESTARTS, ROS_LOGS, require_middleware, surroundings, will_introduce
+from msg_agents.environment import RESTARTS, ROS_LOGS, require_middleware, run_environment, uses_relay
 from msg_agents.process_layout import (
     MOST_PROCESSES,
     MOST_UNAIDED,
     SWITCHER,
-    Share,
+    HostAssignment,
+    assign_cores,
     count_processes,
+    lay_out_network,
     partners,
-    place,
-    plan_network,
 )
 from msg_agents.recovery import entry_size, room_for
-from msg_agents.run.folder import make_bag_directory, workshop
-from msg_agents.run.fork_server import NodeServer
+from msg_agents.run.folder import make_bag_directory, temporary_directory
+from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.result import EventLog, RunResult
 from msg_agents.run.run_channel import RunChannel, run_channel
-from msg_agents.run.supervisor import ACCOUNTS, CLOCKS, CRASHED, LATE, STEPS, Supervisor
-from msg_agents.stepping.stall_detection import ClockDetector, LagDetector, StallDetector
+from msg_agents.run.supervisor import CLOCKS, CRASHED, HUNG, LATE, STATUS_FOLDER, STEPS, Supervisor
+from msg_agents.stepping.monitoring import ClockDetector, LagDetector, StallDetector
 from msg_agents.terminal import Interruption
 from msg_agents.watch.observer import EarlyEnd
 from msg_agents.watch.panel import View
@@ -46,7 +46,7 @@ from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.twin.simulate import new_record
 
-FIRST_POLL, POLL = 0.02, 0.05  # s; the first until the switcher here has heard of all agents
+FIRST_POLL, POLL = 0.02, 0.05  # s; the first until the switcher here knows of all agents
 
 
 def run_network(
@@ -65,10 +65,11 @@ def run_network(
     view: View | None = None,
     environment: Mapping[str, str] | None = None,
     record: RunRecord | None = None,
-    share: Share | None = None,
+    assignment: HostAssignment | None = None,
     channel: Channel | None = None,
     interruption: Interruption | None = None,
     until: Until | None = None,
+    hung_timeout: float = HUNG,
 ) -> RunResult:
     """Run an experiment as a network of ROS 2 processes.
 
@@ -84,7 +85,7 @@ def run_network(
         ROS_DOMAIN_ID; None: a free one is chosen
     restarts
         how often, in all, processes of agents and the switcher are started again when they were killed (or crashed for
-        the first time); one more failure ends the run. 0: no states are kept for a restart
+        the first time); one more failure ends the run. 0: no states are stored for a restart
     readers
         names of other nodes, in the same domain, that must read the states of all agents before the run starts, as
         those of a tool do that must not miss a message
@@ -107,16 +108,18 @@ def run_network(
         changes to the environment of the processes
     record
         record of the run; None: a new one is made
-    share
+    assignment
         what this host runs, of several hosts; None: all. Without the recorder only the logs are kept, in the
         directory that would hold the bag
     channel
         the hosts on which the processes are, and what is between them; None: all are on this one
     until
         when the run may end before its duration, in order, as a complete run of fewer steps; None: it does not. Not
-        with a ``share``
+        with an ``assignment``
     interruption
         keeps signals from the start of the processes on, beyond the end of this call; None: one for this call only
+    hung_timeout
+        s without running after which a process whose main thread waits is ended and started again
 
     Returns
     -------
@@ -131,34 +134,31 @@ def run_network(
     """
     view = view or View(on_progress, on_note)
     experiment.require_available()
-    most = MOST_PROCESSES if channel is None and will_introduce(environment or {}) else MOST_UNAIDED
-    processes = count_processes(experiment, None if share is None else len(share.agents), most=most)
+    most = MOST_PROCESSES if channel is None and uses_relay(environment or {}) else MOST_UNAIDED
+    count = count_processes(experiment, None if assignment is None else len(assignment.agents), most=most)
     directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
-    bag = directory if share is None or share.home else None
+    bag = directory if assignment is None or assignment.has_recorder else None
     result = RunResult(experiment, bag)
-    kept = interruption or Interruption()
+    signals = interruption or Interruption()
     try:
         with (
             run_channel(channel) as linked,
-            workshop() as folder,
-            surroundings(
-                folder,
-                domain,
-                {**(environment or {}), **(linked.environment(folder) if linked else {})},
-                processes + 2,
+            temporary_directory() as folder,
+            run_environment(
+                folder, domain, {**(environment or {}), **(linked.environment(folder) if linked else {})}, count + 2
             ) as around,
         ):
             variables = around.environment
-            with NodeServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
+            with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 require_middleware(variables, *([fork_server.has_middleware] if fork_server else []))
-                if share is None and linked is None:  # other hosts and users' tools do not reach those of a channel
+                if assignment is None and linked is None:  # tools of the user do not reach a channel
                     view.joined(around.domain)
                 record = replace(record or new_record(experiment), until=until)
                 run_file = folder / "run.json"
                 run_file.write_text(record.to_json(with_key=True), encoding="utf-8")
-                kept.keep()
+                signals.keep()
                 with (
-                    workshop(experiment.agents * room_for(entry_size(record)))
+                    temporary_directory(experiment.agents * room_for(entry_size(record)))
                     if restarts or until
                     else nullcontext() as checkpoints,
                     Supervisor(
@@ -166,39 +166,42 @@ def run_network(
                         variables,
                         last_step=experiment.steps,
                         fork_server=fork_server,
-                        introducer=around.introducer,
-                        ends_hung=share is None,  # with several hosts, the switcher waits for others at its end
+                        relay=around.relay,
+                        hung_timeout=hung_timeout,
+                        ends_hung=assignment is None,  # with several hosts, the switcher waits for others at its end
                     ) as supervisor,
                 ):
-                    plans = plan_network(
+                    processes = lay_out_network(
                         experiment,
                         run_file,
                         bag,
                         checkpoints=checkpoints,
                         use_sim_time=use_sim_time,
                         storage=storage,
-                        share=share,
+                        assignment=assignment,
                         readers=readers,
-                        most=MOST_PROCESSES if around.introducer else MOST_UNAIDED,
+                        most=MOST_PROCESSES if around.relay else MOST_UNAIDED,
                         hosts=linked.agents if linked else (),
                     )
                     if linked:
-                        linked.start(supervisor, plans, record.model, lockstep=experiment.run.pace == "lockstep")
-                    if around.introducer:
-                        around.introducer.introduce(partners(plans, record.model.listens()))
+                        linked.start(supervisor, processes, record.model, lockstep=experiment.run.pace == "lockstep")
+                    if around.relay:
+                        around.relay.connect(partners(processes, record.model.listens()))
                     if pin and experiment.run.pace == "lockstep":
-                        supervisor.cores = place(plans, available_cores(), first=around.domain)
-                    supervisor.start(plans)
+                        supervisor.cores = assign_cores(processes, available_cores(), first=around.domain)
+                    supervisor.start(processes)
                     ending = EarlyEnd(record, checkpoints) if until and checkpoints else None
                     with ending or nullcontext():
-                        view.begin(record, checkpoints if share is None else None, ending.observer if ending else None)
+                        view.begin(
+                            record, checkpoints if assignment is None else None, ending.observer if ending else None
+                        )
                         view.started(supervisor.by_node)
                         _watch(
                             supervisor,
                             experiment,
                             result,
                             restarts,
-                            kept,
+                            signals,
                             view,
                             ending,
                             linked,
@@ -207,24 +210,24 @@ def run_network(
                         view.end()
                     result.until = ending.to_json() if ending else None
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
-                    _collect_failures(supervisor, result, kept, restarts)
-            result.strangers = supervisor.account().strangers()
+                    _collect_failures(supervisor, result, signals, restarts)
+            result.strangers = supervisor.status().rejected_messages()
             result.clocks, _ = supervisor.clocks()
             if linked:
                 result.channel = linked.to_json(supervisor, experiment)
             if bag is not None:
                 try:
-                    with kept.let_through():
+                    with signals.let_through():
                         _settle(bag, result)
                 except KeyboardInterrupt:
                     result.interrupt(signal.SIGINT, "while the bag was read")
             if directory is not None:
                 _keep_logs(folder, directory / "log", result)
-        if (number := kept.take()) is not None and not result.interrupted:
+        if (number := signals.take()) is not None and not result.interrupted:
             result.interrupt(number, "while the logs were kept")
     finally:
         if interruption is None:
-            kept.end()
+            signals.end()
         if directory is not None:
             with suppress(OSError):
                 directory.rmdir()  # if it is empty
@@ -249,7 +252,7 @@ def _watch(
     due = run.speed / experiment.step_length  # steps per second in real time
     lag, clock = (LagDetector(due), ClockDetector()) if run.pace == "realtime" and follow_clock else (None, None)
     events, warned = EventLog(result.events), None
-    will_begin = SWITCHER in supervisor.by_node  # with several hosts, one has it; the others are not told
+    will_begin = SWITCHER in supervisor.by_node  # with several hosts, one has it; the others do not know
     while interruption.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
         if linked:
             linked.look(supervisor)
@@ -258,18 +261,18 @@ def _watch(
         if ending and ending.look(min(supervisor.steps, default=-1), view.note):
             supervisor.last_step = steps = ending.last_step
             view.ends_at(steps)
-        events.look(supervisor.steps, supervisor.account)
+        events.look(supervisor.steps, supervisor.status)
         if not warned and (warned := supervisor.clocks()[1]):
             view.note(warned)
         view.look(supervisor.steps)
         for name in supervisor.dismiss_late():
-            view.note(f"{name} had not left {LATE:g} s after the end of the run: told to end")
+            view.note(f"{name} had not left {LATE:g} s after the end of the run: interrupted")
         reached = min(supervisor.steps, default=-1)
         if clock and (words := clock.update()):
             view.note(words)
             lag = LagDetector(due)
         if stall.update(sum(supervisor.steps)) and 0 <= reached < steps:
-            view.note(f"no step for {stall.stalled:.0f} s: {_standstill(supervisor, result.experiment.names)}")
+            view.note(f"no step for {stall.stalled:.0f} s: {_stall_causes(supervisor, result.experiment.names)}")
         if reached < 0:
             continue
         if lag and reached < steps and (behind := lag.update(reached)):
@@ -282,16 +285,16 @@ def _watch(
         if reached < steps or not result.wall_time:
             result.wall_time = now - began
     supervisor.read_status()  # what was reported between the last look and the end
-    events.look(supervisor.steps, supervisor.account, last=True)
+    events.look(supervisor.steps, supervisor.status, last=True)
     view.look(supervisor.steps)
     if result.wall_time:
         result.rate = min(supervisor.steps, default=0) / result.wall_time
 
 
-def _standstill(supervisor: Supervisor, names: Sequence[str] | None) -> str:
+def _stall_causes(supervisor: Supervisor, names: Sequence[str] | None) -> str:
     """Causes of a stall, as far as they are known; a silent process is stopped, or waits for one that is."""
-    words = [f"{node}: {message}" for node, message in sorted(supervisor.account().waiting.items())]
-    silent = [child.plan.name for child in supervisor.silent]
+    words = [f"{node}: {message}" for node, message in sorted(supervisor.status().waiting.items())]
+    silent = [child.spec.name for child in supervisor.silent]
     if silent:
         words.append("no report from " + ", ".join(silent))
     if not words and supervisor.steps:  # the processes that know are on another host
@@ -305,11 +308,11 @@ def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View
     for child in supervisor.failures:
         if not child.resumes or len(result.restarts) >= restarts:
             return False
-        step = min((supervisor.steps[i] for i in child.plan.agents), default=-1) if supervisor.steps else -1
+        step = min((supervisor.steps[i] for i in child.spec.agents), default=-1) if supervisor.steps else -1
         after = f" after step {step}" if step >= 0 else ""
-        words = f" ({child.last_words()})" if child.process.poll() == CRASHED else ""
-        result.restarts.append(f"{child.plan.name}: {child.failure}{words}{after}, started again")
-        events.killed(child.plan.name, child.plan.agents, step, result.restarts[-1])
+        words = f" ({child.last_line()})" if child.process.poll() == CRASHED else ""
+        result.restarts.append(f"{child.spec.name}: {child.failure}{words}{after}, started again")
+        events.killed(child.spec.name, child.spec.agents, step, result.restarts[-1])
         view.note(result.restarts[-1])
         supervisor.restart(child)
         view.started(supervisor.by_node)
@@ -320,14 +323,14 @@ def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: I
     result.reached = min(supervisor.steps, default=-1)
     if (number := interruption.take()) is not None:
         reached, steps = result.reached, result.experiment.steps
-        unknown = all(child.plan.name != SWITCHER for child in supervisor.children)  # it is on another host
+        unknown = all(child.spec.name != SWITCHER for child in supervisor.children)  # it is on another host
         where = "" if unknown else f"at step {reached} of {steps}" if reached >= 0 else "before step 0"
         result.interrupt(number, where)
     for child in supervisor.failures:
-        words = child.last_words()
-        line = f"{child.plan.name}: {child.failure}" + (f": {words}" if words else "")
+        words = child.last_line()
+        line = f"{child.spec.name}: {child.failure}" + (f": {words}" if words else "")
         if child.resumes and result.restarts:
-            counts = {c.plan.name: c.number - 1 for c in supervisor.children if c.number > 1}
+            counts = {c.spec.name: c.number - 1 for c in supervisor.children if c.number > 1}
             listed = ", ".join(
                 f"{name} {times} times" if times > 1 else f"{name} once" for name, times in counts.items()
             )
@@ -337,7 +340,7 @@ def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: I
 
 def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
     try:
-        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(ACCOUNTS, STEPS, CLOCKS, ROS_LOGS))
+        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(STATUS_FOLDER, STEPS, CLOCKS, ROS_LOGS))
     except OSError as error:
         # The argument of shutil.Error is a list of (from, to, reason).
         reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)

@@ -1,7 +1,11 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Starts the processes of a network, watches them and ends them: none outlives its parent."""
+"""Starts the processes of a network, watches them and ends them: none outlives its parent, none that has hung stays.
+
+A process has hung when its main thread waits, and has not run for a minute, though nobody has stopped it. The main
+thread of a node that waits for others, for its clock, or for a slow reader still runs several times a second.
+"""
 
 from __future__ import annotations
 
@@ -13,17 +17,15 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
-from msg_agents.discovery.relay import Introducer
-from msg_agents.process_layout import CHANNEL, RECORDER, SWITCHER, ProcessPlan, keep_to
-from msg_agents.run.fork_server import NodeServer, NodeStart, Process
-from msg_agents.run.lifeline import SHOW_STACKS, HungDetector
-from msg_agents.run.result import Account, read_accounts, read_clocks, read_steps
+from msg_agents.discovery.relay import DiscoveryRelay
+from msg_agents.process_layout import CHANNEL, RECORDER, SWITCHER, Process, ProcessSpec, pin_to_core
+from msg_agents.run.fork_server import SHOW_STACKS, ForkServer, NodeStart
+from msg_agents.run.result import StatusSummary, read_clocks, read_status_files, read_steps
 from msg_analysis.errors import ExitCode
 
 ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
@@ -34,13 +36,49 @@ AFTER_HANG = ((SHOW_STACKS, 0.5), (signal.SIGKILL, 5.0))
 
 AT_ONCE = 50  # processes that are started together: so many log files are then open
 POLL = 0.02  # s
-LOOK = 1.0  # s between two looks whether processes have hung
-SILENCE = 3.0  # s; accounts are written once a second
+CHECK_PERIOD = 1.0  # s between two checks whether processes have hung
+SILENCE = 3.0  # s; status files are written once a second
 CHANNEL_SILENCE = 10.0  # s after which a channel that reports nothing is given up
 EARLY = 3.0  # s after which an agent that has ended without its last step is not waited for any more
 LATE = 10.0  # s after the end of the run after which a process that has not left is not waited for any more
 CRASHED = 1  # exit code of Python after an uncaught exception
-ACCOUNTS, STEPS, CLOCKS = "accounts", "steps.json", "clocks.json"
+STATUS_FOLDER, STEPS, CLOCKS = "status", "steps.json", "clocks.json"
+
+HUNG = 60.0  # s
+LONGEST_LOOK = 2.0  # s that count at most between two looks: this process may have been stopped with the other
+WAITS = "S"  # of the states of proc(5): neither running, nor waiting for a disk, stopped or traced
+
+
+class HungDetector:
+    """Watches one process; where the system does not say when threads run, no process has ever hung."""
+
+    def __init__(
+        self, pid: int, *, clock: Callable[[], float] = time.monotonic, wall: Callable[[], float] = time.time
+    ) -> None:
+        self._pid, self._clock, self._wall = pid, clock, wall
+        self._ran: str | None = None  # ns for which its main thread had run when it was looked at
+        self._looked, self._latest, self._still = clock(), wall(), 0.0
+
+    def update(self, timeout: float = HUNG) -> str | None:
+        """Look at it, about once a second; in words that it has hung, or None."""
+        now, before, self._ran = self._clock(), self._ran, _run_time(self._pid)
+        elapsed, self._looked = min(now - self._looked, LONGEST_LOOK), now
+        # The system's clock may have been set back. Waits of the middleware then last until it is there again.
+        wall = self._wall()
+        counts = wall >= self._latest and self._ran is not None and self._ran == before
+        self._latest = max(wall, self._latest)
+        self._still = self._still + elapsed if counts else 0.0
+        return f"hung, its main thread has not run for {timeout:g} s" if self._still >= timeout else None
+
+
+def _run_time(pid: int) -> str | None:
+    """For how long the main thread of a process has run [ns], if it waits now and the system counts that (Linux)."""
+    thread = Path(f"/proc/{pid}/task/{pid}")
+    with contextlib.suppress(OSError, IndexError):
+        state = (thread / "stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()[0]
+        ran = (thread / "schedstat").read_text(encoding="ascii").split()[0]
+        return ran if state == WAITS and ran != "0" else None
+    return None
 
 
 def failure_of(code: int) -> str | None:
@@ -54,14 +92,14 @@ def failure_of(code: int) -> str | None:
 class Child:
     """A process of the network."""
 
-    plan: ProcessPlan
+    spec: ProcessSpec
     process: Process
     log: Path  # file of what it printed
     number: int = 1  # of this start; 2: restarted once
     ended: float | None = None  # when it was first seen to have ended with exit code 0 [s]
     early: bool = False  # whether it did so before its last step
-    given_up: str | None = None  # why it was ended
-    dismissed: bool = False  # whether it was told to end because the run was over
+    end_reason: str | None = None  # why it was ended
+    dismissed: bool = False  # whether it was interrupted because the run was over
     detector: HungDetector = field(init=False)
 
     def __post_init__(self) -> None:
@@ -73,9 +111,9 @@ class Child:
         return self.process.poll() is None
 
     @property
-    def age_of_account(self) -> float:
-        """Seconds since it last wrote its account; inf: never."""
-        path = self.log.parent / ACCOUNTS / f"{self.plan.name}.{self.number}.json"
+    def status_age(self) -> float:
+        """Seconds since it last wrote its status file; inf: never."""
+        path = self.log.parent / STATUS_FOLDER / f"{self.spec.name}.{self.number}.json"
         try:
             return time.time() - path.stat().st_mtime
         except OSError:
@@ -90,8 +128,8 @@ class Child:
     def failure(self) -> str | None:
         """How it failed, in words; None if it is running or has ended well."""
         code = self.process.poll()
-        if self.given_up:
-            return self.given_up
+        if self.end_reason:
+            return self.end_reason
         if self.early:
             return f"exit code {code} before its last step"
         if self.dismissed and code == ExitCode.INCOMPLETE:
@@ -106,13 +144,13 @@ class Child:
         try. It does not after bad input, failed discovery or an order to stop.
         """
         code = self.process.poll()
-        if not self.plan.resumes or code is None:
+        if not self.spec.resumes or code is None:
             return False
         return code < 0 or (code == CRASHED and self.number == 1)
 
-    def last_words(self) -> str:
+    def last_line(self) -> str:
         """The last line that it printed; none of one that was ended, since it did not say why."""
-        if self.given_up:
+        if self.end_reason:
             return ""
         with contextlib.suppress(OSError):
             lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
@@ -133,75 +171,78 @@ class Supervisor:
     steps: list[int] = field(default_factory=list)  # newest step of every agent, as reported
     cores: Mapping[str, int] = field(default_factory=dict)  # by name of the process; the others are not pinned
     last_step: int = 0  # of the run
-    fork_server: NodeServer | None = None  # without one, or when it has ended, every child starts on its own
-    introducer: Introducer | None = None  # without one, the children look for each other
+    fork_server: ForkServer | None = None  # without one, or when it has ended, every child starts on its own
+    relay: DiscoveryRelay | None = None  # without one, the children look for each other
     namespaces: Mapping[str, int] = field(default_factory=dict)  # descriptors by name of the process; else that of ours
     options: Mapping[str, Sequence[str]] = field(default_factory=dict)  # more of them, by name of the process
     ends_hung: bool = False  # whether processes that have hung are ended
+    escalation: Sequence[tuple[signal.Signals, float]] = ESCALATION
+    late: float = LATE
+    hung_timeout: float = HUNG
     channel: Child | None = None  # carries the packets of the others; not one of ``children``: it has no part to do
     _lifeline: tuple[int, int] = field(default=(-1, -1), init=False)
-    _accounts: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
-    _looked: float = field(default=0.0, init=False)  # for processes that have hung [s of the monotonic clock]
+    _status_files: list[Path] = field(default_factory=list, init=False)  # in the order of the starts, restarts included
+    _checked: float = field(default=0.0, init=False)  # for processes that have hung [s of the monotonic clock]
     _over_since: float | None = field(default=None, init=False)  # [s of the monotonic clock]
     _control: socket.socket | None = field(default=None, init=False)  # of the channel, which ends when it is closed
 
-    def start(self, plans: Sequence[ProcessPlan]) -> None:
+    def start(self, processes: Sequence[ProcessSpec]) -> None:
         """Start all processes."""
         self._lifeline = os.pipe()
-        for first in range(0, len(plans), AT_ONCE):
-            self.children += self._start([(plan, 1) for plan in plans[first : first + AT_ONCE]])
+        for first in range(0, len(processes), AT_ONCE):
+            self.children += self._start([(spec, 1) for spec in processes[first : first + AT_ONCE]])
 
     def start_channel(self) -> socket.socket:
         """Start the process of a channel, before all others; the socket at which it waits for ``hand_over``."""
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
-            plan = ProcessPlan(CHANNEL, (CHANNEL, "--control", str(theirs.fileno())))
-            (self.channel,) = self._start([(plan, 1)])
+            spec = ProcessSpec(CHANNEL, (CHANNEL, "--control", str(theirs.fileno())))
+            (self.channel,) = self._start([(spec, 1)])
         return self._control
 
     @property
-    def channel_account(self) -> Path:
-        """The file in which the channel says what it did."""
-        return self.logs / ACCOUNTS / f"{CHANNEL}.1.json"
+    def channel_status(self) -> Path:
+        """The file to which the channel writes what it did."""
+        return self.logs / STATUS_FOLDER / f"{CHANNEL}.1.json"
 
     def restart(self, child: Child) -> None:
         """Start a process that has ended again; the new child takes its place in ``children``."""
         place = self.children.index(child)
-        self.children[place : place + 1] = self._start([(child.plan, child.number + 1)])
+        self.children[place : place + 1] = self._start([(child.spec, child.number + 1)])
 
-    def _start(self, plans: Sequence[tuple[ProcessPlan, int]]) -> list[Child]:
+    def _start(self, specs: Sequence[tuple[ProcessSpec, int]]) -> list[Child]:
         """Start processes; the numbers count the starts of each."""
-        (self.logs / ACCOUNTS).mkdir(exist_ok=True)
+        (self.logs / STATUS_FOLDER).mkdir(exist_ok=True)
         with contextlib.ExitStack() as stack:
-            logs = [stack.enter_context(self._log(plan).open("ab")) for plan, _ in plans]
-            starts = [self._node_start(*each, log.fileno()) for each, log in zip(plans, logs, strict=True)]
+            logs = [stack.enter_context(self._log(spec).open("ab")) for spec, _ in specs]
+            starts = [self._node_start(*each, log.fileno()) for each, log in zip(specs, logs, strict=True)]
             processes: list[Process] = []
             if self.fork_server is not None:
                 processes += self.fork_server.fork_nodes(starts)
             processes += [self._spawn(start) for start in starts[len(processes) :]]
         return [
-            Child(plan, process, self._log(plan), number)
-            for (plan, number), process in zip(plans, processes, strict=True)
+            Child(spec, process, self._log(spec), number)
+            for (spec, number), process in zip(specs, processes, strict=True)
         ]
 
-    def _log(self, plan: ProcessPlan) -> Path:
-        return self.logs / f"{plan.name}.log"
+    def _log(self, spec: ProcessSpec) -> Path:
+        return self.logs / f"{spec.name}.log"
 
-    def _node_start(self, plan: ProcessPlan, number: int, output: int) -> NodeStart:
-        if plan.name == CHANNEL:
-            *command, option, control = plan.arguments
+    def _node_start(self, spec: ProcessSpec, number: int, output: int) -> NodeStart:
+        if spec.name == CHANNEL:
+            *command, option, control = spec.arguments
             return NodeStart(command, {option: int(control)}, output, None)
-        account = self.logs / ACCOUNTS / f"{plan.name}.{number}.json"
-        self._accounts.append(account)
-        arguments = [*plan.arguments, "--account", str(account), *self.options.get(plan.name, ())]
-        if plan.name == SWITCHER:
+        status_file = self.logs / STATUS_FOLDER / f"{spec.name}.{number}.json"
+        self._status_files.append(status_file)
+        arguments = [*spec.arguments, "--account", str(status_file), *self.options.get(spec.name, ())]
+        if spec.name == SWITCHER:
             arguments += ["--steps", str(self.logs / STEPS), "--clocks", str(self.logs / CLOCKS)]
         descriptors = {"--lifeline": self._lifeline[0]}
-        if self.introducer is not None:
-            descriptors["--introduction"] = self.introducer.descriptor
-        if plan.name in self.namespaces:
-            descriptors["--namespace"] = self.namespaces[plan.name]
-        return NodeStart(arguments, descriptors, output, self.cores.get(plan.name))
+        if self.relay is not None:
+            descriptors["--introduction"] = self.relay.descriptor
+        if spec.name in self.namespaces:
+            descriptors["--namespace"] = self.namespaces[spec.name]
+        return NodeStart(arguments, descriptors, output, self.cores.get(spec.name))
 
     def _spawn(self, node: NodeStart) -> Process:
         """Start a process that is not forked."""
@@ -216,63 +257,63 @@ class Supervisor:
             start_new_session=True,
         )
         if node.core is not None:
-            keep_to(process.pid, node.core)
+            pin_to_core(process.pid, node.core)
         return process
 
     def read_status(self) -> None:
         """Read what the switcher has reported, and note agents that have ended too early: their code may end Python."""
         self.steps = read_steps(self.logs / STEPS) or self.steps
-        if self.channel and CHANNEL_SILENCE < self.channel.age_of_account < math.inf and self.channel.running:
-            self.channel.given_up = f"no report for {CHANNEL_SILENCE:g} s, as if it was stopped"
+        if self.channel and CHANNEL_SILENCE < self.channel.status_age < math.inf and self.channel.running:
+            self.channel.end_reason = f"no report for {CHANNEL_SILENCE:g} s, as if it was stopped"
             self.channel.process.send_signal(signal.SIGKILL)
-        if self.ends_hung and time.monotonic() >= self._looked + LOOK:
-            self._looked = time.monotonic()
+        if self.ends_hung and time.monotonic() >= self._checked + CHECK_PERIOD:
+            self._checked = time.monotonic()
             self._end_hung()
-        switching = any(child.running for child in self.children if child.plan.name == SWITCHER)
+        switching = any(child.running for child in self.children if child.spec.name == SWITCHER)
         for child in self.children:
-            if not self.steps or not switching or not child.plan.agents or child.process.poll() != 0:
+            if not self.steps or not switching or not child.spec.agents or child.process.poll() != 0:
                 continue
             child.ended = child.ended or time.monotonic()
-            behind = min(self.steps[agent] for agent in child.plan.agents) < self.last_step
+            behind = min(self.steps[agent] for agent in child.spec.agents) < self.last_step
             child.early = behind and time.monotonic() > child.ended + EARLY
 
     def _end_hung(self) -> None:
         """End processes that have hung: the others would wait for them for ever."""
         for child in self.running:
-            if words := child.detector.update():
-                child.given_up = f"{words} (stacks in log/{child.log.name})"
+            if words := child.detector.update(self.hung_timeout):
+                child.end_reason = f"{words} (stacks in log/{child.log.name})"
                 self._end([child], AFTER_HANG)
 
     def dismiss_late(self) -> list[str]:
-        """Tell processes to end that have not left long after the switcher; the names of those that were just told.
+        """Interrupt processes that have not left long after the switcher; the names of those that are now interrupted.
 
         The middleware may not have given them the end of the run; one that was stopped then is not given it any more.
         """
-        if not any(child.plan.name == SWITCHER and child.ended_well for child in self.children):
+        if not any(child.spec.name == SWITCHER and child.ended_well for child in self.children):
             return []
         self._over_since = self._over_since or time.monotonic()
         late = [child for child in self.awaited if not child.dismissed]
-        if not late or time.monotonic() < self._over_since + LATE:
+        if not late or time.monotonic() < self._over_since + self.late:
             return []
         for child in late:
             child.dismissed = True
             child.process.send_signal(signal.SIGINT)
-        self._end([child for child in late if child.plan.name != RECORDER])  # a recorder may need time for its bag
-        return [child.plan.name for child in late]
+        self._end([child for child in late if child.spec.name != RECORDER])  # a recorder may need time for its bag
+        return [child.spec.name for child in late]
 
     @property
     def by_node(self) -> dict[str, Process]:
         """The newest process of every node."""
-        return {node: child.process for child in self.children for node in child.plan.nodes}
+        return {node: child.process for child in self.children for node in child.spec.nodes}
 
     @property
     def running(self) -> list[Child]:
         """Children that have not ended."""
         return [child for child in self.children if child.running]
 
-    def account(self) -> Account:
+    def status(self) -> StatusSummary:
         """What the nodes have refused, and what they wait for."""
-        return read_accounts(self._accounts)
+        return read_status_files(self._status_files)
 
     def clocks(self) -> tuple[list[dict[str, Any]] | None, str | None]:
         """How far the clocks of several hosts are apart, and a warning."""
@@ -280,21 +321,21 @@ class Supervisor:
 
     @property
     def silent(self) -> list[Child]:
-        """Running children that have not written their account lately."""
+        """Running children that have not written their status file lately."""
         running = self.running + ([self.channel] if self.channel and self.channel.running else [])
-        return [child for child in running if child.age_of_account > SILENCE]
+        return [child for child in running if child.status_age > SILENCE]
 
     @property
     def starting_again(self) -> list[Child]:
-        """Restarted children that have not found all others yet: they write no account before."""
-        return [child for child in self.running if child.number > 1 and child.age_of_account == math.inf]
+        """Restarted children that have not found all others yet: they write no status file before."""
+        return [child for child in self.running if child.number > 1 and child.status_age == math.inf]
 
     @property
     def over(self) -> bool:
         """Whether all have done their part: no process leaves before, and the switcher only after it has said so."""
-        ended = {child.plan.name for child in self.children if child.ended_well}
-        rest = {child.plan.name for child in self.children} - ended
-        if all(child.plan.name != SWITCHER for child in self.children):  # it is on another host
+        ended = {child.spec.name for child in self.children if child.ended_well}
+        rest = {child.spec.name for child in self.children} - ended
+        if all(child.spec.name != SWITCHER for child in self.children):  # it is on another host
             return bool(ended)
         return SWITCHER in ended or (bool(ended) and rest == {SWITCHER})
 
@@ -308,24 +349,23 @@ class Supervisor:
         """Children that failed; after the end of the run, only the recorder can still fail."""
         failed = [child for child in (self.channel, *self.children) if child and child.failure]
         if failed and self.over:
-            return [child for child in failed if child.plan.name == RECORDER]
+            return [child for child in failed if child.spec.name == RECORDER]
         return failed
 
     def stop(self) -> None:
         """End all: first the agents and the switcher, so that the recorder gets all that they sent."""
-        self._end([child for child in self.children if child.plan.name != RECORDER])
-        self._end([child for child in self.children if child.plan.name == RECORDER])
+        self._end([child for child in self.children if child.spec.name != RECORDER])
+        self._end([child for child in self.children if child.spec.name == RECORDER])
         if self.channel and self._control:
             self._control.close()
             self._end([self.channel])
 
-    @staticmethod
-    def _end(children: Sequence[Child], escalation: Sequence[tuple[signal.Signals, float]] = ESCALATION) -> None:
-        for number, patience in escalation:
+    def _end(self, children: Sequence[Child], escalation: Sequence[tuple[signal.Signals, float]] | None = None) -> None:
+        for number, timeout in escalation or self.escalation:
             for child in children:
                 if child.running:
                     child.process.send_signal(number)
-            deadline = time.monotonic() + patience
+            deadline = time.monotonic() + timeout
             while any(child.running for child in children):
                 if time.monotonic() > deadline:
                     break
@@ -336,9 +376,7 @@ class Supervisor:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
         for descriptor in self._lifeline:
             with contextlib.suppress(OSError):

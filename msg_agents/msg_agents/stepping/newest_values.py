@@ -1,13 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""How far the clocks of other hosts are from ours, from the times of messages in both directions.
-
-A message sent at time s of its sender's clock and received at time r of ours has taken r - s plus how far the sender's
-clock is ahead, which is not negative: so r - s bounds the offset from one side, and the same of the other direction
-from the other. The fastest messages bound it best.
-
-What an agent uses in real time: the newest values it has. No ROS, no arithmetic, no clock.
+"""What an agent uses in real time: the newest values it has. No ROS, no arithmetic, no clock.
 
 The agent makes each step when it is due: with the newest graph that it knows and the newest value that it has of every
 neighbour under that graph. Nothing waits, so nothing is buffered.
@@ -18,69 +12,11 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from math import inf
 from typing import Any
 
 from msg_agents.stepping.synchronizer import NOTHING, AgentInputs, Value
 from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.messages.acceptance import Refusal
-
-MILLISECOND = 1e6  # ns
-
-
-@dataclass(slots=True)
-class Offset:
-    """How far another clock is ahead of ours is between these [ns]; infinite: no message in that direction yet."""
-
-    low: float = -inf
-    high: float = inf
-
-    @property
-    def least(self) -> float:
-        """The smallest distance of the clocks that is possible [ns]."""
-        return max(self.low, -self.high, 0.0)
-
-
-class ClockOffsets:
-    """Of the clocks of some nodes, by name."""
-
-    def __init__(self) -> None:
-        self._offsets: dict[str, Offset] = {}
-
-    def hear(self, node: str, sent: int, received: int, at_most: float = inf) -> None:
-        """A message that a node sent at ``sent`` of its clock came at ``received`` of ours.
-
-        ``at_most``: how far its clock is ahead at most, by what it has heard from here; all in ns.
-        """
-        offset = self._offsets.setdefault(node, Offset())
-        offset.low = max(offset.low, float(sent - received))
-        offset.high = min(offset.high, at_most)
-
-    def warning(self, limit: float) -> str | None:
-        """Which clocks are certainly more than ``limit`` [ns] from ours, and how far; None: none is."""
-        apart = {node: offset for node, offset in self._offsets.items() if offset.least > limit}
-        if not apart:
-            return None
-        worst = max(apart, key=lambda node: apart[node].least)
-        ahead = "ahead of" if apart[worst].low > 0 else "behind"
-        return (
-            f"the clocks of {', '.join(sorted(apart))} are not that of the switcher: {worst} is at least "
-            f"{apart[worst].least / MILLISECOND:.1f} ms {ahead} it, more than dt / speed = {limit / MILLISECOND:g} ms: "
-            "synchronise the hosts (NTP, PTP)"
-        )
-
-    def to_json(self) -> list[dict[str, Any]]:
-        """How far each clock is ahead of ours [ms], for JSON; None: not bounded on that side."""
-        return [
-            {"node": node, "ahead_ms": [_milliseconds(offset.low), _milliseconds(offset.high)]}
-            for node, offset in sorted(self._offsets.items())
-        ]
-
-
-def _milliseconds(value: float) -> float | None:
-    return None if abs(value) == inf else value / MILLISECOND
-
 
 CLOCK_MARGIN = 1.0
 """s of the clock by which the clock of another host, or a message from there, may be ahead of ours."""
@@ -215,7 +151,7 @@ class NewestValues(AgentInputs[Value]):
         return {j: self.step - newest for j, newest in self._newest.items()}
 
 
-class NewestOnAir(NewestValues[Value]):
+class NewestReceived(NewestValues[Value]):
     """The same with messages that are lost, or ``delay`` steps old.
 
     Of an agent with a newest state x(n), a step uses the newest of those up to x(n - delay), and the own value where
@@ -225,32 +161,32 @@ class NewestOnAir(NewestValues[Value]):
     def __init__(self, *, delay: int, lost: Callable[[int, int], bool], holds: bool, **options: Any) -> None:
         super().__init__(**options)
         self._delay, self._lost, self._holds = delay, lost, holds
-        self._kept: dict[int, deque[tuple[int, Value]]] = {j: deque() for j in self._newest}
+        self._states: dict[int, deque[tuple[int, Value]]] = {j: deque() for j in self._newest}
 
     def offer(self, agent: int, step: int, value: Value) -> str | None:
         """See NewestValues."""
         refusal = super().offer(agent, step, value)
         if refusal is None and not (self._holds and self._lost(agent, step)):
-            self._kept[agent].append((step, value))
+            self._states[agent].append((step, value))
             self._forget(agent)
         return refusal
 
     def review(self) -> None:
         """See NewestValues."""
         super().review()
-        for j, kept in self._kept.items():
+        for j, states in self._states.items():
             if self._newest[j] == NOTHING:
-                kept.clear()
+                states.clear()
 
     def _forget(self, agent: int) -> int:
         """Drop what is older than the state to use; the newest step that may be used."""
-        kept, usable = self._kept[agent], max(0, self._newest[agent] - self._delay)
-        while len(kept) > 1 and kept[1][0] <= usable:
-            kept.popleft()
+        states, usable = self._states[agent], max(0, self._newest[agent] - self._delay)
+        while len(states) > 1 and states[1][0] <= usable:
+            states.popleft()
         return usable
 
     def _used(self, agent: int) -> tuple[int, Value | None]:
-        usable, kept = self._forget(agent), self._kept[agent]
-        if not kept or kept[0][0] > usable or (not self._holds and self._lost(agent, kept[0][0])):
+        usable, states = self._forget(agent), self._states[agent]
+        if not states or states[0][0] > usable or (not self._holds and self._lost(agent, states[0][0])):
             return NOTHING, None
-        return kept[0]
+        return states[0]

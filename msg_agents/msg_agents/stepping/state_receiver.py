@@ -1,17 +1,16 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Received states: checked, and those from before a restart found again."""
+"""States received by a recorder: batches are checked, and each step is taken once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from array import array
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from msg_agents.stepping.synchronizer import KEPT_AFTER_USE, RESEND_LIMIT, ReceivedSteps, Synchronizer, Value, marks_of
+from msg_agents.stepping.synchronizer import RESEND_LIMIT
 from msg_analysis.bags.states import States, own_layout, run_number
 from msg_analysis.bags.stored_file import gather
 from msg_analysis.common.arrays import BoolArray, IntArray
@@ -20,91 +19,89 @@ from msg_analysis.messages.cdr import CdrError, decode_batch
 from msg_analysis.messages.topics import TRUTHS, Topic
 from msg_analysis.model.run_record import RunRecord
 
+_MASK = 0x3FFFFFFF  # of the bits of a content that are in its hash
+CONSECUTIVE = 64
+"""Steps in a row after which those before them are taken for lost: the reader came late, for example."""
 
-class LookBackSynchronizer(Synchronizer[Value]):
-    """As Synchronizer, but step k uses x_j(``needed``(j, k)), a step that is at most k and does not fall with k.
 
-    Values may come in any order: those that are sent again after a restart come behind newer ones. A value that is
-    older than what is kept anyway, and is still needed, is held.
+def hashes_of(contents: IntArray) -> array[int]:
+    """Hashes of so many contents: numbers of 30 bits, not 0."""
+    return array("i", ((contents & _MASK) + 1).astype(np.int32).tobytes())
+
+
+class ReceivedSteps:
+    """The steps 0 to ``last`` of one agent, in any order: after a restart some come again.
+
+    A hash of 4 bytes per step shows whether a repeated one is the same, up to RESEND_LIMIT steps before and after
+    ``row``, the newest step up to which none is to come any more.
     """
 
-    def __init__(self, *, needed: Callable[[int, int], int], delay: int, **options: Any) -> None:
-        self._needed_step = needed
-        self._held: dict[int, tuple[int, Value]] = {}  # by place
-        self._oldest: list[int] = []  # by place, the step of the value that the next step would use
-        super().__init__(kept=max(KEPT_AFTER_USE, delay + 1), **options)
-        self._look()
+    def __init__(self, last: int) -> None:
+        self.row = -1
+        self._last = last
+        self._chain = (0, 0)  # the step that would continue the newest ones beyond ``row``, and how many these are
+        # 0: not received. Negative: two different ones were.
+        self._hashes = array("i", bytes(4 * min(2 * RESEND_LIMIT, last + 1)))
 
-    def _look(self) -> None:
-        self._oldest = [self._needed_step(j, self.step) for j in self._places]
+    def take(self, step: int, content: int) -> str | None:
+        """Take a step with a hash of its content; None if it is new, else a ``Refusal``.
 
-    def offer(self, agent: int, step: int, value: Value) -> str | None:
-        """See Synchronizer."""
-        place = self._places.get(agent)
-        if place is None:
-            return Refusal.NOT_A_PEER
-        ahead = step - self.step
-        if ahead > self._window + 1:
+        Of two different ones of one step, the second is a contradiction; further ones count as repeated.
+        """
+        if step > self._last:
+            return Refusal.OUT_OF_RANGE
+        if step <= self.row - RESEND_LIMIT:
+            return Refusal.TOO_OLD
+        if step > self.row + 1:
+            following, count = self._chain
+            self._chain = (step + 1, count + 1 if step == following else 1)
+            if self._chain[1] >= CONSECUTIVE:
+                self._move(step - 1)
+        if step > self.row + RESEND_LIMIT:
             return Refusal.TOO_NEW
-        known = self._value(place, step)
-        if known is not None:
-            return Refusal.REPEATED if known == value else Refusal.CONTRADICTION
-        if step < self._oldest[place]:  # of no use, but it shows the progress of the peer
-            if ahead < -self._window - RESEND_LIMIT:
-                return Refusal.TOO_OLD
-            if step <= self._newest[agent]:
-                return Refusal.REPEATED
-        elif ahead >= -self._kept:
-            self._row(step)[place] = value
-        elif step == self._oldest[place]:  # those between it and the kept ones are never used
-            self._held[place] = step, value
-        self._newest[agent] = max(self._newest[agent], step)
-        if self._needed and self._needed.flags[place] and step == self._oldest[place]:
-            self._missing -= 1
-        return None
+        slot, value = step % len(self._hashes), (content & _MASK) + 1
+        known = self._hashes[slot]
+        if not known:
+            self._hashes[slot] = value
+            while self.row < self._last and self._hashes[(self.row + 1) % len(self._hashes)]:
+                self._move(self.row + 1)
+            return None
+        if known == value or known < 0:
+            return Refusal.REPEATED
+        self._hashes[slot] = -known
+        return Refusal.CONTRADICTION
 
-    def known(self, agent: int, step: int) -> Value:
-        """See Synchronizer."""
-        value = self._value(self._places[agent], step)
-        assert value is not None
-        return value
+    def take_row(self, first: int, hashes: array[int]) -> bool:
+        """Take the steps from ``first`` on at once, if they follow ``row`` and all are new; else False, and none."""
+        size, last = len(self._hashes), first + len(hashes) - 1
+        slot = first % size
+        end = slot + len(hashes)
+        if first != self.row + 1 or last > self._last or end > size or any(self._hashes[slot:end]):
+            return False
+        self._hashes[slot:end] = hashes
+        self._move(last)
+        while self.row < self._last and self._hashes[(self.row + 1) % size]:
+            self._move(self.row + 1)
+        return True
 
-    def inputs(self) -> tuple[int, list[Value]]:
-        """See Synchronizer: the states x_j(needed(j, step))."""
-        assert self._needed is not None
-        found = [self._value(place, step) for place, step in enumerate(self._oldest)]
-        return self._mode, list(self._needed.pick(found))
-
-    def advance(self) -> None:
-        """See Synchronizer."""
-        leaving, row = self.step - self._kept, self._row(self.step - self._kept)
-        for j, place in self._places.items():
-            value = row[place]
-            if value is not None and self._needed_step(j, self.step + 1) == leaving:
-                self._held[place] = leaving, value
-        super().advance()
-
-    def _plan(self) -> None:
-        """See Synchronizer."""
-        self._look()
-        super()._plan()
-        if self._needed is not None:
-            found = [self._value(place, step) for place, step in enumerate(self._oldest)]
-            self._missing = self._needed.pick(found).count(None)
-
-    def _value(self, place: int, step: int) -> Value | None:
-        held = self._held.get(place)
-        if held is not None and held[0] == step:
-            return held[1]
-        return self._row(step)[place] if step >= self.step - self._kept else None
-
-    def _next(self, place: int) -> tuple[int, Value | None]:
-        """See Synchronizer."""
-        return self._oldest[place], self._value(place, self._oldest[place])
+    def _move(self, row: int) -> None:
+        """Set ``row``; the steps that are then within reach take the places of old ones."""
+        size = len(self._hashes)
+        step = max(self.row, row - size) + RESEND_LIMIT + 1
+        end = min(row + RESEND_LIMIT, self._last) + 1
+        if end - step == 1:  # in order, one after the other
+            self._hashes[step % size] = 0
+            step = end
+        while step < end:
+            slot = step % size
+            count = min(end - step, size - slot)
+            self._hashes[slot : slot + count] = array("i", bytes(4 * count))
+            step += count
+        self.row = row
 
 
 _WORD = 4  # bytes; every message in the agents' layout is a multiple of it
-_MARK_SHIFT = np.uint64(34)  # the 30 highest bits of a sum are the mark of a message
+_HASH_SHIFT = np.uint64(34)  # the 30 highest bits of a sum are the hash of a message
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,7 +135,7 @@ class StateReceiver:
         self._single: list[bytes] = []
         self._refused: list[tuple[str, str]] = []  # of these
         self._filled = 0
-        # Odd numbers, the same in every run: two messages have the same mark with probability 2^-30.
+        # Odd numbers, the same in every run: two messages have the same hash with probability 2^-30.
         words = -(-self._frame.size // _WORD)
         self._weights = np.random.Generator(np.random.PCG64(0)).integers(0, 2**63, words, dtype=np.uint64) * 2 + 1
 
@@ -165,9 +162,9 @@ class StateReceiver:
         states, _ = own_layout(data, start, size, np.arange(len(start)))
         good = self._possible(states)
         if not good.all() or len(states) < len(start):
-            kept = np.zeros(len(start), np.bool_)
-            kept[states.position[good]] = True
-            for index in np.flatnonzero(~kept).tolist():
+            accepted = np.zeros(len(start), np.bool_)
+            accepted[states.position[good]] = True
+            for index in np.flatnonzero(~accepted).tolist():
                 refused.append(self._fault(data[start[index] : start[index] + size[index]]))
             states = states[good]
         agent, step = states.agent - 1, states.step
@@ -183,7 +180,7 @@ class StateReceiver:
         if not len(agent):
             return new
         order = np.argsort(agent.astype(np.uint16), kind="stable")  # a radix sort; a bag has fewer topics than 2^16
-        agents, steps, marks = agent[order], step[order], marks_of(contents[order])
+        agents, steps, hashes = agent[order], step[order], hashes_of(contents[order])
         first = np.flatnonzero(np.diff(agents, prepend=-1))  # of each agent
         follows = np.diff(steps, prepend=0) == 1
         follows[first] = True
@@ -191,7 +188,7 @@ class StateReceiver:
         ends = [*first[1:].tolist(), len(agents)]
         for i, begin, end, row in zip(agents[first].tolist(), first.tolist(), ends, in_a_row, strict=True):
             received = self._received[i]
-            if row and received.take_row(int(steps[begin]), marks[begin:end]):
+            if row and received.take_row(int(steps[begin]), hashes[begin:end]):
                 continue  # as nearly always
             its = order[begin:end]
             for index, k, content in zip(its.tolist(), step[its].tolist(), contents[its].tolist(), strict=True):
@@ -249,4 +246,4 @@ class StateReceiver:
             alike = np.flatnonzero(size == length)
             words = gather(data, start[alike], length).view("<u4").reshape(len(alike), -1)
             sums[alike] = words.astype(np.uint64) @ self._weights[: words.shape[1]]
-        return (sums >> _MARK_SHIFT).astype(np.int64)
+        return (sums >> _HASH_SHIFT).astype(np.int64)

@@ -12,16 +12,12 @@ the agent that is furthest behind is ahead of none, and all that it waits for ha
 from __future__ import annotations
 
 import time
-from array import array
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any, Generic, Protocol, Self, TypeVar
 
-import numpy as np
-
-from msg_analysis.common.arrays import IntArray
 from msg_analysis.messages.acceptance import Refusal
 
 Value = TypeVar("Value")
@@ -37,7 +33,7 @@ class AgentInputs(Generic[Value]):
         agent: int,
         steps: int,  # N
         inputs: Sequence[Sequence[int]],  # per mode, the other agents that the agent's row uses, ascending
-        peers: Collection[int],  # every other agent that it ever hears or is heard by; includes ``inputs``
+        peers: Collection[int],  # every other agent with which it ever exchanges states; includes ``inputs``
         start: int = 0,  # the current step, after a takeover
     ) -> None:
         self.agent, self.step, self.steps = agent, start, steps
@@ -69,7 +65,7 @@ class Member(Protocol):
 
 
 class TurnQueue:
-    """Gives turns in the order in which they were asked for, once all ``members`` (a number) have joined.
+    """Gives turns in the order of the requests, once all ``members`` (a number) have joined.
 
     A step of one agent lets others step, and theirs others again: the queue replaces nested calls, which would go as
     deep as the run is long.
@@ -80,10 +76,12 @@ class TurnQueue:
         members: int,
         defer: Callable[[Callable[[], None]], object],  # runs a callback after what is already waiting in the executor
         after: Callable[[], None] = lambda: None,  # is called when turns have been given
+        turn: float = TURN_SLICE,  # s
     ) -> None:
         self._absent = members
         self._defer = defer
         self._after = after
+        self._turn = turn
         self._queue: deque[Member] = deque()
         self._given = True  # turns are being given, or will be: ``ask`` need not start that
 
@@ -102,7 +100,7 @@ class TurnQueue:
 
     def _give(self) -> None:
         self._given = True
-        queue, until = self._queue, time.monotonic() + TURN_SLICE
+        queue, until = self._queue, time.monotonic() + self._turn
         while queue:
             queue.popleft().advance()
             if time.monotonic() > until and queue:
@@ -119,8 +117,8 @@ LOCKSTEP_WINDOW = 64
 RESEND_LIMIT = 6000
 """Most steps that an agent keeps, and sends again when another one was killed; older ones are never sent again."""
 
-KEPT_AFTER_USE = LOCKSTEP_WINDOW
-"""Steps for which a value is kept after its use, to notice a different one for the same step: one of the two is forged.
+HISTORY_STEPS = LOCKSTEP_WINDOW
+"""Steps for which a used value is stored, to notice a different one for the same step: one of the two is forged.
 The true one may come second, when its sender, up to a window behind, makes that step."""
 
 
@@ -152,16 +150,16 @@ class _Uses:
 class Synchronizer(AgentInputs[Value]):
     """The lockstep of one agent; it may be ``window`` steps (>= 0) ahead of a peer. Other options as in AgentInputs.
 
-    ``kept``: steps for which values are kept after they became the newest.
+    ``history``: steps for which values are kept after they became the newest.
     """
 
-    def __init__(self, *, window: int = LOCKSTEP_WINDOW, kept: int = KEPT_AFTER_USE, **options: Any) -> None:
+    def __init__(self, *, window: int = LOCKSTEP_WINDOW, history: int = HISTORY_STEPS, **options: Any) -> None:
         super().__init__(**options)
-        self._window, self._kept = window, kept
+        self._window, self._history = window, history
         self._places = {j: place for place, j in enumerate(self._newest)}  # of the peers in a row
         # The values of a step are in the row (step modulo the number of rows): None where there is none. The rows are
         # those of the last steps, for which values are kept, and of those to come.
-        self._number_of_rows = kept + window + 2
+        self._number_of_rows = history + window + 2
         self._rows: list[list[Value | None]] = [[None] * len(self._places) for _ in range(self._number_of_rows)]
         self._uses = [_Uses.of([self._places[j] for j in row], len(self._places)) for row in self._inputs]
         self._limit = window - 1 if self._newest else self.steps
@@ -191,7 +189,7 @@ class Synchronizer(AgentInputs[Value]):
         self._unplanned = last_step + 1
         self._known.append(_Known(mode, last_step))
         if len(self._known) == 1:
-            self._plan()
+            self._prepare()
         return None
 
     def offer(self, agent: int, step: int, value: Value) -> str | None:
@@ -203,7 +201,7 @@ class Synchronizer(AgentInputs[Value]):
         if ahead > self._window + 1:
             return Refusal.TOO_NEW
         row = self._rows[step % self._number_of_rows]
-        known = row[place] if ahead >= -self._kept else None
+        known = row[place] if ahead >= -self._history else None
         if ahead < 0 or known is not None:
             # Also of a peer that is behind: its value is of no use, but it shows the progress of the peer.
             if known is not None and known != value:
@@ -244,13 +242,13 @@ class Synchronizer(AgentInputs[Value]):
     def advance(self) -> None:
         """Move on to x(step + 1): the step that was ready has been made."""
         step = self.step
-        self._rows[(step - self._kept) % self._number_of_rows] = [None] * len(self._places)
+        self._rows[(step - self._history) % self._number_of_rows] = [None] * len(self._places)
         self.step = step + 1
         if self._known[0].last <= step:
             self._known.popleft()
-        self._plan()
+        self._prepare()
 
-    def _plan(self) -> None:
+    def _prepare(self) -> None:
         """Find out which agents the next step needs, and count those whose state is missing."""
         if not self._known or self.step >= self.steps:
             self._needed, self._missing = None, 1
@@ -273,7 +271,7 @@ class Synchronizer(AgentInputs[Value]):
     def end_at(self, steps: int) -> None:
         """See AgentInputs."""
         super().end_at(steps)
-        self._plan()
+        self._prepare()
 
     def waiting_for(self) -> str:
         """What keeps the agent from its next step, as text (agents from 1)."""
@@ -309,82 +307,83 @@ class Synchronizer(AgentInputs[Value]):
         return max((sum(value is not None for value in values) for values in zip(*to_come, strict=True)), default=0)
 
 
-_MASK = 0x3FFFFFFF  # of the bits of a content that are in its mark
-CONSECUTIVE = 64
-"""Steps in a row after which those before them are taken for lost: the reader came late, for example."""
+class DelayedSynchronizer(Synchronizer[Value]):
+    """As Synchronizer, but step k uses x_j(``needed``(j, k)): an earlier step, which does not decrease with k.
 
-
-def marks_of(contents: IntArray) -> array[int]:
-    """Marks of so many contents: numbers of 30 bits, not 0."""
-    return array("i", ((contents & _MASK) + 1).astype(np.int32).tobytes())
-
-
-class ReceivedSteps:
-    """The steps 0 to ``last`` of one agent, in any order: after a restart some come again.
-
-    A mark of 4 bytes per step tells whether a repeated one is the same, up to RESEND_LIMIT steps before and after
-    ``row``, the newest step up to which none is to come any more.
+    Values may come in any order: those that are sent again after a restart come behind newer ones. A value that is
+    older than what is kept anyway, and is still needed, is held.
     """
 
-    def __init__(self, last: int) -> None:
-        self.row = -1
-        self._last = last
-        self._chain = (0, 0)  # the step that would continue the newest ones beyond ``row``, and how many these are
-        # 0: not received. Negative: two different ones were.
-        self._marks = array("i", bytes(4 * min(2 * RESEND_LIMIT, last + 1)))
+    def __init__(self, *, needed: Callable[[int, int], int], delay: int, **options: Any) -> None:
+        self._needed_step = needed
+        self._held: dict[int, tuple[int, Value]] = {}  # by place
+        self._oldest: list[int] = []  # by place, the step of the value that the next step would use
+        super().__init__(history=max(HISTORY_STEPS, delay + 1), **options)
+        self._find_oldest()
 
-    def take(self, step: int, content: int) -> str | None:
-        """Take a step with a hash of its content; None if it is new, else a ``Refusal``.
+    def _find_oldest(self) -> None:
+        self._oldest = [self._needed_step(j, self.step) for j in self._places]
 
-        Of two different ones of one step, the second is a contradiction; further ones count as repeated.
-        """
-        if step > self._last:
-            return Refusal.OUT_OF_RANGE
-        if step <= self.row - RESEND_LIMIT:
-            return Refusal.TOO_OLD
-        if step > self.row + 1:
-            following, count = self._chain
-            self._chain = (step + 1, count + 1 if step == following else 1)
-            if self._chain[1] >= CONSECUTIVE:
-                self._move(step - 1)
-        if step > self.row + RESEND_LIMIT:
+    def offer(self, agent: int, step: int, value: Value) -> str | None:
+        """See Synchronizer."""
+        place = self._places.get(agent)
+        if place is None:
+            return Refusal.NOT_A_PEER
+        ahead = step - self.step
+        if ahead > self._window + 1:
             return Refusal.TOO_NEW
-        slot, mark = step % len(self._marks), (content & _MASK) + 1
-        known = self._marks[slot]
-        if not known:
-            self._marks[slot] = mark
-            while self.row < self._last and self._marks[(self.row + 1) % len(self._marks)]:
-                self._move(self.row + 1)
-            return None
-        if known == mark or known < 0:
-            return Refusal.REPEATED
-        self._marks[slot] = -known
-        return Refusal.CONTRADICTION
+        known = self._value(place, step)
+        if known is not None:
+            return Refusal.REPEATED if known == value else Refusal.CONTRADICTION
+        if step < self._oldest[place]:  # of no use, but it shows the progress of the peer
+            if ahead < -self._window - RESEND_LIMIT:
+                return Refusal.TOO_OLD
+            if step <= self._newest[agent]:
+                return Refusal.REPEATED
+        elif ahead >= -self._history:
+            self._row(step)[place] = value
+        elif step == self._oldest[place]:  # those between it and the kept ones are never used
+            self._held[place] = step, value
+        self._newest[agent] = max(self._newest[agent], step)
+        if self._needed and self._needed.flags[place] and step == self._oldest[place]:
+            self._missing -= 1
+        return None
 
-    def take_row(self, first: int, marks: array[int]) -> bool:
-        """Take the steps from ``first`` on at once, if they follow ``row`` and all are new; else False, and none."""
-        size, last = len(self._marks), first + len(marks) - 1
-        slot = first % size
-        end = slot + len(marks)
-        if first != self.row + 1 or last > self._last or end > size or any(self._marks[slot:end]):
-            return False
-        self._marks[slot:end] = marks
-        self._move(last)
-        while self.row < self._last and self._marks[(self.row + 1) % size]:
-            self._move(self.row + 1)
-        return True
+    def known(self, agent: int, step: int) -> Value:
+        """See Synchronizer."""
+        value = self._value(self._places[agent], step)
+        assert value is not None
+        return value
 
-    def _move(self, row: int) -> None:
-        """Set ``row``; the steps that are then within reach take the places of old ones."""
-        size = len(self._marks)
-        step = max(self.row, row - size) + RESEND_LIMIT + 1
-        end = min(row + RESEND_LIMIT, self._last) + 1
-        if end - step == 1:  # in order, one after the other
-            self._marks[step % size] = 0
-            step = end
-        while step < end:
-            slot = step % size
-            count = min(end - step, size - slot)
-            self._marks[slot : slot + count] = array("i", bytes(4 * count))
-            step += count
-        self.row = row
+    def inputs(self) -> tuple[int, list[Value]]:
+        """See Synchronizer: the states x_j(needed(j, step))."""
+        assert self._needed is not None
+        found = [self._value(place, step) for place, step in enumerate(self._oldest)]
+        return self._mode, list(self._needed.pick(found))
+
+    def advance(self) -> None:
+        """See Synchronizer."""
+        leaving, row = self.step - self._history, self._row(self.step - self._history)
+        for j, place in self._places.items():
+            value = row[place]
+            if value is not None and self._needed_step(j, self.step + 1) == leaving:
+                self._held[place] = leaving, value
+        super().advance()
+
+    def _prepare(self) -> None:
+        """See Synchronizer."""
+        self._find_oldest()
+        super()._prepare()
+        if self._needed is not None:
+            found = [self._value(place, step) for place, step in enumerate(self._oldest)]
+            self._missing = self._needed.pick(found).count(None)
+
+    def _value(self, place: int, step: int) -> Value | None:
+        held = self._held.get(place)
+        if held is not None and held[0] == step:
+            return held[1]
+        return self._row(step)[place] if step >= self.step - self._history else None
+
+    def _next(self, place: int) -> tuple[int, Value | None]:
+        """See Synchronizer."""
+        return self._oldest[place], self._value(place, self._oldest[place])

@@ -16,12 +16,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from msg_agents.recovery import MARK, StopFiles, entry_size, published_size, room_for
+from msg_agents.recovery import FOOTER, StopFiles, entry_size, published_size, room_for
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.common.resources import one_blas_thread
@@ -48,7 +47,7 @@ class CheckpointReader:
         experiment = record.experiment
         self._directory, self._agents, self._width = directory, experiment.agents, experiment.width
         size, self._beside = entry_size(record), published_size(record)
-        self._total, self._slot = room_for(size), size + MARK.size
+        self._total, self._slot = room_for(size), size + FOOTER.size
         self._size, self._capacity = size, self._total // self._slot
         self._rings: list[AnyArray] = []  # (capacity, slot) bytes of each agent
         self._next = 0
@@ -120,18 +119,18 @@ class CheckpointReader:
         for ring in self._rings:
             head = np.ascontiguousarray(ring[slots, : STATE_HEAD.itemsize]).view(STATE_HEAD)[:, 0]
             stamp = head["seconds"].astype(np.int64) * SECOND + head["nanoseconds"]
-            mark = np.ascontiguousarray(ring[slots, self._size :]).view("<u8")[:, 1]
-            found.append(np.where(mark == steps + 1, stamp, -1))
+            number = np.ascontiguousarray(ring[slots, self._size :]).view("<u8")[:, 1]
+            found.append(np.where(number == steps + 1, stamp, -1))
         return np.stack(found, axis=1)
 
     def _read(self, ring: AnyArray, steps: IntArray) -> tuple[AnyArray, IntArray, BoolArray]:
         """Slots (b, slot), lengths of the entries in them (b,), and whether they still held these steps (b,)."""
         slots = steps % self._capacity
         data = ring[slots]
-        marks = np.ascontiguousarray(data[:, self._size :]).view("<u8")
+        footers = np.ascontiguousarray(data[:, self._size :]).view("<u8")
         again = np.ascontiguousarray(ring[slots, self._size :]).view("<u8")
-        whole = (marks[:, 1] == steps + 1) & (again[:, 1] == steps + 1)
-        return data, np.where(whole, marks[:, 0], self._size).astype(np.int64), whole
+        whole = (footers[:, 1] == steps + 1) & (again[:, 1] == steps + 1)
+        return data, np.where(whole, footers[:, 0], self._size).astype(np.int64), whole
 
     @staticmethod
     def _numbers(data: AnyArray, end: IntArray, count: int) -> FloatArray:
@@ -155,7 +154,7 @@ class CheckpointReader:
 
 
 PERIOD = 0.5  # s between two updates
-FAREWELL = 2.0  # s for the states that are left when the run ends
+SHUTDOWN_TIMEOUT = 2.0  # s for the states that are left when the run ends
 NICE = 10  # of the thread: on a busy machine the network goes first
 MOST_NODES = 20
 """Up to this many agents, each gets a standard error; for more it would cost the network too much CPU time."""
@@ -192,7 +191,7 @@ class RunObserver:
         self._last = step
 
     def end(self) -> None:
-        """Process what is there by now, for about ``FAREWELL`` s at most, and stop; the last report stays."""
+        """Process what is there by now, for about ``SHUTDOWN_TIMEOUT`` s at most, and stop; the last report stays."""
         self._over.set()
         self._thread.join()
 
@@ -208,7 +207,7 @@ class RunObserver:
                     self._reader.keep(estimate.log)
                 while not self._over.wait(PERIOD):
                     self._follow(estimate, math.inf)
-                self._follow(estimate, time.monotonic() + FAREWELL)
+                self._follow(estimate, time.monotonic() + SHUTDOWN_TIMEOUT)
         except InputError as error:
             self.note = str(error)
         except Exception as error:
@@ -312,7 +311,5 @@ class EarlyEnd:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.observer.end()

@@ -9,7 +9,6 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Group, RenderableType
@@ -18,6 +17,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from msg_agents.process_layout import Process
 from msg_agents.terminal import JobControl
 from msg_agents.watch.observer import RunObserver
 from msg_agents.watch.snapshot import Snapshot, SnapshotSource, run_description, snapshot_document
@@ -30,7 +30,7 @@ from msg_analysis.report.figures import shorten
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from msg_agents.run.fork_server import Process
+    from msg_agents.process_layout import Process
     from msg_agents.watch.web_server import WebServer
     from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.inference.estimates import Estimate
@@ -119,13 +119,17 @@ def _speed(snapshot: Snapshot) -> list[str]:
 
 def _progress(snapshot: Snapshot, experiment: Experiment, width: int) -> RenderableType:
     last = snapshot.last or experiment.steps
-    share = snapshot.reached / last
-    parts = [f"step {snapshot.reached} of {last}", f"{100 * share:.0f} %", *_speed(snapshot)]
+    fraction = snapshot.reached / last
+    parts = [f"step {snapshot.reached} of {last}", f"{100 * fraction:.0f} %", *_speed(snapshot)]
     if snapshot.left is not None:
         parts.append(f"{_duration(snapshot.left)} left")
     text = "  ".join(parts)
     bar = ProgressBar(
-        total=1.0, completed=share, width=max(width - len(text) - 2, 4), complete_style="cyan", finished_style="green"
+        total=1.0,
+        completed=fraction,
+        width=max(width - len(text) - 2, 4),
+        complete_style="cyan",
+        finished_style="green",
     )
     line = Table.grid(padding=(0, 2, 0, 0))
     line.add_row(Text(text, no_wrap=True, overflow="ellipsis"), bar)
@@ -264,11 +268,9 @@ class Display:
             self._jobs.__enter__()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.panel:
-            self._jobs.__exit__(kind, error, trace)
+            self._jobs.__exit__(*_)
             self._live.stop()
 
     @property
@@ -308,10 +310,10 @@ LINES = 10.0  # s between two lines where there is no terminal
 class RunView(View):
     """Shows a run in all these ways; a context."""
 
-    def __init__(self, experiment: Experiment, web: WebServer | None = None, *, tells_domain: bool = True) -> None:
+    def __init__(self, experiment: Experiment, web: WebServer | None = None, *, prints_domain: bool = True) -> None:
         from msg_analysis.common.text import SafeConsole
 
-        self._experiment, self._tells_domain = experiment, tells_domain
+        self._experiment, self._prints_domain = experiment, prints_domain
         self._console = SafeConsole(stderr=True)
         self.display = Display(self._console, web, panel=self._console.is_terminal, transient=True)
         self._source = SnapshotSource(experiment)
@@ -320,7 +322,7 @@ class RunView(View):
         self._last_step = experiment.steps
         self._note: str | None = None
         self._begun = False
-        self._shown, self._told = 0.0, time.monotonic()
+        self._shown, self._printed = 0.0, time.monotonic()
         self._steps: Sequence[int] = ()
         self._processes: list[Process | None] = [None] * experiment.agents  # by agent; those of this host
         self._replaced: set[int] = set()  # agents that have got a new process since the last look
@@ -330,11 +332,9 @@ class RunView(View):
         self.look((), force=True)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.end()
-        self.display.__exit__(kind, error, trace)
+        self.display.__exit__(*_)
 
     def note(self, line: str) -> None:
         """Print a note, above the panel; of a run that has begun, it is an event on the page."""
@@ -344,7 +344,7 @@ class RunView(View):
 
     def joined(self, domain: int) -> None:
         """Say where the run is, for whoever wants to watch it."""
-        if self._tells_domain or self.display.panel:
+        if self._prints_domain or self.display.panel:
             self.note(f"ROS_DOMAIN_ID {domain}: to watch the run, msg-agents live --domain {domain}")
 
     def begin(self, record: RunRecord, checkpoints: Path | None, observer: RunObserver | None = None) -> None:
@@ -396,8 +396,8 @@ class RunView(View):
         report, note = (observer.report, observer.note) if observer else (None, None)
         snapshot = self._source.snapshot(steps, report, note or self._note, self._ended())
         self.display.draw(snapshot, self._experiment)
-        if not self.display.panel and now - self._told >= LINES and snapshot.reached >= 0:
-            self._told = now
+        if not self.display.panel and now - self._printed >= LINES and snapshot.reached >= 0:
+            self._printed = now
             self._console.print(plain_line(snapshot, self._experiment), soft_wrap=True, highlight=False, markup=False)
 
     def end(self) -> None:

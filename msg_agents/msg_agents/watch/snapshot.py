@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -32,12 +32,13 @@ SILENT = 1.0  # s without a new step after which a page shows an agent as silent
 class StepRates:
     """Steps per second of every agent over the last ``WINDOW`` seconds."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
         self._seen: deque[tuple[float, list[int]]] = deque()
 
     def add(self, steps: Sequence[int]) -> None:
         """Take the newest step of every agent, by index."""
-        now = time.monotonic()
+        now = self._clock()
         if self._seen and now - self._seen[-1][0] < GRAIN:
             return
         self._seen.append((now, list(steps)))
@@ -65,15 +66,15 @@ class StepRates:
 class Presence:
     """Which agents make no new steps, and since when."""
 
-    def __init__(self, names: Sequence[str] | None) -> None:
-        self._names = names
+    def __init__(self, names: Sequence[str] | None, clock: Callable[[], float]) -> None:
+        self._names, self._clock = names, clock
         self._steps: list[int] = []
         self._moved: list[float] = []  # when each made its newest step [s]
         self.gone: set[int] = set()  # agents (from 0) whose process has ended, until a new one makes a step
 
     def add(self, steps: Sequence[int], ended: Iterable[int]) -> list[str]:
         """Take the newest step of every agent, by index, and the agents whose process has ended; what is new."""
-        now = time.monotonic()
+        now = self._clock()
         if len(steps) != len(self._steps):
             self._steps, self._moved = list(steps), [now] * len(steps)
         back = [agent for agent, (old, new) in enumerate(zip(self._steps, steps, strict=True)) if new > old]
@@ -85,7 +86,7 @@ class Presence:
 
     def ages(self) -> list[float]:
         """Seconds since each agent has made its newest step."""
-        now = time.monotonic()
+        now = self._clock()
         return [now - moved for moved in self._moved]
 
 
@@ -149,10 +150,11 @@ class Snapshot:
 class SnapshotSource:
     """Makes snapshots of a run from the steps that its agents have reached."""
 
-    def __init__(self, experiment: Experiment) -> None:
+    def __init__(self, experiment: Experiment, clock: Callable[[], float] = time.monotonic) -> None:
         self._steps = experiment.steps
         self._last: int | None = None  # where the run ends early
-        self._sojourns, self._rates, self._presence = SojournFinder(experiment), StepRates(), Presence(experiment.names)
+        self._sojourns, self._rates = SojournFinder(experiment), StepRates(clock)
+        self._presence = Presence(experiment.names, clock)
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
         self._refused: dict[str, int] = {}
         self._reached = -1
@@ -166,11 +168,7 @@ class SnapshotSource:
         self._events.append(Event(self._reached, text))
 
     def snapshot(
-        self,
-        steps: Sequence[int],
-        report: LiveReport | None = None,
-        note: str | None = None,
-        ended: Iterable[int] = (),
+        self, steps: Sequence[int], report: LiveReport | None = None, note: str | None = None, ended: Iterable[int] = ()
     ) -> Snapshot:
         """The snapshot now, from the newest step of every agent (-1: none; empty before the start).
 

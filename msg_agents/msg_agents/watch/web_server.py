@@ -23,7 +23,6 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from msg_analysis.common.text import finite
@@ -37,7 +36,7 @@ HISTORY = 600
 SEND_TIMEOUT = 10.0  # s for a browser to take what it is sent
 ALIVE = 5.0  # s after which a comment is sent if there is nothing new, to detect lost browsers
 HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^:@/\[\]]+)(?::\d+)?")  # of a Host header: name, port
-FAREWELL = 1.5  # s for telling the browsers of the end
+SHUTDOWN_TIMEOUT = 1.5  # s for sending the end to the browsers
 REPORT_TIME = 5.0  # s for them to fetch the report after that
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
@@ -55,7 +54,7 @@ class WebServer:
     Its methods may be called from any thread. InputError: the port is taken, or the address is not one of this machine.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, *, request_timeout: float = REQUEST_TIME) -> None:
         self._changed = threading.Condition()
         self._number = 0  # of the newest change
         self._setting: dict[str, Any] | None = None
@@ -66,10 +65,10 @@ class WebServer:
         self._history: deque[list[float | None]] = deque(maxlen=HISTORY)
         self._browsers: dict[_Handler, None] = {}  # in the order in which they came
         self._report: bytes | None = None
-        self._fetching = 0  # browsers that have been told of it and have not fetched it
+        self._fetching = 0  # browsers that have been sent the end and have not fetched it
         try:
             family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-            self._server = _Server(self, host, port, family)
+            self._server = _Server(self, host, port, family, request_timeout)
         except OSError as error:
             reason = error.strerror or str(error)
             raise InputError(
@@ -84,16 +83,14 @@ class WebServer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def begin(self, setting: dict[str, Any]) -> None:
         """Show a run, given by ``snapshot.run_description``."""
         with self._changed:
             self._setting = finite(setting)
-            self._tell()
+            self._notify()
 
     def show(self, moment: dict[str, Any]) -> None:
         """Show the current state of the run, given by ``snapshot.snapshot_document``."""
@@ -108,7 +105,7 @@ class WebServer:
             ):
                 keys = ("measured", "predicted", "standard_error")
                 self._history.append(finite([moment["values_step"], *(system[key] for key in keys)]))
-            self._tell()
+            self._notify()
 
     def end(self, words: dict[str, Any], report: Path | None = None) -> None:
         """Show that the run is over (first call only): ``words`` are "text", and "verdict" or None.
@@ -122,7 +119,7 @@ class WebServer:
             if self._ending is None:
                 self._report = content
                 self._ending = finite({**words, "report": str(report) if content is not None else None})
-            self._tell()
+            self._notify()
 
     def report(self) -> bytes | None:
         """The report for a browser; None: there is none."""
@@ -135,9 +132,9 @@ class WebServer:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Tell the browsers that the run is over, give them the report, and stop serving; a few seconds at most."""
+        """Show the browsers that the run is over, give them the report, and stop serving; a few seconds at most."""
         self.end({"text": "The run has ended.", "verdict": None})
-        deadline = time.monotonic() + FAREWELL
+        deadline = time.monotonic() + SHUTDOWN_TIMEOUT
         with self._changed:
             while self._browsers and (left := deadline - time.monotonic()) > 0:
                 self._changed.wait(left)
@@ -148,7 +145,7 @@ class WebServer:
         self._server.server_close()
         self._thread.join()
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         self._number += 1
         self._changed.notify_all()
 
@@ -163,36 +160,36 @@ class WebServer:
             self._browsers[handler] = None
         try:
             handler.start_events()
-            told, number = dict[str, int](), -1
+            sent_events, number = dict[str, int](), -1
             while True:
                 with self._changed:
                     self._changed.wait_for(lambda: self._number != number, ALIVE)  # noqa: B023  called here and now
                     number = self._number
-                    events = self._events(told)
+                    events = self._events(sent_events)
                 sent = handler.send_events(events)
-                if sent and "end" in told and self._report is not None:
+                if sent and "end" in sent_events and self._report is not None:
                     with self._changed:
                         self._fetching += 1
-                if not sent or "end" in told:
+                if not sent or "end" in sent_events:
                     return
         finally:
             with self._changed:
                 self._browsers.pop(handler, None)
                 self._changed.notify_all()
 
-    def _events(self, told: dict[str, int]) -> list[tuple[str, str]]:
-        """What a browser has not been told, as JSON; ``told``: the numbers of what it has."""
+    def _events(self, sent: dict[str, int]) -> list[tuple[str, str]]:
+        """What a browser has not been sent, as JSON; ``sent``: the numbers of what it has."""
         events: list[tuple[str, str]] = []
-        if self._setting is not None and "setting" not in told:
-            told["setting"] = 1
+        if self._setting is not None and "setting" not in sent:
+            sent["setting"] = 1
             events += [("setting", json.dumps(self._setting)), ("history", json.dumps(list(self._history)))]
-        if self._moment is not None and "setting" in told:
-            if self._traces != told.get("trace", 0):
-                told["trace"] = self._traces
+        if self._moment is not None and "setting" in sent:
+            if self._traces != sent.get("trace", 0):
+                sent["trace"] = self._traces
                 events.append(("trace", self._trace_sent))
             events.append(("moment", json.dumps(self._moment)))
         if self._ending is not None:
-            told["end"] = 1
+            sent["end"] = 1
             events.append(("end", json.dumps(self._ending)))
         return events
 
@@ -203,8 +200,10 @@ class _Server(ThreadingHTTPServer):
     allow_reuse_address = True
     request_queue_size = 64
 
-    def __init__(self, web: WebServer, host: str, port: int, family: socket.AddressFamily) -> None:
-        self.address_family = family
+    def __init__(
+        self, web: WebServer, host: str, port: int, family: socket.AddressFamily, request_timeout: float
+    ) -> None:
+        self.address_family, self._request_timeout = family, request_timeout
         self.web = web
         self.page = _whole_page()
         self.names: set[str] | None = None  # allowed in the Host header; None: any
@@ -242,7 +241,7 @@ class _Server(ThreadingHTTPServer):
 
     def service_actions(self) -> None:
         """End connections whose request does not arrive; called several times a second."""
-        latest = time.monotonic() - REQUEST_TIME
+        latest = time.monotonic() - self._request_timeout
         with self._lock:
             for connection, begun in self._connections.items():
                 if begun is not None and begun < latest:

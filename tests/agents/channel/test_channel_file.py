@@ -10,27 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from networks import experiment
 
 from msg_agents.channel.channel_file import BASE, Channel, ChannelSpec, PairSpec, TwoStates, json_schema
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.problems import ExperimentError
 
 ROOT = Path(__file__).parents[3]
 TWO = {"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}}
-
-
-def experiment(**run: Any) -> Experiment:
-    return Experiment.parse(
-        {
-            "name": "net",
-            "problem": "consensus",
-            "time": "continuous",
-            "graphs": {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"arcs": [[5, 1]]}},
-            "switching": {"generator": [[-1, 1], [1, -1]]},
-            "run": {"dt": 0.05, "duration": 10, "replicas": 1, "seed": 1, **run},
-        }
-    )
 
 
 def parse(**document: Any) -> Channel:
@@ -53,7 +40,7 @@ def test_by_default_every_process_is_a_host_and_nothing_is_lost() -> None:
 
 
 def test_processes_with_several_agents_are_hosts() -> None:
-    channel = Channel.parse({}, experiment(processes=2))
+    channel = Channel.parse({}, experiment(run={"processes": 2}))
     assert channel.hosts == {BASE: (), "agents_1_to_2": (0, 1), "agents_3_to_5": (2, 3, 4)}
     assert [channel.host_of(agents) for agents in ((0, 1), (2, 3, 4), ())] == ["agents_1_to_2", "agents_3_to_5", BASE]
 

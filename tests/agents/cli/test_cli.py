@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
+from networks import document as net
 
 pytest.importorskip("rclpy")
 
@@ -29,15 +30,8 @@ PROGRAM = Path(sys.executable).with_name("msg-agents")
 COMMANDS = ["agent", "check", "prepare", "recorder", "run", "switcher"]
 
 
-def document(**run: Any) -> dict[str, Any]:
-    return {
-        "name": "small",
-        "problem": "consensus",
-        "time": "continuous",
-        "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
-        "switching": {"generator": [[-1, 1], [1, -1]]},
-        "run": {"dt": 0.05, "duration": 5, "seed": 5, **run},
-    }
+def document() -> dict[str, Any]:
+    return net(3, name="small", run={"duration": 5, "replicas": 1, "seed": 5})
 
 
 def call(*arguments: str | Path, directory: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -104,6 +98,11 @@ def run_file(tmp_path: Path) -> Path:
         ({}, ["--duration", "0.07"], ["run.duration"]),
         ({}, ["--domain", "500"], ["--domain", "500"]),
         ({}, ["--seed", "many"], ["--seed"]),
+        (
+            {},
+            ["--delivery", "best_effort"],
+            ["--delivery: run.delivery: best_effort: in lockstep expected reliable, since"],
+        ),
     ],
     ids=lambda value: json.dumps(value) if isinstance(value, dict) else " ".join(value),
 )
@@ -121,25 +120,38 @@ def test_experiments_that_cannot_be_run(
     assert not (tmp_path / "runs").exists()  # nothing half-done
 
 
+def test_channel_files(experiment: Path, tmp_path: Path) -> None:
+    channel = tmp_path / "channel.yaml"
+    channel.write_text("default: {loss: 2, delay: 3}\n")
+    refused(call("run", experiment, "--channel", channel), "channel.yaml: 2 problems")
+    channel.write_text("{}\n")
+    options = ("--channel", channel, "--pace", "realtime", "--use-sim-time")
+    refused(call("run", experiment, *options), "--use-sim-time: not with --channel")
+
+
+def test_files_of_which_no_run_is_known(experiment: Path, tmp_path: Path) -> None:
+    for words, message in (
+        (["--bag", tmp_path], "not a bag: expected metadata.yaml, .mcap or .db3 files"),
+        (["--experiment", experiment], "not a run record (JSONDecodeError"),
+        (["--experiment", tmp_path / "none.json"], "cannot be read"),
+        (["--experiment", experiment, "--bag", tmp_path], "--bag and --experiment: expected at most one of them"),
+    ):
+        refused(call("live", *words), message)
+
+
 @pytest.mark.parametrize(("out", "reason"), [("small.yaml", "is a file"), ("small.yaml/x", "Not a directory")])
 def test_a_place_where_no_bag_can_be_made(experiment: Path, out: str, reason: str) -> None:
     place = experiment.parent / out
     refused(call("run", experiment, "--out", place), f"error: --out: {place}: ", reason, "give a directory")
     assert list(experiment.parent.iterdir()) == [experiment]
+    assert experiment.read_text() == yaml.safe_dump(document())
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
-    refused(execute("run", tmp_path / "nowhere.yaml"), "nowhere.yaml")
+    refused(call("run", tmp_path / "nowhere.yaml"), "nowhere.yaml")
     refused(call("run", tmp_path), str(tmp_path))
     (tmp_path / "binary").write_bytes(bytes(range(256)))
     refused(call("run", tmp_path / "binary"), "binary")
-
-
-def test_out_is_not_a_directory(experiment: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("mine")
-    refused(call("run", experiment, "--out", tmp_path / "file"), str(tmp_path / "file"))
-    refused(call("run", experiment, "--out", tmp_path / "file" / "below"), str(tmp_path / "file"))
-    assert (tmp_path / "file").read_text() == "mine"
 
 
 def test_out_is_not_writable(experiment: Path) -> None:
@@ -229,7 +241,7 @@ def test_check(tmp_path: Path) -> None:
     process = call("check", tmp_path / "bad")
     assert process.returncode == 1
     assert "first: agent 2 at step 40" in process.stdout
-    process = execute("check", tmp_path / "bad", "--json")
+    process = call("check", tmp_path / "bad", "--json")
     assert process.returncode == 1
     found = json.loads(process.stdout)
     assert (found["equal"], found["compared"], found["missing"]) == (False, 303, 0)
@@ -262,10 +274,10 @@ def test_prepare(experiment: Path) -> None:
 
 
 def test_help_and_version() -> None:
-    process = execute("--help")
+    process = call("--help")
     assert process.returncode == 0
     for command in COMMANDS:
         assert command in process.stdout
-    assert "Examples:" in execute("run", "--help").stdout
-    assert execute("--version").stdout.startswith("msg-agents, version ")
+    assert "Examples:" in call("run", "--help").stdout
+    assert call("--version").stdout.startswith("msg-agents, version ")
     refused(execute("fly"), "fly")

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from networks import run_file
 
 from msg_agents.cli import nodes
 from msg_agents.cli.nodes import load_record, read_record_ahead
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.twin.simulate import new_record
 
 
 @pytest.fixture(autouse=True)
@@ -21,13 +20,8 @@ def _nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def written(directory: Path, **changes: Any) -> Path:
-    graphs = {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}}
-    switching = {"generator": [[-1, 1], [1, -1]]}
-    document = {"name": "net", "problem": "consensus", "time": "continuous", "graphs": graphs, "switching": switching}
-    run = {"dt": changes.pop("dt", 0.05), "duration": 5, "start": [1.0, -1.0, 2.0]}
-    file = directory / "run.json"
-    file.write_text(new_record(Experiment.parse({**document, **changes, "run": run})).to_json(with_key=True))
-    return file
+    run = {"dt": changes.pop("dt", 0.05), "duration": 5, "start": [1.0, -1.0, 2.0], "replicas": 1}
+    return run_file(directory, 3, **changes, run=run)
 
 
 def test_read_once(tmp_path: Path) -> None:

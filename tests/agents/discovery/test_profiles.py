@@ -11,39 +11,39 @@ from pathlib import Path
 
 import pytest
 
-from msg_agents.discovery import profiles
-from msg_agents.discovery.profiles import (
-    INTRODUCED_PROFILE,
+from msg_agents.discovery import rtps
+from msg_agents.discovery.rtps import (
     LOOPBACK_PROFILE,
     PROFILE_VARIABLES,
+    RELAYED_PROFILE,
     UDP_PROFILE,
+    free_domain,
     has_fast_dds_3,
     has_profile_for,
     profile_for_hosts,
 )
-from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment, profile_variables
 from msg_analysis.messages.topics import STATES, TRUTHS
 
 OLD, NEW = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
-FOLDER = Path(profiles.__file__).parent
+FOLDER = Path(rtps.__file__).parent
 # All that the profiles have and Fast DDS 3 has renamed: its profiles are made by
 #     cd msg_agents/msg_agents/discovery
-#     for i in loopback introduced; do
+#     for i in loopback relayed; do
 #         sed -e s/heartbeatPeriod/heartbeat_period/ -e s/initialAcknackDelay/initial_acknack_delay/ $i.xml \
 #             > fast_dds_3/$i.xml
 #     done
 RENAMED = {"heartbeatPeriod": "heartbeat_period", "initialAcknackDelay": "initial_acknack_delay"}
 
 
-@pytest.mark.parametrize("name", ["loopback.xml", "introduced.xml"])
+@pytest.mark.parametrize("name", ["loopback.xml", "relayed.xml"])
 def test_profiles_for_fast_dds_3_differ_in_what_it_has_renamed(name: str) -> None:
     old = (FOLDER / name).read_text()
     new = re.sub("|".join(RENAMED), lambda found: RENAMED[found[0]], old)
     assert (FOLDER / "fast_dds_3" / name).read_text() == new
 
 
-@pytest.mark.parametrize("path", [LOOPBACK_PROFILE, INTRODUCED_PROFILE], ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", [LOOPBACK_PROFILE, RELAYED_PROFILE], ids=lambda path: path.stem)
 def test_profiles_of_topics_have_the_times_of_the_others(path: Path) -> None:
     """The profile of a topic is read instead of the default one."""
     for kind in ("data_writer", "data_reader"):
@@ -65,7 +65,7 @@ def test_from_kilted_on_the_old_variable_gives_a_warning(distribution: str) -> N
     assert profile_variables(Path("/p.xml"), distribution) == {NEW: "/p.xml"}
 
 
-@pytest.mark.parametrize("profile", [LOOPBACK_PROFILE, INTRODUCED_PROFILE, UDP_PROFILE], ids=lambda path: path.stem)
+@pytest.mark.parametrize("profile", [LOOPBACK_PROFILE, RELAYED_PROFILE, UDP_PROFILE], ids=lambda path: path.stem)
 def test_the_middleware_here_takes_it(profile: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It prints what it does not understand and goes on without the profile."""
     pytest.importorskip("rclpy")
@@ -96,7 +96,7 @@ def test_our_profiles_for_one_machine_bound_the_batches_of_states(
     assert not has_profile_for("/states")
     for path, bounded in (
         (LOOPBACK_PROFILE, True),
-        (INTRODUCED_PROFILE, True),
+        (RELAYED_PROFILE, True),
         (hosts, False),
         (UDP_PROFILE, False),
         (damaged, False),

@@ -1,13 +1,20 @@
-"""RTPS messages of discovery, against bytes that were put together by hand from DDSI-RTPS 2.3, and real ones."""
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Discovery: messages against bytes put together by hand from DDSI-RTPS 2.3 and real ones; domains and their locks."""
 
 from __future__ import annotations
 
 import os
 import re
+import shutil
 import socket
+import struct
 import subprocess
 import sys
-from contextlib import ExitStack, suppress
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -16,21 +23,30 @@ from hypothesis import strategies as st
 
 pytest.importorskip("rclpy")
 
-from msg_agents.discovery.profiles import FIRST_INTRODUCED, INTRODUCED_PROFILE, MOST_INTRODUCED, domains_for
 from msg_agents.discovery.rtps import (
+    FIRST_RELAYED,
+    GROUP,
+    LOOPBACK_INTERFACES,
+    MOST_RELAYED,
     PEERS_VARIABLE,
     PORT_BASE,
     PORTS_PER_DOMAIN,
+    RELAYED_PROFILE,
     Announcement,
+    announce_here,
     announcement_message,
     discovery_port,
     discovery_ports,
     disposal_message,
+    domains_for,
     free_domain,
+    held_domains,
+    multicast_port,
     read_announcement,
     remove_participant,
 )
 from msg_agents.environment import LAST_DOMAIN, node_environment
+from msg_analysis.errors import InputError
 
 PREFIX = bytes(range(1, 13))
 HEADER = bytes.fromhex("52545053 0203 010f 0102030405060708090a0b0c")
@@ -145,7 +161,7 @@ def test_the_announcement_of_a_real_participant() -> None:
         listener = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         listener.bind(("127.0.0.1", discovery_port(domain, 3)))
         listener.settimeout(30)
-        environment = node_environment(domain, INTRODUCED_PROFILE)
+        environment = node_environment(domain, RELAYED_PROFILE)
         process = stack.enter_context(subprocess.Popen([sys.executable, "-P", "-c", ANNOUNCER], env=environment))
         stack.callback(process.kill)
         found = read_announcement(listener.recv(1 << 16))
@@ -158,7 +174,7 @@ def test_the_announcement_of_a_real_participant() -> None:
         lines = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
         ports = {int(line[1].rpartition(":")[2], 16) for line in lines if line[9] in own}
         assert found.port in ports
-        assert discovery_port(domain, FIRST_INTRODUCED) == found.port
+        assert discovery_port(domain, FIRST_RELAYED) == found.port
 
 
 def test_the_disposal_byte_for_byte() -> None:
@@ -194,26 +210,26 @@ def test_a_real_participant_answers_one_without_endpoints(reach: str) -> None:
         listener.settimeout(10)
         own = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": reach}
         environment = node_environment(domain) if reach == "our profile" else os.environ | own
-        visitor = stack.enter_context(
+        participant_of_ros = stack.enter_context(
             subprocess.Popen([sys.executable, "-P", "-c", ANSWERER], stdout=subprocess.PIPE, text=True, env=environment)
         )
-        stack.callback(visitor.kill)
-        assert visitor.stdout is not None
-        prefix = bytes.fromhex(visitor.stdout.readline())
+        stack.callback(participant_of_ros.kill)
+        assert participant_of_ros.stdout is not None
+        prefix = bytes.fromhex(participant_of_ros.stdout.readline())
         asking = announcement_message(prefix[:4] + bytes(range(8)), listener.getsockname()[1], 20)
-        for participant in range(FIRST_INTRODUCED):
+        for participant in range(FIRST_RELAYED):
             listener.sendto(asking, ("127.0.0.1", discovery_port(domain, participant)))
         answer = None
         while answer is None:
             answer = read_announcement(listener.recv(1 << 16))
         assert answer.prefix == prefix
-        assert visitor.stdout.readline() == "['answerer']\n"
+        assert participant_of_ros.stdout.readline() == "['answerer']\n"
 
 
 def test_every_participant_of_the_domain_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """On this machine, and on the other hosts of the run."""
     monkeypatch.setenv(PEERS_VARIABLE, "127.0.0.1 127.0.0.2")
-    places = [("127.0.0.1", 0), ("127.0.0.1", FIRST_INTRODUCED + MOST_INTRODUCED - 1), ("127.0.0.2", 3)]
+    places = [("127.0.0.1", 0), ("127.0.0.1", FIRST_RELAYED + MOST_RELAYED - 1), ("127.0.0.2", 3)]
     with free_domain(2) as domain:
         sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in places]
         for listener, (address, participant) in zip(sockets, places, strict=True):
@@ -232,18 +248,142 @@ def test_ports_are_ports(domain: int) -> None:
     """The last domain has no ports for so many participants."""
     ports = discovery_ports(domain)
     assert ports[0] == discovery_port(domain, 0)
-    assert len(ports) == min(FIRST_INTRODUCED + MOST_INTRODUCED, (65535 - ports[0]) // 2 + 1)
+    assert len(ports) == min(FIRST_RELAYED + MOST_RELAYED, (65535 - ports[0]) // 2 + 1)
     assert ports[-1] < 1 << 16
 
 
-def test_a_farewell_in_the_last_domain() -> None:
+def test_a_disposal_in_the_last_domain() -> None:
     """No number is tried whose port would be above the last one, which a socket refuses."""
     remove_participant(PREFIX, LAST_DOMAIN)
 
 
-@pytest.mark.parametrize(("participants", "domains"), [(1, 1), (87, 1), (88, 2), (MOST_INTRODUCED, 2), (207, 3)])
+@pytest.mark.parametrize(("participants", "domains"), [(1, 1), (87, 1), (88, 2), (MOST_RELAYED, 2), (207, 3)])
 def test_ports_of_a_run_stay_in_its_domains(participants: int, domains: int) -> None:
     """Both ports of the last participant lie below the first of the next domain (9.6.1.1: offsets 10 and 11)."""
     assert domains_for(participants) == domains
-    last = discovery_port(1, FIRST_INTRODUCED + participants - 1) + 1
+    last = discovery_port(1, FIRST_RELAYED + participants - 1) + 1
     assert last < PORT_BASE + PORTS_PER_DOMAIN * (1 + domains)
+
+
+HOLD = """
+from msg_agents.discovery.rtps import free_domain
+with free_domain(domains=range({first}, {end})) as held:
+    print(held, flush=True)
+    input()
+"""
+
+
+@pytest.fixture
+def reserved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[range]:
+    """Three domains in a row that no other run takes meanwhile; for the tests, locks of our own."""
+    with free_domain(3) as first:
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+        yield range(first, first + 3)
+
+
+@contextmanager
+def holder(domains: range, directory: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
+    """Another process that holds a domain."""
+    code = HOLD.format(first=domains.start, end=domains.stop)
+    environment = {**os.environ, "TMPDIR": str(directory)}
+    command = [sys.executable, "-P", "-c", code]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        assert process.stdout is not None
+        try:
+            yield process, int(process.stdout.readline())
+        finally:
+            process.kill()
+
+
+def test_holders_get_different_domains(reserved: range) -> None:
+    """And give them back, also when what they do fails."""
+    with ExitStack() as stack:
+        assert {stack.enter_context(free_domain(domains=reserved)) for _ in reserved} == set(reserved)
+        with pytest.raises(InputError, match="--domain"), free_domain(domains=reserved):
+            pass
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="the run failed"), free_domain(domains=reserved[:1]):
+            raise RuntimeError("the run failed")
+
+
+def test_a_killed_holder_gives_its_domain_back(reserved: range, tmp_path: Path) -> None:
+    domains = reserved[:1]
+    with holder(domains, tmp_path) as (process, held):
+        assert held == domains[0]
+        with pytest.raises(InputError), free_domain(domains=domains):
+            pass
+        (tmp_path / "msg_agents_domain_x.lock").touch()
+        assert held_domains(domains) == [held]
+        process.kill()
+        process.wait()
+        assert held_domains(domains) == []
+        with free_domain(domains=domains) as mine:
+            assert mine == held
+
+
+@pytest.mark.parametrize("family", [socket.AF_INET, socket.AF_INET6])
+def test_a_domain_whose_ports_are_in_use_is_left_alone(reserved: range, family: socket.AddressFamily) -> None:
+    domains = reserved[:2]
+    with socket.socket(family, socket.SOCK_DGRAM) as somebody:
+        try:
+            somebody.bind(
+                ("::1" if family == socket.AF_INET6 else "127.0.0.1", PORT_BASE + PORTS_PER_DOMAIN * domains[0] + 11)
+            )
+        except OSError as error:
+            pytest.skip(f"this machine: cannot bind: {error}")
+        for _ in range(4):  # the order is random
+            with free_domain(domains=domains) as chosen:
+                assert chosen == domains[1]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="run as root: only root can be another user")
+def test_lock_files_of_another_user_do_not_use_up_the_domains(
+    reserved: range, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    shared = Path(tempfile.mkdtemp(dir="/tmp"))  # pytest's own directories are closed to others
+    request.addfinalizer(lambda: shutil.rmtree(shared))
+    monkeypatch.setattr(tempfile, "tempdir", str(shared))
+    shared.chmod(0o1777)  # as /tmp is; Linux guards files of others in such directories
+    with free_domain(domains=reserved[:1]) as held:
+        pass
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            os.setgid(65534)
+            os.setuid(65534)
+            with free_domain(domains=reserved[:1]) as chosen:
+                code = 0 if chosen == held else 2
+        finally:
+            os._exit(code)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+
+
+IP_RECVTTL = 12  # Linux
+
+
+def interfaces() -> list[tuple[int, str]]:
+    """Those that can have multicast and an address: the kernel lists the groups of each."""
+    members = Path("/proc/net/igmp").read_text()
+    flags = {n: int(Path(f"/sys/class/net/{n}/flags").read_text(), 16) for _, n in socket.if_nameindex()}
+    return [(i, n) for i, n in socket.if_nameindex() if flags[n] & 0x1001 == 0x1001 and f"{n}" in members]
+
+
+def test_it_is_heard_at_the_interface_and_leaves_no_machine() -> None:
+    found = [(i, n) for i, n in interfaces() if n not in LOOPBACK_INTERFACES]
+    if not found:
+        pytest.skip("no interface of a network")
+    with free_domain() as domain, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        receiver.setsockopt(socket.IPPROTO_IP, IP_RECVTTL, 1)
+        receiver.bind(("", multicast_port(domain)))
+        index, _ = found[0]
+        membership = struct.pack("4s4si", socket.inet_aton(GROUP), b"", index)
+        receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        receiver.settimeout(5)
+        announce_here(b"here", domain)
+        data, (control, *_), *_ = receiver.recvmsg(100, 100)
+    assert data == b"here"
+    assert struct.unpack("i", control[2]) == (0,)  # a router, and the interface itself, drop it

@@ -21,8 +21,8 @@ import rclpy
 from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment
 from msg_agents.nodes.recorder import Recorder, write_size
-from msg_agents.stepping.state_receiver import StateReceiver
-from msg_agents.stepping.synchronizer import RESEND_LIMIT, ReceivedSteps
+from msg_agents.stepping.state_receiver import ReceivedSteps, StateReceiver
+from msg_agents.stepping.synchronizer import RESEND_LIMIT
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import encode_batch
@@ -32,7 +32,7 @@ from msg_analysis.twin.simulate import new_record
 
 pytestmark = pytest.mark.filterwarnings("ignore:module .sre_:DeprecationWarning")  # of a package that rclpy imports
 AGENTS, DT = 2, 0.05
-STEPS = 5 * RESEND_LIMIT
+STEPS = 3 * RESEND_LIMIT
 
 
 @pytest.fixture

@@ -1,15 +1,21 @@
-"""Newest value wins, against a model that remembers everything that it was ever offered."""
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Newest value wins, against a model that remembers all that it was offered; when steps are due, against fractions."""
 
 from __future__ import annotations
 
+import math
+from fractions import Fraction
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from msg_agents.stepping.newest_values import NewestOnAir, NewestValues
+from msg_agents.stepping.newest_values import NewestReceived, NewestValues, Schedule
 from msg_agents.stepping.synchronizer import NOTHING
+from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.messages.acceptance import Refusal
 
 STEPS = 40
@@ -41,6 +47,7 @@ def test_the_newest_that_can_be(script: list[tuple[Any, ...]]) -> None:
     node = newest(clock)
     assert node.learn(0, 0) is None
     taken: dict[int, list[int]] = {j: [] for j in PEERS}
+    reasons: list[tuple[str | None, str | None]] = []  # found, wanted
     for kind, *arguments in script:
         if kind == "clock":
             clock.reach += arguments[0]
@@ -48,18 +55,19 @@ def test_the_newest_that_can_be(script: list[tuple[Any, ...]]) -> None:
             node.advance()
         elif kind == "offer":
             agent, step = arguments
-            reason = node.offer(agent, step, (agent, step))
+            wanted = None
             if agent not in PEERS:
-                assert reason == Refusal.NOT_A_PEER
+                wanted = Refusal.NOT_A_PEER
             elif step <= max(taken[agent], default=-1):
-                assert reason == Refusal.REPEATED
+                wanted = Refusal.REPEATED
             elif step > min(clock.reach, STEPS):
-                assert reason == Refusal.TOO_NEW
+                wanted = Refusal.TOO_NEW
             else:
-                assert reason is None
                 taken[agent].append(step)
+            reasons.append((node.offer(agent, step, (agent, step)), wanted))
         expected = [(max(taken[j]), (j, max(taken[j]))) if taken[j] else (NOTHING, None) for j in INPUTS[0]]
         assert node.inputs() == (0, expected)
+    assert all(found == wanted for found, wanted in reasons)
 
 
 @given(st.permutations([(2, 0), (0, 10), (1, 11), (2, 25)]))
@@ -149,10 +157,10 @@ def test_another_value_of_the_newest_step() -> None:
     delay=st.integers(0, 8),
     holds=st.booleans(),
 )
-def test_on_the_air(steps: list[int], lost: set[int], delay: int, holds: bool) -> None:
+def test_lost_and_delayed_values(steps: list[int], lost: set[int], delay: int, holds: bool) -> None:
     """Against a memory of all that came, asked after every message or only now and then."""
     nodes = [
-        NewestOnAir(
+        NewestReceived(
             delay=delay,
             lost=lambda agent, step: agent == 3 and step in lost,
             holds=holds,
@@ -182,9 +190,9 @@ def test_on_the_air(steps: list[int], lost: set[int], delay: int, holds: bool) -
             assert node.known(3) == f"x{came[-1]}"
 
 
-def test_on_the_air_what_came_too_early_is_forgotten() -> None:
+def test_what_was_received_too_early_is_forgotten() -> None:
     clock = Clock()
-    node = NewestOnAir(
+    node = NewestReceived(
         delay=1, lost=lambda _j, _k: False, holds=True, agent=0, steps=STEPS, inputs=[[1]], peers=[1], reach=clock
     )
     assert node.learn(0, 0) is None
@@ -197,3 +205,51 @@ def test_on_the_air_what_came_too_early_is_forgotten() -> None:
     assert node.offer(1, 4, "fine") is None
     assert node.offer(1, 5, "newest") is None
     assert node.inputs() == (0, [(4, "fine")])
+
+
+DAY = 86_400 * SECOND
+speeds = st.floats(1e-3, 1e3)
+lengths = st.floats(1e-3, 10.0)
+phases = st.floats(0.0, 1.0, exclude_max=True)
+epochs = st.integers(0, 2_000_000_000 * SECOND)
+
+
+@given(epoch=epochs, speed=speeds, dt=lengths, phase=phases, step=st.integers(0, 10**6))
+def test_due_times(epoch: int, speed: float, dt: float, phase: float, step: int) -> None:
+    """To two nanoseconds and the precision of a double of the time that has gone."""
+    schedule = Schedule(epoch=epoch, speed=speed, step_length=dt, phase=phase)
+    due = (step + Fraction(phase)) * Fraction(dt) * SECOND
+    assert abs(schedule.due(step) - due) <= 2 + abs(due) / 2**50
+    gone = schedule.clock_time(step) - epoch
+    assert abs(gone - due / Fraction(speed)) <= 2 + (2 + abs(gone)) * (1 + 1 / speed) / 2**50 + 1 / speed
+    assert schedule.due(step) < schedule.due(step + 1)
+
+
+@given(epoch=epochs, speed=speeds, dt=lengths, phase=phases, gone=st.integers(-DAY, DAY), after=st.integers(0, 1000))
+def test_the_next_step_is_the_first_that_is_not_due(
+    epoch: int, speed: float, dt: float, phase: float, gone: int, after: int
+) -> None:
+    schedule = Schedule(epoch=epoch, speed=speed, step_length=dt, phase=phase)
+    simulated = schedule.simulated(epoch + gone)
+    step = schedule.next_step(epoch + gone, after=after)
+    assert step >= after
+    assert step == after or schedule.due(step - 1) <= simulated
+    assert schedule.due(step) > simulated
+
+
+@given(epoch=epochs, speed=st.sampled_from([0.5, 1.0, 5.0, 1 / 3]), step=st.integers(0, 10**7), phase=phases)
+def test_a_timer_on_time_finds_its_step_due(epoch: int, speed: float, step: int, phase: float) -> None:
+    """Or is called again a nanosecond later."""
+    schedule = Schedule(epoch=epoch, speed=speed, step_length=0.05, phase=phase)
+    now = schedule.clock_time(step)
+    assert schedule.simulated(now + 2) >= schedule.due(step)
+    assert schedule.next_step(now + 2, after=step) == step + 1
+
+
+@given(speed=speeds, dt=lengths, gone=st.integers(0, DAY))
+def test_nobody_on_time_is_out_of_reach(speed: float, dt: float, gone: int) -> None:
+    schedule = Schedule(epoch=7, speed=speed, step_length=dt)
+    newest = math.floor(gone * speed / (dt * SECOND))  # who has phase 0 has made the step newest -> newest + 1
+    assert schedule.reach(7 + gone) >= newest + 1
+    assert schedule.reach(7 + gone) <= newest + 3 + speed / dt  # a margin of 1 s
+    assert schedule.reach(-DAY) == 0

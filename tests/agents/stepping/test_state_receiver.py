@@ -1,15 +1,22 @@
-"""What a recorder takes from batches, against the same messages one by one."""
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a recorder takes from batches, against the same messages one by one; which steps it knows."""
 
 from __future__ import annotations
 
 import random
+import tracemalloc
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from networks import experiment
 
-from msg_agents.stepping.state_receiver import StateReceiver
-from msg_analysis.experiment.experiment import Experiment
+from msg_agents.stepping.state_receiver import CONSECUTIVE, ReceivedSteps, StateReceiver, hashes_of
+from msg_agents.stepping.synchronizer import RESEND_LIMIT
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import encode_batch
 from msg_analysis.messages.messages import AgentState
@@ -21,18 +28,9 @@ STEPS = 200
 
 
 def _record(**noise: Any) -> RunRecord:
-    return new_record(
-        Experiment.parse(
-            {
-                "name": "net",
-                "graphs": {"line": {"path": [1, 2, 3]}, "star": {"star": {"center": 2}}},
-                "agents": 3,
-                "switching": {"generator": [[-1, 1], [1, -1]]},
-                "noise": {"process": 1.0} | noise,
-                "run": {"dt": 0.1, "duration": STEPS * 0.1, "replicas": 2},
-            }
-        )
-    )
+    graphs = {"line": {"path": [1, 2, 3]}, "star": {"star": {"center": 2}}}
+    run = {"dt": 0.1, "duration": STEPS * 0.1}
+    return new_record(experiment(3, agents=3, graphs=graphs, noise={"process": 1.0} | noise, run=run))
 
 
 def _message(record: RunRecord, agent: int, step: int, value: float = 1.5, **changes: Any) -> bytes:
@@ -49,21 +47,24 @@ def test_a_run_in_batches_of_any_size() -> None:
     record, chance = _record(), random.Random(1)
     receiver = _receiver(record)
     sent = [(agent, step) for step in range(STEPS + 1) for agent in (1, 2, 3)]
-    found, left = [], list(sent)
+    parts, left = [], list(sent)
     while left:
         count = chance.randrange(1, 40)
-        part, left = left[:count], left[count:]
+        parts, left = [*parts, left[:count]], left[count:]
+    received = []
+    for part in parts:
         batch = encode_batch(record.run.bytes, [_message(record, *each) for each in part])
         assert receiver.add(batch) >= len(batch)
-        if chance.random() < 0.5 or not left:
-            received = receiver.take()
-            assert received.refused == []
-            for agent, step, time, start, size in zip(
-                *(received.agent, received.step, received.time, received.start, received.size), strict=True
-            ):
-                assert received.data[start : start + size] == _message(record, agent + 1, step)
-                assert time == step * 10**8
-                found.append((agent + 1, step))
+        received += [receiver.take()] if chance.random() < 0.5 or part is parts[-1] else []
+    found = []
+    for some in received:
+        assert some.refused == []
+        for agent, step, time, start, size in zip(
+            *(some.agent, some.step, some.time, some.start, some.size), strict=True
+        ):
+            assert some.data[start : start + size] == _message(record, agent + 1, step)
+            assert time == step * 10**8
+            found.append((agent + 1, step))
     assert found == sent
     assert len(receiver.take().agent) == 0
     assert receiver.names == ["/net/agent_1/state", "/net/agent_2/state", "/net/agent_3/state"]
@@ -161,3 +162,116 @@ def test_single_messages_beside_batches() -> None:
     assert sorted(received.refused) == sorted(
         [("/net/agent_1/state", Refusal.REPEATED), ("/net/agent_2/state", Refusal.OTHER_AGENT)]
     )
+
+
+LONG = 50_000
+
+
+def test_in_order_to_the_end() -> None:
+    steps = ReceivedSteps(LONG)
+    for k in range(LONG + 1):
+        assert steps.take(k, k) is None
+        assert steps.row == k
+    assert steps.take(LONG + 1, 0) == Refusal.OUT_OF_RANGE
+
+
+def test_neighbours_swapped() -> None:
+    """k + 2 before k + 1, once: what comes long afterwards is taken all the same."""
+    steps = ReceivedSteps(LONG)
+    for k in (0, 2, 1, *range(3, LONG + 1)):
+        assert steps.take(k, k) is None
+    assert steps.row == LONG
+
+
+@given(st.integers(0, 2**32), st.integers(1, 300), st.integers(0, 40))
+def test_any_order_and_repetitions(seed: int, last: int, shuffled: int) -> None:
+    """Restarts repeat what came before; of different contents the second is told apart."""
+    chance = random.Random(seed)
+    order = sorted(range(last + 1), key=lambda k: k + chance.uniform(0, shuffled))
+    steps, known = ReceivedSteps(last), {}
+    for k in order:
+        assert steps.take(k, hash((k, seed))) is None
+        known[k] = hash((k, seed))
+        again = chance.choice(list(known))
+        assert steps.take(again, known[again]) == Refusal.REPEATED
+    assert steps.row == last
+    assert steps.take(last, 1) == Refusal.CONTRADICTION
+    assert steps.take(last, 2) == Refusal.REPEATED
+    assert steps.take(last, known[last]) == Refusal.REPEATED
+
+
+def test_reach() -> None:
+    steps = ReceivedSteps(LONG)
+    for k in range(20_001):
+        steps.take(k, k)
+    assert steps.take(20_000 - RESEND_LIMIT, 0) == Refusal.TOO_OLD
+    assert steps.take(20_001 - RESEND_LIMIT, 20_001 - RESEND_LIMIT) == Refusal.REPEATED
+    assert steps.take(20_001 - RESEND_LIMIT, 0) == Refusal.CONTRADICTION
+    assert steps.take(20_001 + RESEND_LIMIT, 0) == Refusal.TOO_NEW
+    assert steps.take(20_000 + RESEND_LIMIT, 0) is None
+
+
+def test_forged_steps_change_nothing() -> None:
+    """Of any steps that do not follow each other, before the first true one and between true ones."""
+    chance = random.Random(1)
+    steps = ReceivedSteps(LONG)
+    taken = set()
+    for k in [*range(LONG, 0, -50), *(chance.randrange(LONG) for _ in range(2000))]:
+        taken |= {k} if steps.take(k, -1) is None else set()
+    for k in range(LONG + 1):
+        assert steps.take(k, k) == (Refusal.CONTRADICTION if k in taken else None)
+        forged = chance.randrange(k + 1, 2 * LONG)
+        taken |= {forged} if steps.take(forged, -1) is None else set()
+    assert steps.row == LONG
+
+
+def test_a_reader_that_came_late() -> None:
+    """The first steps never come: after a few in a row they are taken for lost."""
+    for first in (1, 100, RESEND_LIMIT, 20_000):
+        steps = ReceivedSteps(LONG)
+        taken = [k for k in range(first, LONG + 1) if steps.take(k, k) is None]
+        assert taken == list(range(taken[0], LONG + 1))
+        assert taken[0] - first < CONSECUTIVE
+        assert steps.row == LONG
+
+
+def test_memory_does_not_grow() -> None:
+    steps = ReceivedSteps(10**9)
+    for k in range(20_000):
+        steps.take(k, k)
+    tracemalloc.start()
+    for k in range(20_000, 40_000):
+        steps.take(k, k)
+        steps.take(10**9 - k, k)
+    grown, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert grown < 10_000
+
+
+@given(st.integers(0, 2**32), st.sampled_from([3, 50, 7_000, 13_000, LONG]))
+def test_rows_at_once_are_the_same_as_one_by_one(seed: int, last: int) -> None:
+    """Rows that follow, repeat, overlap or leave gaps: what one by one says, and the same hashes afterwards."""
+    chance = random.Random(seed)
+    rows, singles = ReceivedSteps(last), ReceivedSteps(last)
+    step = 0
+    for _ in range(30):
+        first = max(0, step + chance.choice([0, 0, 0, 0, 1, -3, 100, -RESEND_LIMIT]))
+        contents = [hash((k, chance.random() < 0.01)) for k in range(first, first + chance.randrange(1, 900))]
+        one_by_one = [singles.take(k, content) for k, content in enumerate(contents, start=first)]
+        at_once = rows.take_row(first, hashes_of(np.array(contents)))
+        left = [] if at_once else contents
+        refusals = [None] * len(contents) if at_once else []
+        assert refusals + [rows.take(k, content) for k, content in enumerate(left, start=first)] == one_by_one
+        assert rows.row == singles.row
+        step = min(first + len(contents), last + 1)
+    for k in range(max(0, step - 2 * RESEND_LIMIT), min(step + RESEND_LIMIT, last) + 1, 7):
+        assert rows.take(k, k) == singles.take(k, k)
+
+
+def test_a_row_beyond_the_end() -> None:
+    steps = ReceivedSteps(5)
+    assert not steps.take_row(0, hashes_of(np.arange(7)))
+    assert not steps.take_row(1, hashes_of(np.arange(3)))
+    assert steps.take_row(0, hashes_of(np.arange(6)))
+    assert steps.row == 5
+    assert not steps.take_row(6, hashes_of(np.arange(1)))

@@ -222,19 +222,17 @@ def test_the_run_may_end_early_at_any_time(case: Case, data: st.DataObject, seed
     """Agents learn of the last step at different times: all make every step up to it, and none waits for ever."""
     end = data.draw(st.integers(1, case.steps))
     rng = random.Random(seed)
-    network, told = Network(case), set[int]()
-    while True:
-        events = network.events()
-        untold = [agent for agent in range(case.agents) if agent not in told]
-        if untold and (not events or rng.random() < 0.05):
-            agent = rng.choice(untold)
-            told.add(agent)
+    network, lasts = Network(case), dict[int, tuple[int, int]]()  # found, wanted
+    while (events := network.events()) or len(lasts) < case.agents:
+        others = [agent for agent in range(case.agents) if agent not in lasts]
+        if others and (not events or rng.random() < 0.05):
+            agent = rng.choice(others)
+            wanted = max(end, network.nodes[agent].step)
             network.nodes[agent].end_at(end)
-            assert network.nodes[agent].steps == max(end, network.nodes[agent].step)
-        elif events:
-            network.happen(rng.choice(events))
+            lasts[agent] = network.nodes[agent].steps, wanted
         else:
-            break
+            network.happen(rng.choice(events))
+    assert all(found == wanted for found, wanted in lasts.values())
     assert all(node.finished for node in network.nodes)
     assert all(len(states) > end for states in network.states)
     made = [list(row) for row in zip(*(states[: end + 1] for states in network.states), strict=True)]

@@ -196,7 +196,7 @@ EXPONENTIALS = """
 import hashlib, sys
 sys.path.insert(0, {here!r})
 from test_arithmetic import laplacian
-from msg_analysis.arithmetic.matrix_exponential import exponential
+from msg_analysis.arithmetic.reproducible import exponential
 print(hashlib.sha256(b"".join(exponential(-laplacian(m, 1.0, m)).tobytes() for m in (3, 9, 64))).hexdigest())
 """
 

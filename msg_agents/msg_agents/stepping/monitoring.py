@@ -1,0 +1,149 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Stalls, lags and clocks: when to warn that no steps are made, or fewer than in real time, or that clocks differ.
+
+Steps in real time follow the clock of the system, which can be set while they do; on several hosts there are several.
+A message sent at s of its sender's clock and received at r of ours has taken r - s plus how far the sender's clock is
+ahead, which is not negative: r - s bounds the offset from one side, and the other direction from the other.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+STALL_TIME = 5.0  # s without a step, after which an agent counts as stalled
+LAG_TIME = 2.0
+"""s by which a run in real time is behind its clock after which it counts as too slow; agents report every 0.2 s."""
+CLOCK_STEP = 0.5  # s by which the clock must have been set to be noted
+
+
+class StallDetector:
+    """Measures the rate of a step counter between two calls of ``update``."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._step, self._time = 0, clock()
+        self._next_warning = STALL_TIME
+        self.rate = self.stalled = 0.0  # steps/s between the last two updates; s without a step
+
+    def update(self, step: int) -> bool:
+        """Whether to warn now: after ``STALL_TIME`` s without a step, and again whenever the stall has doubled."""
+        now = self._clock()
+        elapsed, made = now - self._time, step - self._step
+        self._step, self._time = step, now
+        self.rate = made / elapsed if elapsed > 0.0 else 0.0
+        if made:
+            self.stalled, self._next_warning = 0.0, STALL_TIME
+            return False
+        self.stalled += elapsed
+        if self.stalled < self._next_warning:
+            return False
+        self._next_warning = 2.0 * self.stalled
+        return True
+
+
+class LagDetector:
+    """Notices that a run in real time falls behind its clock; ``rate``: steps that are due per second."""
+
+    def __init__(self, rate: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._rate, self._clock = rate, clock
+        self._began: float | None = None
+        self._first = 0
+        self._next_warning = LAG_TIME
+
+    def update(self, step: int) -> float | None:
+        """After each look at the newest step of all agents: s behind, if to warn now, and again when it has doubled."""
+        now = self._clock()
+        if self._began is None or step == self._first:  # waiting for the epoch
+            self._began, self._first = now, step
+            return None
+        behind = now - self._began - (step - self._first) / self._rate
+        if behind < self._next_warning:
+            return None
+        self._next_warning = 2.0 * behind
+        return behind
+
+
+class ClockDetector:
+    """Notices that the clock of this machine has been set, by comparison with the one that nobody sets."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic, wall: Callable[[], float] = time.time) -> None:
+        self._clock, self._wall = clock, wall
+        self._apart = wall() - clock()
+
+    def update(self) -> str | None:
+        """What has happened since the last call, in words."""
+        before, self._apart = self._apart, self._wall() - self._clock()
+        forward = self._apart - before
+        if abs(forward) < CLOCK_STEP:
+            return None
+        if forward > 0.0:
+            return (
+                f"the clock of this machine was set forward by {forward:.1f} s, or the machine slept: the steps of "
+                "that time are made at once, too late"
+            )
+        return (
+            f"the clock of this machine was set back by {-forward:.1f} s: no step is due until it is there again, "
+            "since steps in real time follow it; a new run begins at once"
+        )
+
+
+MILLISECOND = 1e6  # ns
+
+
+@dataclass(slots=True)
+class Offset:
+    """How far another clock is ahead of ours is between these [ns]; infinite: no message in that direction yet."""
+
+    low: float = -inf
+    high: float = inf
+
+    @property
+    def least(self) -> float:
+        """The smallest distance of the clocks that is possible [ns]."""
+        return max(self.low, -self.high, 0.0)
+
+
+class ClockOffsets:
+    """Of the clocks of some nodes, by name."""
+
+    def __init__(self) -> None:
+        self._offsets: dict[str, Offset] = {}
+
+    def add(self, node: str, sent: int, received: int, at_most: float = inf) -> None:
+        """Take a message that a node sent at ``sent`` of its clock, and that came at ``received`` of ours.
+
+        ``at_most``: how far its clock is ahead at most, by what it has received from here; all in ns.
+        """
+        offset = self._offsets.setdefault(node, Offset())
+        offset.low = max(offset.low, float(sent - received))
+        offset.high = min(offset.high, at_most)
+
+    def warning(self, limit: float) -> str | None:
+        """Which clocks are certainly more than ``limit`` [ns] from ours, and how far; None: none is."""
+        apart = {node: offset for node, offset in self._offsets.items() if offset.least > limit}
+        if not apart:
+            return None
+        worst = max(apart, key=lambda node: apart[node].least)
+        ahead = "ahead of" if apart[worst].low > 0 else "behind"
+        return (
+            f"the clocks of {', '.join(sorted(apart))} are not that of the switcher: {worst} is at least "
+            f"{apart[worst].least / MILLISECOND:.1f} ms {ahead} it, more than dt / speed = {limit / MILLISECOND:g} ms: "
+            "synchronise the hosts (NTP, PTP)"
+        )
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """How far each clock is ahead of ours [ms], for JSON; None: not bounded on that side."""
+        return [
+            {"node": node, "ahead_ms": [_milliseconds(offset.low), _milliseconds(offset.high)]}
+            for node, offset in sorted(self._offsets.items())
+        ]
+
+
+def _milliseconds(value: float) -> float | None:
+    return None if abs(value) == inf else value / MILLISECOND

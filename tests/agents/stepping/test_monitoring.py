@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Stalls, lags and clocks against hand-made times."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from msg_agents.stepping.monitoring import ClockDetector, ClockOffsets, LagDetector, StallDetector
+
+
+class Clock:
+    """A clock to be set; it begins at 100 s. ``wall``: that of the system."""
+
+    now, wall = 100.0, 1e9
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def test_a_stall_is_told_when_it_has_doubled(clock: Clock) -> None:
+    detector, told = StallDetector(clock), []
+    for second in range(1, 45):
+        clock.now = 100.0 + second
+        if detector.update(7):
+            told.append(second)
+    assert told == [6, 11, 21, 41]  # the seven steps were made in the first second
+
+
+def test_a_run_that_keeps_up(clock: Clock) -> None:
+    """Reports come every 0.2 s, and the clock of simulated time begins half a second after the agents."""
+    detector = LagDetector(100.0, clock)
+    for tick in range(1000):
+        clock.now = 100.0 + 0.05 * tick
+        assert detector.update(max(0, 20 * int(5 * (clock.now - 100.5)))) is None
+
+
+def test_a_run_at_half_the_speed(clock: Clock) -> None:
+    detector, told = LagDetector(100.0, clock), []
+    for second in range(40):
+        clock.now = 100.0 + second
+        if behind := detector.update(50 * second):
+            told.append((second, behind))
+    assert told == [(4, 2.0), (8, 4.0), (16, 8.0), (32, 16.0)]
+
+
+def test_a_clock_that_is_set(clock: Clock) -> None:
+    detector, told = ClockDetector(clock, lambda: clock.wall), []
+    for tick in range(1, 1001):  # 20 ms each; the clock is slewed by 10 %, which is no step
+        clock.now, clock.wall = 100.0 + 0.02 * tick, clock.wall + 0.022
+        if tick == 400:
+            clock.wall -= 3600.0
+        if tick == 700:
+            clock.wall += 2.5
+        if tick == 800:
+            clock.wall -= 0.4
+        if words := detector.update():
+            told.append((tick, words.partition(":")[0]))
+    set_forward = "the clock of this machine was set forward by 2.5 s, or the machine slept"
+    assert told == [(400, "the clock of this machine was set back by 3600.0 s"), (700, set_forward)]
+
+
+MS = 1_000_000  # ns
+
+
+def test_bounds_by_hand() -> None:
+    """The other clock is 70 ms ahead; messages take 4 and 2 ms to us, and 3 ms from us."""
+    clocks = ClockOffsets()
+    assert clocks.to_json() == []
+    clocks.add("agent_1", sent=1070 * MS, received=1004 * MS)
+    assert clocks.to_json() == [{"node": "agent_1", "ahead_ms": [66.0, None]}]
+    assert clocks.warning(50 * MS) is not None  # at least 66 ms, however long messages take
+    clocks.add("agent_1", sent=2070 * MS, received=2002 * MS, at_most=73 * MS)
+    clocks.add("agent_1", sent=3070 * MS, received=3009 * MS, at_most=90 * MS)
+    assert clocks.to_json() == [{"node": "agent_1", "ahead_ms": [68.0, 73.0]}]
+    warning = clocks.warning(50 * MS)
+    assert warning is not None
+    assert "agent_1 is at least 68.0 ms ahead of it, more than dt / speed = 50 ms" in warning
+    assert clocks.warning(69 * MS) is None
+
+
+def test_a_clock_that_is_behind() -> None:
+    clocks = ClockOffsets()
+    clocks.add("agent_2", sent=900 * MS, received=1001 * MS, at_most=-99 * MS)
+    clocks.add("agent_1", sent=1000 * MS, received=1001 * MS, at_most=1 * MS)
+    warning = clocks.warning(50 * MS)
+    assert warning is not None
+    assert warning.startswith(
+        "the clocks of agent_2 are not that of the switcher: agent_2 is at least 99.0 ms behind it"
+    )
+
+
+def test_the_offset_is_always_between_the_bounds() -> None:
+    rng = random.Random(1)
+    for _ in range(200):
+        offset = rng.randint(-(10**9), 10**9)
+        clocks, at_most = ClockOffsets(), float("inf")
+        for now in range(0, 10**10, 10**9):
+            at_most = min(at_most, rng.expovariate(1 / 5e6) + offset)
+            clocks.add("agent_1", now + offset, now + int(rng.expovariate(1 / 5e6)), at_most)
+        low, high = clocks.to_json()[0]["ahead_ms"]
+        assert low <= offset / MS <= high
+        assert high - low < 20  # ms; two minima of ten delays with mean 5 ms: larger once in 10^12
