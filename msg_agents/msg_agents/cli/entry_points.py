@@ -3,7 +3,8 @@
 
 """Installed entry points: the command line, the nodes as executables of the ROS 2 package, and the verb of ``ros2``.
 
-Each node is the command of that name of ``msg-agents``: ``ros2 run msg_agents agent --ros-args -p run:=... ...``.
+Each node is the command of that name of ``msg-agents``: ``ros2 run msg_agents agent --ros-args -p run:=... ...``. This
+module itself loads nothing, so that Ctrl-C during the imports ends the program in order.
 """
 
 from __future__ import annotations
@@ -14,99 +15,10 @@ import os
 import sys
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
-
-import click
-
-from msg_agents.environment import LAST_DOMAIN, check_domain, tolerate_warnings
-from msg_agents.nodes.parameters import GIVES_PARAMETERS, PROCESS, given, mention_qos, merge, name_of, options_of
-from msg_agents.run.fork_server import exit_with_lock
-from msg_agents.terminal import exit_on_signals
-from msg_analysis.cli.options import PATH
+from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-
-
-class RosCommand(click.Command):
-    """Takes arguments for ROS 2 as any ROS node does: ``--ros-args ... [--]``.
-
-    rclpy reads these itself; parameters among them replace options that are not on the command line. Those given to one
-    node are found by ``node_name`` (default: the name of the command).
-    """
-
-    def __init__(self, *args: Any, node_name: str | None = None, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self.params.append(click.Option(["--lifeline-lock"], type=PATH, hidden=True))  # given by launch files
-        self.node_name = node_name or self.name or ""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """As in click; with the parameters that the arguments of ROS 2 give."""
-        ours, ros = split_arguments(args)
-        if ctx.resilient_parsing:  # completion in a shell, perhaps after an option that has no value yet
-            while ours and ours[-1].startswith("-"):
-                ours.pop()
-            return super().parse_args(ctx, ours)
-        if not GIVES_PARAMETERS.intersection(ros):
-            rest = super().parse_args(ctx, ours)
-        else:
-            rest = self._parse_with_parameters(ctx, ours, ros)
-        PROCESS.options, PROCESS.values = options_of(self), dict(ctx.params)
-        return rest
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """As in click; without ``--domain``, ROS_DOMAIN_ID is checked first."""
-        tolerate_warnings()
-        if (folder := ctx.params.pop("lifeline_lock", None)) is not None:
-            exit_with_lock(folder)
-        if ctx.params.get("domain") is None:
-            check_domain()
-        return super().invoke(ctx)
-
-    def _parse_with_parameters(self, ctx: click.Context, ours: list[str], ros: list[str]) -> list[str]:
-        # Parameters may supply what is required: check that after they have been read.
-        required = [each for each in self.params if each.required]
-        for each in required:
-            each.required = False
-        try:
-            rest = super().parse_args(ctx, ours)
-        finally:
-            for each in required:
-                each.required = True
-        PROCESS.qos_overrides = mention_qos(ros)
-        group = ctx.parent.command if ctx.parent else None
-        commands = group.commands.values() if isinstance(group, click.Group) else [self]
-        nodes = [command for command in commands if isinstance(command, RosCommand)]
-        known = [name_of(each) for command in nodes for each in options_of(command)]
-        options = options_of(self)
-        ctx.params |= merge(ctx, options, given(self.node_name, ros), known)
-        for each in required:
-            if ctx.params.get(each.name or "") in (None, ()):
-                raise click.MissingParameter(f"Or the parameter {name_of(each)!r}.", ctx=ctx, param=each)
-        return rest
-
-
-def split_arguments(args: list[str]) -> tuple[list[str], list[str]]:
-    """Split what the user typed into arguments of the command and those for ROS 2, with their ``--ros-args``."""
-    ours, ros = list(args), list[str]()
-    while "--ros-args" in ours:
-        start = ours.index("--ros-args")
-        end = ours.index("--", start) + 1 if "--" in ours[start:] else len(ours)
-        ros += ours[start:end]
-        ours = ours[:start] + ours[end:]
-    return ours, ros
-
-
-domain_option = click.option(
-    "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", help="Overrides ROS_DOMAIN_ID of the environment."
-)
-
-
-def enter(domain: int | None) -> None:
-    """Set the ROS domain, and let SIGTERM and SIGHUP end the process in order."""
-    if domain is not None:
-        os.environ["ROS_DOMAIN_ID"] = str(domain)
-    exit_on_signals()
 
 
 def _run(*command: str) -> None:

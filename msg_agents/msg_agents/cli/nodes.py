@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
-from msg_agents.cli.entry_points import RosCommand
+from msg_agents.cli.ros_command import RosCommand
 from msg_agents.environment import DISCOVERY_TIMEOUT
 from msg_agents.run.fork_server import exit_with_pipe
 from msg_analysis.cli.console import examples

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
-from msg_agents.cli.entry_points import RosCommand, domain_option, enter
+from msg_agents.cli.ros_command import RosCommand, domain_option, enter
 from msg_analysis.cli.console import examples, print_json, print_text
 from msg_analysis.cli.options import BAG, PositiveFloat, json_option
 from msg_analysis.errors import ExitCode

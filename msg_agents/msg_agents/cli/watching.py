@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from msg_agents.cli import nodes
-from msg_agents.cli.entry_points import RosCommand, domain_option, enter
+from msg_agents.cli.ros_command import RosCommand, domain_option, enter
 from msg_analysis.cli.console import examples, print_json, print_note, print_text, result_console
 from msg_analysis.cli.options import BAG, RUN_RECORD, PositiveFloat, json_option
 from msg_analysis.errors import ExitCode

@@ -17,9 +17,9 @@ pytest.importorskip("rclpy")
 
 import click
 
-from msg_agents.cli.entry_points import RosCommand, split_arguments
 from msg_agents.cli.main import main
 from msg_agents.cli.node_server import MODULES as NODE_MODULES
+from msg_agents.cli.ros_command import RosCommand, split_arguments
 from msg_agents.discovery.rtps import free_domain
 from msg_agents.nodes.parameters import describe, name_of, options_of
 from msg_analysis.experiment.experiment import Experiment
