@@ -31,7 +31,7 @@ class ExitCode(IntEnum):
 
 
 def killed_by(number: int) -> int:
-    """Exit code of a process that a signal ended, as shells report it."""
+    """Exit code of a process that the signal with this ``number`` ended, as shells report it."""
     return 128 + number
 
 

@@ -322,18 +322,15 @@ class WrittenFile:
             kind = topic.type.full_name
             if kind not in schemas:
                 schemas[kind] = self.mcap.register_schema(kind, "ros2msg", topic.type.schema.encode())
-            self._add_channel(topic, schemas[kind])
+            type_hash, count = topic.type.type_hash, self.count.channels
+            count[topic.name] = ChannelCount(topic.name, kind, type_hash, topic.qos.offered())
+            metadata = {"offered_qos_profiles": _offered(topic.qos), "topic_type_hash": type_hash}
+            self._numbers[topic.name] = self.mcap.register_channel(topic.name, "cdr", schemas[kind], metadata)
         for message in latched:
             self.repeat(message)
         self.mcap.flush()
         # The head is not counted: it may be larger than the limit, and every file has it.
         self._limit = None if storage.split_size is None else self._stream.tell() + storage.split_size
-
-    def _add_channel(self, topic: Topic, schema: int) -> None:
-        offered = topic.qos.offered()
-        self.count.channels[topic.name] = ChannelCount(topic.name, topic.type.full_name, topic.type.type_hash, offered)
-        metadata = {"offered_qos_profiles": _offered(topic.qos), "topic_type_hash": topic.type.type_hash}
-        self._numbers[topic.name] = self.mcap.register_channel(topic.name, "cdr", schema, metadata)
 
     @property
     def full(self) -> bool:

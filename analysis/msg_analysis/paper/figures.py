@@ -147,21 +147,21 @@ def csv_text(number: int, points: Sequence[Measured]) -> str:
     return examples.commented_csv(comments, COLUMNS, rows)
 
 
-def summary(points: Sequence[Measured], runs: int, level: float = LEVEL) -> str:
+def summary(points: Sequence[Measured], runs: int) -> str:
     """One sentence: whether all points agree with theory; ``runs`` is the number of networks."""
-    apart = disagreeing(points, level)
+    apart = disagreeing(points)
     within = np.mean([point.low <= point.predicted <= point.high for point in points])
     least = min(point.p_holm for point in points)
     verdict = f"{len(apart)} disagree with theory" if apart else "all agree with theory"
     return (
-        f"{len(points)} points of {runs} networks: {verdict} (Holm over all points, level {level:g}; smallest adjusted "
+        f"{len(points)} points of {runs} networks: {verdict} (Holm over all points, level {LEVEL:g}; smallest adjusted "
         f"p {least:.3g}); {100 * within:.0f} % of the 95 % intervals contain the prediction"
     )
 
 
-def disagreeing(points: Sequence[Measured], level: float = LEVEL) -> list[Measured]:
-    """The points whose adjusted p is below ``level``."""
-    return [point for point in points if point.p_holm < level]
+def disagreeing(points: Sequence[Measured]) -> list[Measured]:
+    """The points whose adjusted p is below ``LEVEL``."""
+    return [point for point in points if point.p_holm < LEVEL]
 
 
 FORMATS = ("png", "svg", "pdf")
@@ -178,13 +178,9 @@ _STYLE = (
     | {"pdf.fonttype": 42, "svg.fonttype": "path"}  # TrueType: text stays text; the same where the font is missing
 )
 # Colour, dashes and marker of the first, second ... curve of a panel; each of the three alone is distinctive.
-_LINES = (
-    (look.BLUE, "-", "o"),
-    (look.VERMILLION, (0, (5, 1.5)), "s"),
-    (look.GREEN, (0, (5, 1.5, 1, 1.5)), "^"),
-    (look.ORANGE, (0, (1, 1)), "D"),
-    (look.PURPLE, (0, (8, 2)), "v"),
-)
+_COLOURS = (look.BLUE, look.VERMILLION, look.GREEN, look.ORANGE, look.PURPLE)
+_DASHES: Any = ("-", (0, (5, 1.5)), (0, (5, 1.5, 1, 1.5)), (0, (1, 1)), (0, (8, 2)))
+_LINES = tuple(zip(_COLOURS, _DASHES, "os^Dv", strict=True))
 _SIDE = 0.05  # inches between points at the same rate
 _NOTE = (
     "Curves: continuous time.  Points: networks of ROS 2 processes, 95 % intervals.  "
@@ -274,12 +270,12 @@ def _draw_2(example: Example, measured: Sequence[Measured]) -> Figure:
         system.annotate(text, peak, (0, 6), textcoords="offset points", ha="center", color=colour, size=7.5)
     system.set_title("(d) largest values: stars", loc="left")
     halves = grid[2].subgridspec(2, 1)
-    panels = [figure.add_subplot(halves[row]) for row in range(2)]
-    for letter, panel, scale in zip("ef", panels, examples.NODE_SCALES, strict=True):
+    for row, scale in enumerate(examples.NODE_SCALES):
+        panel = figure.add_subplot(halves[row])
         panel.set(ylabel="node certainty $1/E_i$", xlabel=rates, xlim=(0, 1), ylim=(1.5, 5.2))
         nodes = _coinciding([c for c in example.select("three_lines", NODE) if c.epsilon[0] == scale])
         _plot(panel, "r12", nodes, "agents", measured)
-        panel.set_title(rf"({letter}) $\epsilon$ = {scale:g}", loc="left")
+        panel.set_title(rf"({'ef'[row]}) $\epsilon$ = {scale:g}", loc="left")
     return figure
 
 
@@ -298,9 +294,9 @@ def _draw_3(example: Example, measured: Sequence[Measured]) -> Figure:
         for axes in (centrality, certainty, lead):
             axes.set(xscale="log", xlim=(1e-2, 1e2), xlabel=r"$\epsilon = q_{12} = q_{21}$ [1/time]")
             axes.set_title(f"({next(letters)})", loc="left")
-        centrality.set(ylabel="robustness centrality $1/E$")
-        certainty.set(ylabel="node certainty $1/E_i$")
-        for axes, curves in ((centrality, central), (certainty, certain)):
+        named = ((centrality, central, "robustness centrality $1/E$"), (certainty, certain, "node certainty $1/E_i$"))
+        for axes, curves, name in named:
+            axes.set_ylabel(name)
             found = [point for c in curves for point in _on_curve(_agent(c), c, "epsilon", measured)]
             low = min([c.value.min() for c in curves] + [point.low for point in found])
             high = max([c.value.max() for c in curves] + [point.high for point in found])

@@ -144,9 +144,11 @@ def find_program() -> str:
     remedy = "install the package msg_agents and ROS 2 (or simulate with the offline twin instead)"
     if found is None:
         raise InputError(f"{PROGRAM}: not found beside {sys.executable} nor on PATH: it runs the networks: {remedy}")
+    with Path(found).open("rb") as file:
+        line = file.readline(1000).decode(errors="replace").strip()
+    python = line[2:] if line.startswith("#!/") and "python" in line and " " not in line else None
     # Its command line starts without ROS, a run does not.
     check = "import importlib.util, sys; sys.exit(importlib.util.find_spec('rclpy') is None)"
-    python = _interpreter(Path(found))
     if python and subprocess.run([python, "-c", check], capture_output=True, check=False).returncode:
         raise InputError(f"{found}: there is no rclpy for {python}: {remedy}")
     return found
@@ -155,13 +157,6 @@ def find_program() -> str:
 def options(directory: Path, keep: bool, at_once: int) -> NetworkOptions:
     """How the networks of a sweep in ``directory`` are run; errors as of ``find_program``."""
     return NetworkOptions(find_program(), str(directory.absolute() / "runs"), keep, at_once)
-
-
-def _interpreter(program: Path) -> str | None:
-    """The Python in the first line of a script; None where there is none."""
-    with program.open("rb") as file:
-        line = file.readline(1000).decode(errors="replace").strip()
-    return line[2:] if line.startswith("#!/") and "python" in line and " " not in line else None
 
 
 def run_network(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:

@@ -137,12 +137,12 @@ def _read(path: Path) -> tuple[dict[str, Outcome], int, int]:
     for line in content[:whole].splitlines():
         try:
             entry = json.loads(line)
-            if not isinstance(entry, dict) or set(entry) != _FIELDS:
-                raise ValueError
         except ValueError:
+            entry = None
+        if isinstance(entry, dict) and set(entry) == _FIELDS:
+            outcomes[entry["id"]] = Outcome(**entry)
+        else:
             damaged += 1
-            continue
-        outcomes[entry["id"]] = Outcome(**entry)
     return outcomes, damaged, whole
 
 
