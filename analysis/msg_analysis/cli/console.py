@@ -290,7 +290,7 @@ class SweepProgress(_Progress):
         self.done(done, total, 0)
 
     def done(self, done: int, total: int, failed: int) -> None:
-        """Show how many points are done, and how many of these failed; a ``SweepProgress`` of ``sweep.conduct``."""
+        """Show how many points are done, and how many of these failed; a ``SweepProgress`` of ``run_jobs``."""
         without = f"{failed} without a result" if failed else ""
         self._show(self._title, done, total, without, without)
 

@@ -35,7 +35,7 @@ from msg_analysis.errors import InputError
 # What the result of a job depends on: the folders and modules that ``evaluate`` imports.
 _SOURCES = (
     *("arithmetic", "common", "experiment", "model", "theory", "twin", "inference"),
-    *("sweep/points.py", "errors.py", "protocol.py"),
+    *("sweeps/points.py", "errors.py", "protocol.py"),
 )
 _LIBRARIES = ("distributed", "pyarrow")
 

@@ -104,11 +104,11 @@ def test_without_room_on_the_disk() -> None:
     script = """
 import signal
 import numpy as np
-from msg_analysis.common import large_arrays
-array = large_arrays.large_zeros((300_000,), np.float64, total=10**9)
-assert not large_arrays.in_file(array)
+from msg_analysis.common import arrays
+array = arrays.large_zeros((300_000,), np.float64, total=10**9)
+assert not arrays.in_file(array)
 array[:] = 1.0
-large_arrays.LARGE = 8
+arrays.LARGE = 8
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 rows, parts = arrays.LargeRows(2, np.int64), [np.full((20_000, 2), number) for number in range(9)]
 for part in parts:

@@ -15,7 +15,7 @@ import yaml
 import experiments
 from experiments import Experiment, simulate
 from msg_analysis.errors import InputError
-from msg_analysis.sweeps import results as conducting
+from msg_analysis.sweeps import workers as conducting
 from msg_analysis.sweeps.grid import load_sweep
 from msg_analysis.sweeps.points import DONE, FAILED, Job, Outcome, evaluate
 from msg_analysis.sweeps.results import JOURNAL, ResultStore, arrow_table, evaluate_sweep, picture, rows_of
