@@ -32,7 +32,9 @@ sys.path.append(str(ROOT / "build/mutants"))
 TESTS = {
     "msg_agents/msg_agents/stepping/synchronizer.py": "tests/agents/stepping",
     "analysis/msg_analysis/theory/moments.py": "tests/analysis/theory/test_moments.py "
-    "tests/analysis/theory/test_prediction.py",
+    "tests/analysis/theory/test_moments_precision.py "
+    "tests/analysis/theory/test_prediction.py "
+    "tests/analysis/theory/test_solvers.py -k 'not test_solvers or converge or dense'",
     "analysis/msg_analysis/inference/verdict.py": "tests/analysis/inference/test_compare.py",
     "analysis/msg_analysis/bags/salvage.py": "tests/analysis/bags/test_trajectory_writer_and_salvage.py -k 'not 00'",
     "analysis/msg_analysis/messages/acceptance.py": "tests/analysis/wire/test_receiving.py",

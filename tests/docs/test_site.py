@@ -179,7 +179,7 @@ def seen(tab: Tab, site: Path, pages: dict[Path, Links]) -> Seen:
 
 def test_in_a_browser(seen: Seen) -> None:
     """Opened from the disk: no request to anywhere, no error, nothing wider than a phone, and the search finds."""
-    assert "leaders.html" in seen.first
+    assert "leader_theory.html" in seen.first
     addresses = seen.log.requests
     assert [url for url in addresses if not url.startswith(("file:", "data:", "blob:", "about:"))] == []
     assert seen.log.complaints == []
