@@ -120,8 +120,10 @@ def test_evidence_ends_a_run_whose_switcher_is_killed(network: Any, monkeypatch:
     other = network.experiment(run=LONG, noise={"process": 0.6})
     announced = []
 
+    made = run_observer.RunObserver
+
     def observer(record: Any, checkpoints: Path) -> run_observer.RunObserver:
-        return run_observer.RunObserver(replace(record, experiment=other), checkpoints)
+        return made(replace(record, experiment=other), checkpoints)
 
     def kill(files: Any) -> int | None:
         step = found(files)
