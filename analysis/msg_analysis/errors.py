@@ -31,7 +31,13 @@ class ExitCode(IntEnum):
 
 
 def killed_by(number: int) -> int:
-    """Exit code of a process that the signal with this ``number`` ended, as shells report it."""
+    """Exit code of a process that a signal ended, as shells report it: 128 + its number.
+
+    Parameters
+    ----------
+    number
+        of the signal
+    """
     return 128 + number
 
 

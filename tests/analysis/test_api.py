@@ -189,6 +189,7 @@ def test_every_object_has_a_table_for_notebooks(experiment: Experiment, run: Run
     shown = [
         *(experiment, prediction, prediction.emulated, run, run.completeness, comparison, comparison.system_error),
         *(experiment.transient([0, 1, 2]), experiment.spectrum([0, 1]), Experiment.load(TRACKING).leaders(1)),
+        msg_analysis.sweep(experiment, {"switching.scale": [1.0, 2.0]}),
     ]
     classes = [getattr(msg_analysis, name) for name in msg_analysis.__all__ if name[0].isupper()]
     assert {kind for kind in classes if not issubclass(kind, Exception)} <= {type(each) for each in shown}

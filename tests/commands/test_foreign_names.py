@@ -11,7 +11,8 @@ import pytest
 from rich.panel import Panel
 from rich.table import Table
 
-from msg_analysis.common.text import SafeConsole, visible
+from msg_analysis.common.console import SafeConsole
+from msg_analysis.common.text import visible
 from msg_analysis.experiment.experiment import Experiment
 
 HOSTILE = "\x1b]0;owned\x07\x9b31m\x1b[2J\u202e"

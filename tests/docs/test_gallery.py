@@ -41,4 +41,4 @@ def test_what_the_page_begins_with(elsewhere: Path) -> None:
     compile(network, "docs/python.md", "exec")  # tests/integration/test_python.py runs it
     for script in (first, *others):
         exec(compile(script, "docs/python.md", "exec"), {})
-    assert {file.name for file in elsewhere.glob("*.png")} == {"run.png", "comparison.png", "prediction.png"}
+    assert {file.name for file in elsewhere.glob("*.png")} == {"run.png", "comparison.png", "rates.png"}

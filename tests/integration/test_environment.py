@@ -1,4 +1,4 @@
-"""RunEnvironment in which a run has the same result as anywhere else."""
+"""Surroundings in which a run has the same result as anywhere else."""
 
 from __future__ import annotations
 

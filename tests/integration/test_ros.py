@@ -170,7 +170,7 @@ def test_what_the_launch_files_do(network: Any) -> None:
     launched.ended(ANALYSIS, analysis.returncode)
     assert (launched.reason is None) == (analysis.returncode == 0)
     assert analysis.returncode in (0, 1), stderr  # which, is a matter of the seed
-    assert "Mean-square error" in stdout
+    assert "mean-square error " in stdout
     launched.close()
     assert json.loads((launched.bag / "log/run.json").read_text())["experiment"]["name"] == "net"
     assert (launched.bag / "report.html").is_file()

@@ -178,7 +178,7 @@ def examples(*lines: str) -> str:
 
 def result_console() -> Console:
     """The rich console for tables on stdout."""
-    from msg_analysis.common.text import ResultConsole
+    from msg_analysis.common.console import ResultConsole
 
     return ResultConsole()
 
@@ -199,9 +199,9 @@ def print_json(document: dict[str, Any], indent: int | None = None) -> None:
 
 def print_note(line: str) -> None:
     """Print one line on stderr, behind a coloured ``note:``."""
-    from msg_analysis.common import text
+    from msg_analysis.common import console
 
-    text.print_note(line)
+    console.print_note(line)
 
 
 _LINE_PERIOD = 10.0  # s between two lines where there is no terminal
@@ -216,7 +216,7 @@ class _Progress:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
         from rich.text import Text
 
-        from msg_analysis.common.text import SafeConsole
+        from msg_analysis.common.console import SafeConsole
 
         times = self._times
 

@@ -1,19 +1,15 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Numbers, agents and tables as text; text that is safe for terminals; notes on stderr."""
+"""Numbers, agents and tables as text; text that is safe for terminals."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
-
-from rich.console import Console, ConsoleOptions, RenderableType
-from rich.segment import Segment
-from rich.text import Text
 
 HALF_WIDTH_95 = 1.959963984540054
 """Half-width of a 95 % interval, in standard errors."""
@@ -125,37 +121,3 @@ _SHOWN = {
 def visible(text: str) -> str:
     """The text with its control characters written as escapes; line ends and tabs stay."""
     return text.translate(_SHOWN)
-
-
-class SafeConsole(Console):
-    """A rich console that prints control characters of texts as escapes; its own are in segments of their own."""
-
-    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
-        """Segments of something that is printed; see rich."""
-        for text, style, control in super().render(renderable, options):
-            yield Segment(text if control else visible(text), style, control)
-
-
-class ResultConsole(SafeConsole):
-    """For tables on stdout."""
-
-    def __init__(self) -> None:
-        super().__init__(highlight=False, markup=False)
-
-    def print(self, *objects: Any, **options: Any) -> None:
-        """Print; sentences are wrapped for readers at a terminal, not for programs."""
-        if not self.is_terminal and all(isinstance(each, str | Text) for each in objects):
-            options.setdefault("soft_wrap", True)
-        super().print(*objects, **options)
-
-    def on_broken_pipe(self) -> None:
-        """Rich exits with 1, which means "disagrees" here."""
-        raise BrokenPipeError
-
-
-def print_note(line: str, console: Console | None = None) -> None:
-    """Print one line after a coloured ``note:``; ``console``: that of the live display which is shown meanwhile."""
-    from rich.text import Text
-
-    console = console or SafeConsole(stderr=True)
-    console.print(Text("note: ", style="bold yellow") + Text(line), soft_wrap=True)

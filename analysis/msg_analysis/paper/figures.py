@@ -25,8 +25,9 @@ from msg_analysis.experiment.graphs import Graph
 from msg_analysis.inference.statistics import holm
 from msg_analysis.paper import examples
 from msg_analysis.paper.examples import CENTRALITY, NODE, SYSTEM, Curve, Example
-from msg_analysis.report import figures as look
-from msg_analysis.report.figures import BLACK, DARK_GREY, draw_graph, rendered
+from msg_analysis.report import look
+from msg_analysis.report.figures import STYLE, draw_graph, rendered
+from msg_analysis.report.look import BLACK, DARK_GREY
 from msg_analysis.sweeps.grid import own_seed
 from msg_analysis.sweeps.points import DONE, Job, Outcome
 
@@ -168,7 +169,7 @@ FORMATS = ("png", "svg", "pdf")
 WIDTH = 7.16  # inches: two columns of a journal
 _DPI = 300
 _STYLE = (
-    look.STYLE
+    STYLE
     | dict.fromkeys(("font.size", "axes.titlesize", "axes.labelsize"), 8)
     | dict.fromkeys(("xtick.labelsize", "ytick.labelsize", "legend.fontsize", "legend.title_fontsize"), 7.5)
     | dict.fromkeys(("axes.linewidth", "xtick.major.width", "ytick.major.width"), 0.6)

@@ -16,7 +16,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.text import agent_name, listed, z_text
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graphs import Graph
-from msg_analysis.report.figures import LABELLED, places, shorten
+from msg_analysis.report.look import LABELLED, places, shorten
 from msg_analysis.report.plot_style import NOBODY, Candidates, graph_variable
 from msg_analysis.theory.graph_indices import algebraic_connectivity
 

@@ -21,7 +21,7 @@ from bokeh.models import BasicTicker, BoxAnnotation, PlainText
 from bokeh.plotting import figure
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray, release
-from msg_analysis.report.figures import shorten
+from msg_analysis.report.look import shorten
 
 
 @dataclass(frozen=True, slots=True)

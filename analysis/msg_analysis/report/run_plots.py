@@ -17,7 +17,7 @@ from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray, pieces
 from msg_analysis.common.text import agent_text, counted
 from msg_analysis.model.phases import phases
 from msg_analysis.model.run import Run
-from msg_analysis.report.figures import shorten
+from msg_analysis.report.look import shorten
 from msg_analysis.report.plot_style import (
     BLACK,
     BLUE,

@@ -34,16 +34,8 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import measured_text, number_text
 from msg_analysis.experiment.problems import show
-from msg_analysis.report.figures import (
-    DARK_GREY,
-    MODE_COLOURS,
-    STYLE,
-    NotebookFigure,
-    plain,
-    rendered,
-    shifted,
-    shorten,
-)
+from msg_analysis.report.figures import STYLE, NotebookFigure, plain, rendered
+from msg_analysis.report.look import DARK_GREY, MODE_COLOURS, shifted, shorten
 from msg_analysis.report.plot_style import BLACK, DARK_SCALE, GREY, INK, LINES, SANS, SCALE, new_figure
 from msg_analysis.sweeps.results import Picture, Place, Series, axis_name, column_words, key_words, value_text
 from msg_analysis.theory.prediction import LAW_NAMES

@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import ValidationError
 
+from msg_analysis.common.text import markdown_table
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graph_sources import plain
+from msg_analysis.experiment.network_spec import is_number
 from msg_analysis.experiment.problems import ExperimentError, translate
 from msg_analysis.sweeps import grid
 from msg_analysis.sweeps.grid import SweepSpec
@@ -50,6 +52,13 @@ class Sweep:
         verdict = f"; {self.judgement.verdict}" if self.judgement.verdict else ""
         what = f"{', '.join(self.points.keys)}: {len(self.rows)} points, {self.points.kind}"
         return f"<Sweep of {self.points.experiment!r} over {what}{verdict}>"
+
+    def _repr_markdown_(self) -> str:
+        shown = [*self.points.keys, *(name for name in self.rows[0] if name.endswith("system_error"))]
+        cells = [
+            [f"{value:.6g}" if is_number(value := row.get(name)) else str(value) for name in shown] for row in self.rows
+        ]
+        return f"{self!r}\n\n{markdown_table(shown, cells, names=0)}"
 
     def to_dataframe(self) -> pd.DataFrame:
         """The points as a data frame of pandas, a row each.

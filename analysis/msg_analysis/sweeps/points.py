@@ -291,10 +291,10 @@ def _result(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
         from msg_analysis.theory.prediction import predict
 
         return of_prediction(predict(experiment).to_json())
-    from msg_analysis.inference.pool import compare
+    from msg_analysis.inference.verdict import compare_run
     from msg_analysis.twin.simulate import simulate
 
-    return of_comparison(compare(simulate(experiment), level=job.level).to_json())
+    return of_comparison(compare_run(simulate(experiment), level=job.level).to_json())
 
 
 def of_prediction(document: Mapping[str, Any]) -> dict[str, Any]:

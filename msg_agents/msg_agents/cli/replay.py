@@ -150,7 +150,7 @@ class PlayBar:
         from rich.text import Text
 
         from msg_agents.nodes.player import Played
-        from msg_analysis.common.text import SafeConsole
+        from msg_analysis.common.console import SafeConsole
 
         class BarAndKeys(Progress):
             def get_renderables(self) -> Iterable[RenderableType]:
@@ -199,7 +199,7 @@ class PlayBar:
 
     def note(self, line: str) -> None:
         """Print a note, above the bar."""
-        from msg_analysis.common.text import print_note
+        from msg_analysis.common.console import print_note
 
         print_note(line, self._console)
 

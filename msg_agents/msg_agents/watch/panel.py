@@ -21,11 +21,12 @@ from msg_agents.process_layout import Process
 from msg_agents.terminal import JobControl
 from msg_agents.watch.observer import RunObserver
 from msg_agents.watch.snapshot import Snapshot, SnapshotSource, run_description, snapshot_document
-from msg_analysis.common.text import HALF_WIDTH_95, agent_name, print_note
+from msg_analysis.common.console import print_note
+from msg_analysis.common.text import HALF_WIDTH_95, agent_name
 from msg_analysis.messages.topics import agent_node_name
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.report.comparison_text import any_time_text, coverage, error_text
-from msg_analysis.report.figures import shorten
+from msg_analysis.report.look import shorten
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -311,7 +312,7 @@ class RunView(View):
     """Shows a run in all these ways; a context."""
 
     def __init__(self, experiment: Experiment, web: WebServer | None = None, *, prints_domain: bool = True) -> None:
-        from msg_analysis.common.text import SafeConsole
+        from msg_analysis.common.console import SafeConsole
 
         self._experiment, self._prints_domain = experiment, prints_domain
         self._console = SafeConsole(stderr=True)

@@ -195,7 +195,7 @@ class SnapshotSource:
 
 def run_description(experiment: Experiment) -> dict[str, Any]:
     """What does not change in a run, for a page that draws it: agents, graphs, positions."""
-    from msg_analysis.report.figures import places
+    from msg_analysis.report.look import places
 
     where = places(experiment.graph_list)
     return {

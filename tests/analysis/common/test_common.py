@@ -167,7 +167,7 @@ def test_what_is_told(tmp_path: Path) -> None:
     with watched(lambda what, done, total: told.setdefault(what, []).append((done, total))):
         compare(read_bag(tmp_path / "bag"))
     tell("nothing", 1, 2)
-    stages = ["reading bag", "reading bag_0.mcap", "errors", "errors given the path", "innovations"]
+    stages = ["reading bag", "reading bag_0.mcap", "errors", "errors given the path", "residuals"]
     assert list(told) == stages
     for steps in told.values():
         assert all(0 <= done <= total for done, total in steps)

@@ -67,7 +67,8 @@ def test_neither_file_nor_example() -> None:
     with pytest.raises(InputError) as error:
         find("lin_ring")
     assert str(error.value) == (
-        f"lin_ring: no such file, and no example of this name: expected a file, or one of {', '.join(names())}"
+        f"lin_ring: no such file, and no example of this name: expected a file, or one of {', '.join(names())}: "
+        "did you mean line_ring?"
     )
     with pytest.raises(InputError, match=r"^line_ring\.yaml: no such file: check the path, or give line_ring"):
         find("line_ring.yaml")

@@ -217,7 +217,7 @@ def test_agents_that_are_where_no_noise_could_have_put_them():
     trajectory.states[100, 0] += 0.5
     result = compare(trajectory)
     assert result.verdict == "disagrees"
-    assert result.residuals.p_covariance == 0.0
+    assert result.innovations.p_covariance == 0.0
 
 
 @pytest.mark.filterwarnings("error")
@@ -271,11 +271,11 @@ def test_noise_in_the_wrong_graph_is_found():
     swapped, told = (loud(*noise, duration=200) for noise in ((1.0, 0.3), (0.3, 1.0)))
     comparison = compare(claimed(simulate(swapped), told))
     assert comparison.verdict == "disagrees"
-    assert comparison.residuals.p_covariance < 1e-6
+    assert comparison.innovations.p_covariance < 1e-6
     noisy = np.array(SHARED)
     noisy[2, 2] = 1e-3
     comparison = compare(claimed(simulate(loud(noisy.tolist(), 1.0)), loud(SHARED, 1.0)))
-    assert comparison.residuals.p_covariance == 0.0
+    assert comparison.innovations.p_covariance == 0.0
     assert comparison.verdict == "disagrees"
 
 
@@ -302,10 +302,10 @@ def test_heavy_tails(document):
     assert found.any_time.half_width is None
     assert not found.running["standard_error"].any()
     tests = {test.name: test.p for test in found.tests}
-    assert tests["system error"] == pytest.approx(found.given.system_error.p)
+    assert tests["system error, corrected"] == pytest.approx(found.given.system_error.p)
     [words] = trust_words(found.to_json())
     assert "infinite" in words
-    assert "Trust the errors given the path" in words
+    assert "Trust the errors corrected for the graph sequence" in words
 
 
 def test_heavy_tails_of_several_runs_and_live():

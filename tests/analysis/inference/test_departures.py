@@ -38,7 +38,7 @@ def summed(observation: Observation, kind: type[Kind], size: int = 37) -> Kind:
     sums = EvidenceSums(observation.prediction, observation.replicas, in_detail=True)
     for first in range(0, observation.steps, size):
         sums.add(observation, first, min(first + size, observation.steps))
-    return next(each for each in sums.departures.kinds if isinstance(each, kind))
+    return next(each for each in sums.diagnostics if isinstance(each, kind))
 
 
 def whitened(observation: Observation) -> np.ndarray:
@@ -419,7 +419,7 @@ def departures():
 
 
 WORDS = {
-    "an agent stands still for 20 steps": r"agent 3 stood still from step ([\d,]+) to ([\d,]+), although it has noise",
+    "an agent stands still for 20 steps": r"agent 3 did not move from step ([\d,]+) to ([\d,]+), although it has noise",
     "names of the graphs swapped in 10 blocks of 20 steps": (
         r"the log has the names of the graphs line and ring swapped from step [\d,]+ to [\d,]+"
     ),
@@ -440,7 +440,7 @@ WORDS = {
         r"the noise of all agents has correlation 0\.0[45]\S* \(.*\) with its own 20 steps before, not 0"
     ),
     "gamma sojourns of shape 10": (
-        r"the probability of leaving graph (line|ring) depends on the length of the sojourn: it is .*, not 0.0476"
+        r"the probability of leaving graph (line|ring) depends on how long it has lasted: it is .*, not 0.0476"
     ),
     "one innovation of 8 standard deviations": r"agent 4's noise is 8 standard deviations in step [\d,]+",
     "stale values in one message of five": (

@@ -37,7 +37,7 @@ def test_calibration(case):
     """40 true runs of 400 steps."""
     results = [compare(simulate(CASES[case].with_run(seed=seed))) for seed in SEEDS]
     collected = {test.name for test in results[0].tests}
-    names = {"system error", "covariance", "residuals: covariance", "residuals: gains"}
+    names = {"system error, corrected", "covariance", "residuals: covariance", "residuals: gains"}
     assert names <= collected
     assert ("residuals: whiteness" in collected) == (case != "no process noise")
     assert ("loss" in collected) == (case != "nothing lost")

@@ -62,10 +62,10 @@ def test_innovations_are_added_up(three):
     whitened = np.einsum("i,kir->kri", 1 / np.sqrt(np.diag(observations[0].step.noise[0])), e).reshape(-1, 3)
     n, scatter = len(whitened), whitened.T @ whitened / len(whitened)
     statistic = n * (np.trace(scatter) - np.log(np.linalg.det(scatter)) - 3) * (1 - 26 / (24 * n))
-    assert pooled.residuals.p_covariance == pytest.approx(stats.chi2.sf(statistic, 6), rel=1e-8)
+    assert pooled.innovations.p_covariance == pytest.approx(stats.chi2.sf(statistic, 6), rel=1e-8)
     sums = [Evidence.of(one, 0.01).residuals for one in observations]
     chi2, dof = quadratic_form(sum(s.score for s in sums), sum(s.covariance for s in sums))
-    assert pooled.residuals.p_gain == pytest.approx(stats.chi2.sf(chi2, dof))
+    assert pooled.innovations.p_gain == pytest.approx(stats.chi2.sf(chi2, dof))
 
 
 def test_runs_alike_is_cochrans_q(three):

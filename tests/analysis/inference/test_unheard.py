@@ -100,11 +100,11 @@ def test_late_agents_and_messages(late_timers):
     """Receivers that are late have not missed what came twice in their period; slow messages are overtaken."""
     what = experiment(40)
     punctual = late_timers.run(what)
-    assert lost_messages(observed(punctual)).unheard.sum() == 0
+    assert lost_messages(observed(punctual)).lost.sum() == 0
     slow = late_timers.run(what, slow=late_timers.busy(0.5, 2.5), late=late_timers.busy(0.3, 1.5))
     found = lost_messages(observed(slow))
-    assert found.unheard.sum() > 0
-    for (receiver, sender), messages, unheard in zip(found.links.tolist(), found.messages, found.unheard, strict=True):
+    assert found.lost.sum() > 0
+    for (receiver, sender), messages, unheard in zip(found.links.tolist(), found.messages, found.lost, strict=True):
         assert (messages, unheard) == by_hand(slow, receiver, sender)
 
 

@@ -28,7 +28,7 @@ MISTAKES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
         [
             'protocol.name: "metropolys": expected one of integral_action (msg_agents_example_protocols 0.1.0), '
             "metropolis (msg_agents_example_protocols 0.1.0), saturated (msg_agents_example_protocols 0.1.0): "
-            "correct it, or install its package"
+            "did you mean metropolis?"
         ],
     ),
     ({"laziness": 0.5}, {}, ["protocol.name: missing: expected the name under which"]),

@@ -11,8 +11,8 @@ import yaml
 from browser import CUT, FAINT, Log, Tab
 
 from msg_analysis import Experiment
-from msg_analysis.report.figures import shifted
 from msg_analysis.report.list_pages import write_runs_page, write_sweep_page
+from msg_analysis.report.look import shifted
 from msg_analysis.runs import RunEntry
 from msg_analysis.sweeps.grid import load_sweep
 from msg_analysis.sweeps.results import axis_name, column_words

@@ -135,7 +135,7 @@ IMPORTED = """
 import sys
 from msg_analysis.sweeps.points import evaluate
 from msg_analysis.theory import prediction
-from msg_analysis.inference.verdict import compare
+from msg_analysis.inference.verdict import compare_run
 from msg_analysis.twin import simulate
 print(*(module.__file__ for name, module in sys.modules.items() if name.startswith("msg_analysis.")), sep="\\n")
 """

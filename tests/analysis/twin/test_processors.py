@@ -68,7 +68,7 @@ def test_a_long_past_is_replaced_by_a_rounded_start(tmp_path: Path, monkeypatch:
     """On another processor too: the rounding is far above what linear algebra differs by."""
     other, file = another_processor(), tmp_path / "net.yaml"
     file.write_text(yaml.safe_dump(document(CASES["grounded"] | {"noise": {"process": CORRELATED}})))
-    code = "from msg_analysis.twin import start as twin_start; twin_start.MAX_PAST = 0\n" + WRITE
+    code = "from msg_analysis.twin import simulate as twin_start; twin_start.MAX_PAST = 0\n" + WRITE
     environment = os.environ | other | {"PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", code, file], env=environment, check=True)
     monkeypatch.setattr(twin_start, "MAX_PAST", 0)

@@ -74,7 +74,7 @@ def test_reasons_in_the_documentation() -> None:
     """Every reason that the documentation explains exists, and no two have the same text."""
     reasons = [text for name, text in vars(Refusal).items() if not name.startswith("_")]
     assert len(set(reasons)) == len(reasons)
-    faults = (DOCS / "faults.md").read_text(encoding="utf-8")
+    faults = (DOCS / "wire.md").read_text(encoding="utf-8")
     table = re.search(r"^\| reason \|.*\n((?:\|.*\n)+)", faults, re.MULTILINE)
     assert table
     named = re.findall("`(.*?)`", "".join(line.split("|")[1] for line in table[1].splitlines()[1:]))
