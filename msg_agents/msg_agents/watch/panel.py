@@ -31,7 +31,6 @@ from msg_analysis.report.look import shorten
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from msg_agents.process_layout import Process
     from msg_agents.watch.web_server import WebServer
     from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.inference.estimates import Estimate
