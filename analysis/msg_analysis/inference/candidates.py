@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
-from msg_analysis.common.text import HALF_WIDTH_95
+from msg_analysis.common.text import HALF_WIDTH_95, percent
 from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.inference.counts import LossTally
 from msg_analysis.inference.received_values import NO_NOISE
@@ -54,6 +54,12 @@ class Selected:
         """95 %."""
         half = HALF_WIDTH_95 * self.standard_error
         return self.estimate - half, self.estimate + half
+
+    @property
+    def factor(self) -> tuple[float, tuple[float, float]]:
+        """Estimate and interval of a change of a logarithm, as factors."""
+        low, high = self.interval
+        return math.exp(self.estimate), (math.exp(low), math.exp(high))
 
 
 def select(
@@ -198,6 +204,11 @@ class Cause:
 def numbers_text(value: float, interval: tuple[float, float]) -> str:
     """A number and its interval."""
     return f"{value:#.3g} ({interval[0]:#.3g} to {interval[1]:#.3g})"
+
+
+def share_text(share: float, interval: tuple[float, float]) -> str:
+    """A share and its interval, in percent."""
+    return f"{percent(share)} ({100 * interval[0]:.3g} to {100 * interval[1]:.3g} %)"
 
 
 MIN_SAMPLES = 30  # fewest residuals for a variance

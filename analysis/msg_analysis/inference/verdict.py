@@ -216,14 +216,16 @@ def evaluate(
     covariance = _covariance(evidence, prediction.system)
     law = evidence.tested
     tested_error, tested_nodes = estimates(law, prediction.system) if law else (None, [])
+    switching = evidence.transitions.test(prediction.step.transition)
+    loss = evidence.loss.test() if evidence.loss else None
     run = Statistics(
         system_error=tested_error,
         node_errors=tested_nodes,
         corrected=", corrected" if law and law is evidence.given else "",
-        covariance=covariance if evidence.decisive else None,
+        p_covariance=covariance.p if evidence.decisive else None,
         residuals=evidence.residuals.tests(),
-        switching=evidence.transitions.test(prediction.step.transition),
-        loss=evidence.loss.test() if evidence.loss else None,
+        p_switching=switching.p,
+        p_loss=loss.p if loss else None,
         p_broadcast=evidence.broadcast.p_value() if evidence.broadcast else None,
         findings=evidence.watched.sums.findings(),
         p_alike=p_alike,
@@ -244,12 +246,12 @@ def evaluate(
         node_errors=node_errors,
         covariance=covariance,
         innovations=run.residuals,
-        switching=run.switching,
+        switching=switching,
         continuous_error=prediction.continuous.system_error if prediction.continuous_moments else None,
         batch=batch_interval(means.system_series),
         tests=tests,
         running=_running(means, prediction.step.dt),
-        loss=run.loss,
+        loss=loss,
         p_broadcast=run.p_broadcast,
         timing=evidence.timing,
         laws=evidence.laws,
@@ -296,10 +298,9 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
     if measurement.steps < MIN_STEPS and not trajectory.completeness.complete:
         enough = False
     series, covariance = measurement.system_series, measurement.covariance if enough else None
-    run = Statistics(
-        switching=switching_test(measurement.modes, measurement.step.transition) if enough else None,
-        loss=loss_test(measurement) if enough else None,
-    )
+    switching = switching_test(measurement.modes, measurement.step.transition) if enough else None
+    loss = loss_test(measurement) if enough else None
+    run = Statistics(p_switching=switching.p if switching else None, p_loss=loss.p if loss else None)
     nodes = [Estimate()] * agents if covariance is None else [Estimate(float(error)) for error in np.diag(covariance)]
     counts = spaced_steps(len(series)) if enough else np.empty(0, np.int64)
     return Comparison(
@@ -309,7 +310,7 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
         system_error=Estimate() if covariance is None else Estimate(float(np.trace(covariance))),
         node_errors=nodes,
         covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
-        switching=run.switching,
+        switching=switching,
         batch=batch_interval(series) if enough else None,
         tests=decide(run, level),
         running={
@@ -317,7 +318,7 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
             "system_error": np.cumsum(series)[counts - 1] / counts if enough else np.empty(0),
             "standard_error": np.zeros(len(counts)),
         },
-        loss=run.loss,
+        loss=loss,
         unpredicted=unpredicted,
         transient=measurement.first if enough else None,
     )

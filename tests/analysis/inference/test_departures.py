@@ -123,6 +123,11 @@ def sojourns(transition: list[list[float]], steps: int) -> HoldingTimes:
     return HoldingTimes(law_of(json.dumps(transition), steps))
 
 
+def count(sums: HoldingTimes, graphs: np.ndarray) -> None:
+    """Add steps with these graphs, the last one being that of the next step."""
+    sums.add(SimpleNamespace(graphs=graphs, analyses=Analyses.at_the_end(len(graphs))))  # type: ignore[arg-type]
+
+
 def made(step: StepModel, steps: int, replicas: int, noisy: np.ndarray) -> Law:
     """Of a run without links that are asked about."""
     none = np.empty((0, 2), np.int64)
@@ -152,7 +157,7 @@ def test_sojourns_are_counted_as_by_a_loop() -> None:
     path = chain(SLOW, 900, 2)
     sums = sojourns(SLOW, 900)
     for first in range(0, 900, 50):
-        sums.count(path[first : first + 51], Analyses.at_the_end(50))
+        count(sums, path[first : first + 51])
     steps, left, age = np.zeros((2, PARTS)), np.zeros((2, PARTS)), 0
     for now, following in zip(path[:-1].tolist(), path[1:].tolist(), strict=True):
         # Part p has the ages by which at least p, and fewer than p + 1, eighths of the sojourns have ended.
@@ -160,19 +165,17 @@ def test_sojourns_are_counted_as_by_a_loop() -> None:
         steps[now, part] += 1
         left[now, part] += now != following
         age = 0 if now != following else age + 1
-    assert (sums.steps == steps).all()
-    assert (sums.left == left).all()
+    assert (sums.sums[0] == steps).all()
+    assert (sums.sums[1] == left).all()
 
 
 def test_the_statistic_of_sojourns_is_that_of_a_table() -> None:
     path = chain(SLOW, 20_000, 4)
     sums = sojourns(SLOW, 20_000)
-    sums.count(path, Analyses.at_the_end(len(path)))
+    count(sums, path)
     finding = sums.finding()
-    total = sum(
-        stats.chi2_contingency(np.vstack([sums.left[g], sums.steps[g] - sums.left[g]]), lambda_="log-likelihood")[0]
-        for g in range(2)
-    )
+    tables = [np.vstack([left, steps - left]) for steps, left in zip(*sums.sums, strict=True)]
+    total = sum(stats.chi2_contingency(table, lambda_="log-likelihood")[0] for table in tables)
     assert np.exp(finding.log_p) == pytest.approx(stats.chi2.sf(total, 14), rel=1e-6)
 
 
@@ -182,7 +185,7 @@ def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], s
     p = []
     for seed in range(200):
         sums = sojourns(transition, steps)
-        sums.count(chain(transition, steps, seed), Analyses.at_the_end(steps))
+        count(sums, chain(transition, steps, seed))
         finding = sums.finding()
         p.append(np.exp(finding.log_p))
     assert stats.kstest(p, "uniform").pvalue > 1e-3
@@ -190,7 +193,7 @@ def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], s
 
 def test_few_sojourns_are_not_tested() -> None:
     sums = sojourns(SLOW, 300)
-    sums.count(chain(SLOW, 300, 1), Analyses.at_the_end(300))
+    count(sums, chain(SLOW, 300, 1))
     assert sums.finding() is None
 
 
@@ -201,8 +204,8 @@ def test_noise_by_graph() -> None:
     for g in range(2):
         squares = (white[observation.modes == g] ** 2).sum(axis=(0, 2))
         number = 2 * int((observation.modes == g).sum())
-        assert sums.squares[g] == pytest.approx(squares)
-        assert (sums.samples[g] == number).all()
+        assert sums.sums[1][g] == pytest.approx(squares)
+        assert (sums.sums[0][g] == number).all()
         for total, samples in [*((s, number) for s in squares), (squares.sum(), 5 * number)]:
             p.append(2.0 * min(stats.chi2.sf(total, samples), stats.chi2.cdf(total, samples)))
     finding = sums.finding()
@@ -321,8 +324,8 @@ def test_long_lags() -> None:
     for lag in range(1, 101):
         late, early = white[lag:], white[:-lag]
         score, information = (late * early).sum(axis=(0, 2)), (early**2).sum(axis=(0, 2))
-        assert sums.sums.score[lag - 1] == pytest.approx(score, abs=1e-9)
-        assert sums.sums.information[lag - 1] == pytest.approx(information)
+        assert sums.lags.score[lag - 1] == pytest.approx(score, abs=1e-9)
+        assert sums.lags.information[lag - 1] == pytest.approx(information)
         p += (1000 * 2 * stats.norm.sf(np.abs(score / np.sqrt(information)))).tolist()
         p.append(200 * 2 * stats.norm.sf(abs(score.sum() / np.sqrt(information.sum()))))
     finding = sums.finding()
@@ -356,8 +359,8 @@ def test_stale_values(changes: dict[str, Any]) -> None:
                 older = step.nominal[own, i, j] * (heard[max(s - 1, 0), j] - heard[s, j])
                 score[i, j] += older @ e / variance
                 information[i, j] += older @ older / variance
-    assert sums.score == pytest.approx(score, abs=1e-9)
-    assert sums.information == pytest.approx(information)
+    assert sums.sums[0] == pytest.approx(score, abs=1e-9)
+    assert sums.sums[1] == pytest.approx(information)
     links = information > 0.0
     p = 2 * stats.norm.sf(np.abs(score[links] / np.sqrt(information[links]))) * 2 * links.sum()
     common = 2 * stats.norm.sf(abs(score.sum()) / np.sqrt(information.sum())) * 2
@@ -400,9 +403,9 @@ def test_runs_are_merged() -> None:
     largest = pairs[2][0].finding()
     assert (largest.place.run, largest.place.first) == (2, 121)
     lags = [summed(each, LongLags) for each in (first, second)]
-    products = lags[0].sums.score + lags[1].sums.score
+    products = lags[0].lags.score + lags[1].lags.score
     lags[0].merge(lags[1])
-    assert (lags[0].sums.score == products).all()
+    assert (lags[0].lags.score == products).all()
 
 
 BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
