@@ -3,8 +3,6 @@
 
 """Candidate causes of a disagreement, and their words.
 
-Scores of the parameters that may be wrong (gains, noise, messages), and the single causes searched for.
-
 Every group has parameters with a score s and its information J, so that a change c of them gives s the mean J c.
 """
 
@@ -65,28 +63,11 @@ class Selected:
 def select(
     score: FloatArray, information: FloatArray, classes: Sequence[Sequence[Candidate]], families: int, level: float
 ) -> tuple[list[Selected], FloatArray]:
-    """Find the changes that explain a score, the smallest p-value first, each given the others.
+    """The changes that explain a score (K,), the smallest p-value first, each given the others; and their sum (K,).
 
-    A candidate's p-value is multiplied by the number of candidates of its class and by the number of classes
-    (Bonferroni): so a class of one (all messages alike) needs less evidence than one of many links.
-
-    Parameters
-    ----------
-    score
-        (K,) with mean information @ change
-    information
-        (K, K) covariance of the score where nothing is wrong
-    classes
-        candidates, class by class
-    families
-        number of classes, those of other scores included
-    level
-        probability of finding anything where nothing is wrong, at most
-
-    Returns
-    -------
-    tuple[list[Selected], FloatArray]
-        what was found, and the total change (K,) of the parameters
+    A candidate's p-value is multiplied by the number of candidates of its class and by the number of classes of all
+    scores, ``families`` (Bonferroni): so a class of one (all messages alike) needs less evidence than one of many
+    links. The probability of finding anything where nothing is wrong is at most ``level``.
     """
     candidates, penalties = _distinct(classes, families)
     if not candidates:
@@ -233,17 +214,15 @@ def frozen(sums: ResidualSums) -> list[tuple[int, int, int]]:
 
 
 def gains(sums: ResidualSums, excluded: Iterable[int]) -> Parameters | None:
-    """Parameters of the regression on received values, without the ``excluded``; None where it is not available.
-
-    Changes of gains are relative, those of the reference and of offsets (per step) absolute. The score G C^-1 U and the
-    information G C^-1 G follow from the regression's score U, covariance C and gram G.
-    """
+    """Of the regression on received values, without the ``excluded`` agents; None where it is not available."""
     if sums.gram is None or len(sums.terms) > MAX_PARAMETERS:
         return None
     out = set(excluded)
     kept = np.array([a for a, term in enumerate(sums.terms) if term.agent not in out], dtype=np.int64)
     if not kept.size:
         return None
+    # Of the regression's score U, covariance C and gram G: G C^-1 U, G C^-1 G. Changes of gains are relative, those of
+    # the reference and of offsets (per step) absolute.
     square = np.ix_(kept, kept)
     inverse = pseudo_inverse(sums.covariance[square])
     back = sums.gram[square] @ inverse
@@ -299,10 +278,7 @@ def _reference(terms: Sequence[Term]) -> FloatArray:
 
 
 def noise(sums: ResidualSums, excluded: Iterable[int], change: FloatArray) -> Parameters | None:
-    """Logarithms of the noise variances over their nominal values, by graph and agent; None without usable ones.
-
-    Left out are the ``excluded`` agents, and what the coefficients ``change`` (K,) of the regression explain.
-    """
+    """Log noise variances by graph and agent, less what the ``change`` (K,) of gains explains; None without any."""
     n, m = sums.still.shape
     out = np.zeros(m, np.bool_)
     out[list(excluded)] = True
@@ -330,10 +306,7 @@ def noise(sums: ResidualSums, excluded: Iterable[int], change: FloatArray) -> Pa
 
 
 def variances(squares: FloatArray, samples: int) -> Parameters:
-    """Logarithms of the variances of m kinds of independent normal numbers, nominally 1.
-
-    ``squares`` (m,) are sums of squares of as many numbers as ``samples``.
-    """
+    """Logarithms of variances, nominally 1, from sums of squares (m,) of so many normal ``samples`` each."""
     information = np.eye(len(squares)) * samples / 2.0
     classes = [
         [Candidate("agent", i, row) for i, row in enumerate(np.eye(len(squares)))],
@@ -391,19 +364,7 @@ class Rate:
 
 
 def find_rates(counts: IntArray, chain: MarkovChain, dt: float, families: int, level: float) -> list[Rate]:
-    """Find the rates that explain the counted transitions: score tests, then maximum likelihood of the factors.
-
-    Parameters
-    ----------
-    counts
-        (n, n) of transitions from step to step
-    chain
-        the nominal chain; with more than ``MAX_JUMPS`` kinds of jumps nothing is found
-    dt
-        length of a step [simulated time]
-    families, level
-        see ``selection.select``
-    """
+    """Rates that explain the transitions ``counts`` (n, n): score tests, then maximum likelihood of their factors."""
     n = chain.modes
     transition = chain.transition(dt)
     jumps = [(g, h) for g, h in np.argwhere(chain.matrix > 0.0).tolist() if g != h]

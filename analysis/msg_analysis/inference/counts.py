@@ -4,8 +4,8 @@
 """Counted transitions of the graphs and counted losses of messages, and their tests (docs/statistics.md).
 
 Given the graphs, the losses of a link are independent, or with ``noise.burst`` a Markov chain with two states. In
-lockstep the log has the fate of every message of an active link. In real time it has that of every use: a message that
-is used again counts again, which leaves the share of the lost ones right, but not its variance.
+lockstep the log says of every message of an active link whether it was lost. In real time it says so of every use: a
+message that is used again counts again, which leaves the share of the lost ones right, but not its variance.
 """
 
 from __future__ import annotations
@@ -57,7 +57,13 @@ class Transitions:
         return Transitions(self.counts + other.counts, self.paths + other.paths)
 
     def test(self, transition: FloatArray) -> SwitchingTest:
-        """See ``switching_test``; ``transition`` is P (n, n)."""
+        """Test the paths of the graph against P (n, n), by the likelihood-ratio statistic G.
+
+        Its law is chi-square when every possible transition is expected often enough; else it is simulated: paths of
+        the same length from the same first graph (fixed seed), with a gamma fit where none of them is as extreme. With
+        two graphs and 6 expected switches each way, 2.3 % of Pearson's p-values would be below 0.01; of these, 0.9 %
+        (20 000 paths).
+        """
         counts = self.counts
         visits = counts.sum(axis=1)
         expected = visits[:, None] * transition
@@ -89,38 +95,12 @@ class Transitions:
 
 
 def switching_test(modes: IntArray, transition: FloatArray) -> SwitchingTest:
-    """Test a path of the graph against its chain, by the likelihood-ratio statistic G.
-
-    Its law is chi-square when every possible transition is expected often enough; else it is simulated: paths of the
-    same length from the same first graph (fixed seed), with a gamma fit where none of them is as extreme. With two
-    graphs and 6 expected switches each way, 2.3 % of Pearson's p-values would be below 0.01 and 0.7 % below 0.001; of
-    these, 0.9 % and 0.15 % (20 000 paths).
-
-    Parameters
-    ----------
-    modes
-        (N,) from 0
-    transition
-        (n, n) P
-    """
+    """See ``Transitions.test``; graphs (N,) from 0, and P (n, n)."""
     return Transitions.of(modes, len(transition)).test(transition)
 
 
 def likelihood_ratio(counts: IntArray, transition: FloatArray) -> FloatArray:
-    """G = 2 sum c log(c / e) of counts c, e being the visits of a row times P.
-
-    Parameters
-    ----------
-    counts
-        (..., n, n) of transitions
-    transition
-        (n, n) P
-
-    Returns
-    -------
-    FloatArray
-        (..., ) one G for each matrix of counts
-    """
+    """(...): G = 2 sum c log(c / e) of transitions c (..., n, n), e being the visits of a row times P (n, n)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = counts * np.log(counts / (counts.sum(axis=-1, keepdims=True) * transition))
     return np.asarray(2.0 * np.where(counts > 0, terms, 0.0).sum(axis=(-2, -1)))
@@ -240,10 +220,8 @@ class LossTally:
         self._same_step += other._same_step
 
     def score(self) -> tuple[FloatArray, FloatArray]:
-        """(links,) each: losses beyond the expected ones, and their information, of what says most about the chance.
-
-        In bursts, whose mean length is given, that are the messages after one that was not lost.
-        """
+        """(links,) each: losses beyond the expected ones, and their information, of what says most about the chance."""
+        # In bursts, whose mean length is given, the messages after one that was not lost.
         if self._bursts:
             chance, tried, failed = self._chances[1], self._tried[1], self._failed[1]
         else:

@@ -121,11 +121,7 @@ class Lag:
 
 
 class LagSums:
-    """Regression of N(0, 1) numbers on those of the same column 1 to 100 steps before; expected coefficient 0.
-
-    Given the past, the sum of the products is a martingale whose variance is the sum of the squares of the earlier
-    numbers.
-    """
+    """Regression of N(0, 1) numbers on those of the same column 1 to 100 steps before; expected coefficient 0."""
 
     def __init__(self, columns: int, samples: int) -> None:
         self._tail = np.empty((0, columns, samples))
@@ -134,6 +130,7 @@ class LagSums:
 
     def add(self, numbers: FloatArray, analyses: Analyses) -> tuple[FloatArray, FloatArray]:
         """Add numbers (b, columns, samples): (T, 100, columns) ``score`` and ``information`` after each analysis."""
+        # Given the past, the sum of the products is a martingale, whose variance is the sum of the earlier squares.
         joined = np.concatenate([self._tail, numbers])
         old, lags = len(self._tail), np.arange(1, LAGS + 1)
         # (T, lags): between the analyses, the numbers that have one so many steps before them, in ``joined``.
@@ -196,10 +193,7 @@ def lag_evidence(score: FloatArray, information: FloatArray) -> FloatArray:
 
 
 class LongLags(Diagnostic):
-    """Regression of every residual on that of the same agent 1 to 100 steps before: the clearest lag.
-
-    Of an agent, or of all together where they are independent, with half of the level each.
-    """
+    """Regression of every residual on that of the same agent 1 to 100 steps before: the clearest lag."""
 
     name = "residuals: lags to 100"
     meaning = "the noise of a step depends on that of up to 100 steps before"
@@ -223,7 +217,7 @@ class LongLags(Diagnostic):
         if each is None:
             return None
         best = min((lag for lag in (each, whole) if lag), key=lambda lag: lag.log_p)
-        log_p = min(0.0, best.log_p + math.log(1.0 + self.together))
+        log_p = min(0.0, best.log_p + math.log(1.0 + self.together))  # half of the level each
         return best.finding(None if best is whole else self.agent(best.column), log_p)
 
     def logarithms(self) -> FloatArray:

@@ -92,10 +92,7 @@ def estimates(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Esti
 
 
 def beside(measured: FloatArray, predicted: FloatArray, errors: FloatArray) -> tuple[Estimate, list[Estimate]]:
-    """Estimates of the system error and of the node errors from arrays (1 + nodes,), the system error first.
-
-    ``errors`` are standard errors. The p-values of the nodes are adjusted by Holm.
-    """
+    """Estimates of the system error and of the node errors (Holm), from arrays (1 + nodes,), the system error first."""
     found = [estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)]
     tested = [i for i, entry in enumerate(found) if i > 0 and entry.p is not None]
     adjusted = dict(zip(tested, holm(np.array([found[i].p for i in tested], dtype=float)), strict=True))
@@ -116,20 +113,7 @@ def estimate(measured: float, predicted: float, error: float, scale: float) -> E
 
 
 def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
-    """Test of all second moments together: the quadratic form of measured - predicted is chi-square.
-
-    Parameters
-    ----------
-    means
-        of the run, or of several
-    system
-        the reduced system whose moments they are
-
-    Returns
-    -------
-    CovarianceTest
-        without ``chi2`` where not all moments are estimated together; without ``p`` where dof = 0
-    """
+    """Quadratic form of measured - predicted second moments; without ``chi2`` where they are not estimated together."""
     frame = system.frame
     measured = frame @ means.second_moments @ frame.T
     predicted = frame @ means.expected_moments @ frame.T
@@ -228,16 +212,9 @@ def rank_agents(means: TimeMeans, level: float) -> Ranking | None:
 def rank_estimates(
     measured: FloatArray, covariance: FloatArray, predicted: FloatArray | None, level: float
 ) -> Ranking | None:
-    """Order estimates, and distinguish pairs of them by z-tests, adjusted by Holm.
+    """Order estimates (q,) with covariance (q, q), and distinguish pairs of them by z-tests, adjusted by Holm.
 
-    None where there is no pair, no noise, or more than ``MAX_RANKED_PAIRS``.
-
-    Parameters
-    ----------
-    measured, covariance, predicted
-        (q,) estimates, their (q, q), and (q,) what they should be, or None
-    level
-        probability of any wrong distinction, at most
+    None where there is no pair, no noise, or more than ``MAX_RANKED_PAIRS``; ``predicted`` (q,): what they should be.
     """
     q = len(measured)
     first, second = np.triu_indices(q, 1)

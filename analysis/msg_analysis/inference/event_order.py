@@ -52,10 +52,7 @@ class EventOrder:
         return cls(position, newest)
 
     def events(self, first: int, last: int) -> tuple[IntArray, IntArray]:
-        """Steps and agents (e,) of the events after sampling time first - 1 and up to last - 1, agent after agent.
-
-        ``first``: 0 for the beginning; ``last``: N + 2 for the end.
-        """
+        """Steps and agents (e,) of the events after sampling time first - 1 and up to last - 1 (0 and N + 2: all)."""
         m = self.newest.shape[1]
         begin = self.newest[first - 1] if first else np.zeros(m, dtype=np.int64)
         end = self.newest[last - 1] if last <= len(self.newest) else np.full(m, len(self.position))
@@ -68,10 +65,8 @@ def _zeros(rows: int, columns: int) -> IntArray:
 
 
 def order_events(observation: Observation, ties_at_once: int = TIES_AT_ONCE) -> EventOrder:
-    """Order the events of a run in real time by time; at equal times, a value comes before the steps that use it.
-
-    Equal times are common where the agents' clock moves in jumps, and when a late agent catches up.
-    """
+    """Order the events of a run in real time by time; at equal times, a value comes before the steps that use it."""
+    # Equal times are common where the agents' clock moves in jumps, and when a late agent catches up.
     timers = _timers(observation)
     newest = newest_steps(observation)
     contradiction, ties = _early_and_equal(observation, timers)

@@ -112,19 +112,7 @@ class FaultPower:
 def fault_powers(
     prediction: Prediction, replicas: int, level: float, faults: Sequence[Fault] = FAULTS
 ) -> list[FaultPower]:
-    """Of the faults that the law can have: those without noise, links or switching are left out.
-
-    Parameters
-    ----------
-    prediction
-        of the experiment
-    replicas
-        of the run
-    level
-        probability of a false "disagrees", all tests together
-    faults
-        each is one row of the result
-    """
+    """One for each of the ``faults`` that the law can have, not those without noise, links or switching."""
     step, sums = prediction.step, EvidenceSums(prediction, replicas, in_detail=True)
     # While a run goes on, diagnostics are not asked.
     families = {name: logs.size for name, logs in sums.families().items()}

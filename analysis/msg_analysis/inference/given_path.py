@@ -96,10 +96,7 @@ def means_given_path(
     most_work: float = MAX_WORK,
     most_numbers: int = MAX_NUMBERS,
 ) -> TimeMeans | None:
-    """Time means of a run in lockstep, with expectation and standard errors given the path of the graphs.
-
-    None where it would take too long: more than ``most_work``, or too many kinds of steps for ``most_numbers``.
-    """
+    """Time means of a run in lockstep given the path of the graphs; None where that is more than ``most_work``."""
     system, steps = observation.prediction.system, observation.steps
     d = system.dimension
     counts: dict[Literal["joint", "nodes", "system"], int] = {  # of forms; made only where they are used

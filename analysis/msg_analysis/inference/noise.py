@@ -179,7 +179,7 @@ class NoiseOverTime(Diagnostic):
         self._evidence = WindowEvidence(self._windows, columns)
         self._lags = LagSums(columns, 1)
         self._sizes = self._numbers << np.arange(self._windows.levels)[:, None]  # (levels, columns) numbers in a window
-        self._known = variance_constant(self._sizes)  # (levels, columns, K)
+        self._known = variance_constant(self._sizes)  # (K, levels, columns)
         self._counts = np.zeros(LEVELS, np.int64)  # windows of runs that were merged
         self._runs = 1
         # Largest sum, and largest of minus the sums, of each length and column, the first step, and the run.
@@ -196,7 +196,8 @@ class NoiseOverTime(Diagnostic):
         lags = lag_evidence(*self._lags.add(normal_score(squares, self._numbers)[:, :, None], analyses))
         ended = self._windows.add(squares)
         self._keep(ended)
-        numbers, constant = (np.repeat(each[ended.levels], ended.counts, axis=0) for each in (self._sizes, self._known))
+        levels = ended.level
+        numbers, constant = self._sizes[levels], self._known[:, levels]
         mixed = log_mean(variance_evidence(numbers, ended.sums, constant), axis=-1)
         windows = self._evidence.add(ended, mixed, analyses)
         return np.concatenate([windows, _mean_over_lags(lags)], axis=1)[:, :, None]
@@ -228,10 +229,7 @@ class NoiseOverTime(Diagnostic):
         return np.asarray(self._counts + np.pad(seen, (0, LEVELS - len(seen))))
 
     def finding(self) -> Finding | None:
-        """The window or the lag, and the agent or all agents, whose noise is the least likely.
-
-        A window is named, since it says where, even if a lag is clearer, but not where it says next to nothing.
-        """
+        """The window or the lag, and the agent or all agents, whose noise is the least likely."""
         window, lag = self._window(), self._lags.clearest()
         found = [window] if window else []
         if lag:
@@ -239,6 +237,7 @@ class NoiseOverTime(Diagnostic):
         if not found:
             return None
         best = min(found, key=lambda one: one.log_p)
+        # A window says where, even if a lag is clearer, but not one that says next to nothing.
         named = window if window and window.log_p <= SHARE * best.log_p else best
         return replace(named, log_p=min(0.0, best.log_p + math.log(len(found))))
 

@@ -72,15 +72,10 @@ class Measurement:
 
 
 def transient_length(series: FloatArray) -> int:
-    """Steps at the start of a series without which its mean is more precise, by MSER-5 (White 1997).
+    """Steps at the start of a series (N,) without which its mean is more precise, by MSER-5 (White 1997).
 
     Of the means of 5 steps, the number left out minimises the variance of the mean of the others, as if these were
     independent. At most half are left out; 0 for series shorter than 20.
-
-    Parameters
-    ----------
-    series
-        (N,) in the order of time
     """
     count = len(series) // BATCH
     if count < 4:
@@ -137,10 +132,7 @@ class Observation:
 
     @classmethod
     def of(cls, trajectory: Run, prediction: Prediction) -> Observation:
-        """Everything before the first gap.
-
-        InputError if the log of a run in real time does not say what the agents used.
-        """
+        """Everything before the first gap; InputError if a log in real time does not say what the agents used."""
         real_time = trajectory.record.experiment.run.pace == "realtime"
         steps = _known_steps(trajectory) if real_time else trajectory.prefix
         published, lost, used = trajectory.published, trajectory.lost, trajectory.used
@@ -209,10 +201,7 @@ class Observation:
         return replace(self, timers=Timers(graphs, used, made), used=None)
 
     def blocks(self, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
-        """(first, last + 1) of blocks of steps that keep temporary arrays of so many numbers per step small.
-
-        ``what``: what is done with them, for those who watch.
-        """
+        """(first, last + 1) of blocks of steps with few temporary numbers; ``what`` is done, for those who watch."""
         length = max(1, self.block_numbers // max(1, numbers_per_step))
         for first in range(0, self.steps, length):
             tell(what, first, self.steps)

@@ -3,10 +3,9 @@
 
 """Errors of a network next to their prediction while it runs: the numbers of a comparison, one step at a time.
 
-Measured are time means with the standard errors of ``errors.time_means``: of a complete run of up to ``EVERY_STEP``
-agents, both give the same. Only sums are kept. Per step, the system error takes O(m^2), and so do the node errors: with
-more agents, the standard errors of the nodes are estimated from some of the steps only. While the effect of a start
-that is not stationary lasts, the expectation is stepped along: O(n m^3). Incomplete steps are left out of both means.
+Measured are time means with the standard errors of ``time_means``: of a complete run of up to ``EVERY_STEP`` agents,
+both give the same. Only sums are kept; a step takes O(m^2), and while the effect of a start that is not stationary
+lasts, O(n m^3). Incomplete steps are left out of both means.
 """
 
 from __future__ import annotations
@@ -39,10 +38,7 @@ TUNING_STEPS = 500  # before the interval is given: their variances say how it i
 
 
 class RunningInterval:
-    """Half-width of the 95 % interval of the system error that holds at all times at once.
-
-    By the martingale where there is a standard error; else by batch means of the measured errors, as in real time.
-    """
+    """Half-width of the 95 % interval of the system error that holds at all times at once."""
 
     def __init__(self, record: RunRecord, prediction: Prediction | None, variance: float | None) -> None:
         self._until, self._planned = record.until, record.planned_steps
@@ -99,10 +95,8 @@ class LiveReport:
 class LiveEstimate:
     """The errors of a run next to their prediction, from the states as they arrive.
 
-    In real time agents are at different steps at the same moment, and the expected errors depend on their timing: then
-    there is no standard error, and the prediction is that of agents that are never late. ``nodes`` asks for standard
-    errors of the nodes, ``evidence`` for the evidence, which may need the messages. InputError where there is no
-    prediction (too large, unbounded).
+    ``nodes`` asks for standard errors of the nodes, ``evidence`` for the evidence, which may need the messages.
+    InputError where there is no prediction (too large, unbounded).
     """
 
     def __init__(self, record: RunRecord, *, nodes: bool = True, evidence: bool = True) -> None:

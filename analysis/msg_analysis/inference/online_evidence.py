@@ -3,12 +3,10 @@
 
 """Evidence against the law of a running network, and the interval of its system error that holds at all times at once.
 
-The sums of ``evidence_sums``, one stretch of whole steps after the other; O(1) per step. Which steps are
-left out, because they were not seen whole, must not depend on what happened in them.
-
-With reception noise, with delay and in real time, from what every agent received. The newest steps are stored until the
-values that were used in them are there. A value that is not there, because its step was not seen or is too old, leaves
-out the agent that used it in this step: that depends on times and losses only, never on states. Memory is bounded.
+The sums of ``evidence_sums``; O(1) per step. Which steps are left out, because they were not seen whole, must not
+depend on what happened in them. With reception noise, with delay and in real time, the newest steps are stored until
+the values that were used in them are there. A value that is not there, because its step was not seen or is too old,
+leaves out the agent that used it: that depends on times and losses only, never on states. Memory is bounded.
 """
 
 from __future__ import annotations
@@ -116,10 +114,7 @@ class RunningEvidence(EvidenceWatch):
         if self.sums.error is None:
             raise ValueError("the states alone do not give the evidence of this run")
         self._prediction, self._replicas = prediction, replicas
-        step = prediction.step
-        numbers = (4 + step.most_neighbours) * step.agents * replicas
-        numbers = max(numbers + step.agents**2, self.sums.error.numbers * (1 + len(self.sums.error.rates)))
-        self._length = max(1, BLOCK_NUMBERS // numbers)
+        self._length = max(1, BLOCK_NUMBERS // self.sums.numbers_per_step)
         self._end = prediction.experiment.steps
         # The newest step, which counts when the graph after it is known: its number, graph, states before it and after.
         self._kept: tuple[int, IntArray, FloatArray] | None = None
@@ -196,7 +191,7 @@ class ReceivedEvidence(EvidenceWatch):
         self._used = np.zeros((kept, m, step.most_neighbours), dtype=np.int64)
         self._newest, self._end = -1, experiment.steps
         self._largest = 0.0
-        self._length = max(1, BLOCK_NUMBERS // ((4 + step.most_neighbours) * m * replicas + m * m))
+        self._length = max(1, BLOCK_NUMBERS // self.sums.numbers_per_step)
         self._path = NetworkPath()
 
     def end_at(self, step: int) -> None:

@@ -4,11 +4,10 @@
 """The periods of a run in real time as linear maps between the states known at its sampling times.
 
 The state of the network at the sampling time K dt is a stack: the newest state of every agent; older ones that a later
-step still uses, because a message was slow, its reader late, or a newer one lost; in place of these, with reception
-noise, the values as they were published, or received if they arrive once and are used again; and, if process noise is
-correlated between agents, that of a step that some agents have made and others not yet. A period maps one stack to the
-next by a matrix and noise, which depend on the log alone. Without losses nearly all periods of a run are alike:
-matrices are computed once for each pattern.
+step still uses; in place of these, with reception noise, the values as they were published, or received if they arrive
+once and are used again; and, if process noise is correlated between agents, that of a step that some agents have made
+and others not yet. A period maps one stack to the next by a matrix and noise, which depend on the log alone: matrices
+are computed once for each pattern.
 """
 
 from __future__ import annotations
@@ -47,10 +46,7 @@ class _Law(NamedTuple):
 
 
 class Periods:
-    """The periods K = 1..N-1 of a run in real time, from sampling time K-1 to K.
-
-    A stack begins with the m newest states. ``order`` is that in which the states were made.
-    """
+    """The periods K = 1..N-1 of a run, from sampling time K-1 to K; a stack begins with the m newest states."""
 
     def __init__(self, observation: Observation, order: EventOrder) -> None:
         self._step = step = observation.step
@@ -84,11 +80,9 @@ class Periods:
         return moment[np.ix_(owners, owners)], noise
 
     def stack(self, number: int, moment: FloatArray) -> FloatArray | None:
-        """(S, S): mean of z z^T over the replicas at sampling time ``number``, given what is logged.
-
-        What was received is not logged, but follows, but for its noise, from the rest: by regression, with the second
-        moment (S, S) of the law. None where the stack contains process noise.
-        """
+        """(S, S): mean of z z^T over replicas at sampling time ``number``, given the log; None with process noise."""
+        # What was received is not logged, but follows, but for its noise, from the rest: by regression, with the second
+        # ``moment`` (S, S) of the law.
         if self._shared.any():
             return None
         step, m, observation = self._step, self._step.agents, self._observation
@@ -196,14 +190,11 @@ class Periods:
         return live.take(stacked)
 
 
-_Key = tuple[int, int]
+_Key = tuple[int, int]  # entry and step; sources of noise are numbers of variance 1, new where not known yet
 
 
 class _Live:
-    """Values as combinations of the stack at the beginning of a period, and the covariance of the noise added since.
-
-    Keys are (entry, step), see ``Periods``; noise sources are numbers of variance 1, new where not known yet.
-    """
+    """Values as combinations of the stack at the beginning of a period, and the covariance of the noise added since."""
 
     def __init__(self, stack: list[_Key], agents: int) -> None:
         self._agents, self._entries = agents, len(stack)

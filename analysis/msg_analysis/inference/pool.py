@@ -63,22 +63,11 @@ def compare(*runs: Run | str | Path, level: float = 0.01) -> Comparison:
 
 
 def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> Comparison:
-    """Compare several runs of one experiment, (name, trajectory) each, with its prediction, to one verdict.
+    """Compare several runs of one experiment, by name and read one after the other, with its prediction.
 
     Sums are added up over the runs, so that every step counts the same. A further test of the family asks whether the
-    runs are alike (Cochran's Q). No trajectory is kept.
-
-    Parameters
-    ----------
-    runs
-        name for messages, and trajectory; they are read one after the other
-    level
-        probability of a false "disagrees", all tests together
-
-    Raises
-    ------
-    InputError
-        no run, different experiments, a run or seed that is there twice, or no prediction
+    runs are alike (Cochran's Q). No trajectory is kept. InputError: no run, different experiments, a run or seed that
+    is there twice, or no prediction.
     """
     total: Evidence | None = None
     prediction: Prediction | None = None

@@ -49,22 +49,8 @@ class PatternUnavailableError(Exception):
 
 
 def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
-    """Effect of a run's timing on its system error: expectation given the log over that with ideal timers, less 1.
-
-    Both are exact, for the same start and graphs of the network, so that hardly anything is left to chance.
-
-    Parameters
-    ----------
-    observation
-        of a run in real time
-    means
-        of ``pattern_means``
-
-    Returns
-    -------
-    float | None
-        None where the expected error is 0
-    """
+    """Effect of timing on the system error: expectation given the log over that with ideal timers, less 1."""
+    # Both are exact, for the same start and graphs of the network, so that hardly anything is left to chance.
     experiment = observation.prediction.experiment
     graphs, used, made = ideal_log(experiment, observation.step, observation.modes)
     ideal = replace(observation, timers=Timers(graphs[1:], used, made))
@@ -82,22 +68,7 @@ def pattern_means(
     most_work: float = MAX_WORK,
     most_entries: int = MAX_ENTRIES,
 ) -> TimeMeans:
-    """Time means of the sampled states, with expectation and standard errors given the log.
-
-    Parameters
-    ----------
-    observation
-        of a run in real time
-    order
-        of its events
-    most_work, most_entries
-        multiplications, and entries of a stack, at most
-
-    Raises
-    ------
-    PatternUnavailableError
-        contradictory times, too many values to be known at the same time, or a run that is too long
-    """
+    """Time means of the sampled states, with expectation and standard errors given the log."""
     if order.contradiction:
         raise PatternUnavailableError(order.contradiction)
     system, steps = observation.prediction.system, observation.steps
@@ -135,10 +106,7 @@ def pattern_means(
 
 
 def means_in_lockstep(observation: Observation) -> TimeMeans | None:
-    """Time means of a run in lockstep, given the path of the graphs and which values were received.
-
-    None where that would take too long.
-    """
+    """Time means of a run in lockstep given the graphs and the values received; None where that would take too long."""
     order = EventOrder.of_lockstep(observation.steps, observation.step.agents)
     try:
         return pattern_means(observation.as_timed(), order)

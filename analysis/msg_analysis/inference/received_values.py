@@ -4,15 +4,9 @@
 """What the agents received in the steps of a run, with noise or loss of messages, and in real time.
 
 The log gives, for every step, what each agent used: which values of its neighbours, and in real time their steps and
-the graph. Given that, the residuals are normal and independent, with an exactly known covariance: process noise, by
-the graph that each agent used, plus the link noise of the received messages. Broadcast noise, losses and delays are
-part of what was used; they are tested, or reported, separately.
-
-Link noise of messages that are used more than once: what earlier steps say about it.
-
-The noise of a link belongs to the message: used again, because a newer one was lost or late, it is the same. So the
-residuals e_i of an agent are no longer independent, but those of the Kalman filter are: the noises of its newest
-messages are a Gaussian vector, of which every step observes one combination, w^T noise + process noise.
+the graph. Given that, the residuals are normal and independent, with an exactly known covariance: process noise, by the
+graph that each agent used, plus the link noise of the received messages. Broadcast noise, losses and delays are part of
+what was used.
 """
 
 from __future__ import annotations
@@ -112,9 +106,7 @@ class ReceivedValues:
         )
 
     def received(self, at: IntArray, agents: IntArray, which: IntArray) -> FloatArray:
-        """(k, a, R): what ``agents`` (a,) used of their neighbours ``which`` (a,) in the steps ``at`` (k,) of the
-        block.
-        """
+        """(k, a, R): what ``agents`` (a,) used of neighbours ``which`` (a,) in the steps ``at`` (k,) of the block."""
         index = at[:, None], agents, which
         return np.asarray(self.published[self.used[index], self.senders[index]])
 
@@ -127,10 +119,7 @@ class ReceivedValues:
         return np.asarray(total)
 
     def patterns(self, order: IntArray | None = None) -> Iterator[tuple[IntArray, IntArray | None, IntArray]]:
-        """Groups of like steps of the block: graphs (m,) of the agents, their order (m,) or None, steps (a,).
-
-        ``order`` (b, m) has the agents of each step, first to last.
-        """
+        """Groups of like steps: graphs (m,) and order (m,) of the agents, by ``order`` (b, m), and steps (a,)."""
         if order is None and (self.graphs == self.modes[:, None]).all():
             for mode in np.unique(self.modes):
                 at = np.flatnonzero(self.modes == mode)
@@ -148,10 +137,7 @@ class ReceivedValues:
 
 
 def mode_links(step: Wiring, mode: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Receiver, sender, and place among the receiver's neighbours, (links,) each, of all links of a graph.
-
-    Sorted by receiver and then by sender.
-    """
+    """Receiver, sender, and place among the receiver's neighbours, (links,) each, of a graph; sorted."""
     tables = neighbour_tables(step)
     receiver, which = np.nonzero(np.arange(step.most_neighbours) < tables.count[mode][:, None])
     return receiver, tables.senders[mode, receiver, which], which
@@ -240,7 +226,9 @@ NEVER = -2
 class RepeatedNoise:
     """Frees the residuals, block after block, of what earlier ones say about the noise in them.
 
-    Exact where the process noise of the agents is independent.
+    The noise of a link belongs to the message: used again, because a newer one was lost or late, it is the same. The
+    noises of an agent's newest messages are a Gaussian vector, of which every step observes one combination, w^T noise
+    + process noise: a Kalman filter. Exact where the process noise of the agents is independent.
     """
 
     def __init__(self, observation: Observation) -> None:

@@ -85,23 +85,11 @@ class StateRegression:
 
 
 def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[Term]]:
-    """Regressors of the residuals: phi_a(k) = inputs[g, a] . z(k) for row rows[a].
+    """Regressors of the residuals: rows (K,), inputs (n, K, m + 1), terms; phi_a(k) = inputs[g, a] . z(k).
 
     One for every graph and difference x_j - x_i that row i uses, for every graph and leader (x_i - reference), and for
     every agent (1, which finds a wrong reference or offset). Where these are more than ``most``: the whole pull (W_g x
     - x)_i of a row instead of each of its terms; where that is still too many, without distinguishing graphs.
-
-    Parameters
-    ----------
-    step
-        step model of the run
-    most
-        largest number K
-
-    Returns
-    -------
-    tuple[IntArray, FloatArray, list[Term]]
-        rows (K,), inputs (n, K, m + 1), and the terms (K)
     """
     n, m = step.modes, step.agents
     terms = [Term("constant", i) for i in range(m)]
@@ -136,19 +124,10 @@ def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[T
 class ReceivedRegression:
     """Score test: residuals do not depend on what the agents received, with the weights it was used with.
 
-    As ``gain_regression.StateRegression``, but row i uses the differences y_j - x_i of the received values, y_j as
-    published, and the covariance of the residuals is that of each step. In real time the agents make a step one after
-    the other. With correlated noise, a value that is used may contain a part of the noise of the same step; so each
-    residual is first freed of what those made earlier in the step say about it (``position``, needed only then).
-
-    Parameters
-    ----------
-    observation
-        of a run with noise or loss of messages, or in real time
-    most
-        largest number of regressors K; beyond it, fewer kinds of them are tested
-    position
-        (N, m) order in which the states were made
+    As ``StateRegression``, but row i uses the differences y_j - x_i of the received values, y_j as published, and the
+    covariance of the residuals is that of each step. In real time the agents make a step one after the other, in the
+    order ``position`` (N, m). With correlated noise, a value that is used may contain a part of the noise of the same
+    step; so each residual is first freed of what those made earlier in the step say about it.
     """
 
     def __init__(self, observation: Observation, most: int, position: IntArray | None = None) -> None:

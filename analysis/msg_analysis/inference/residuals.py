@@ -5,14 +5,14 @@
 
 Under the model the e(k) are independent N(0, N_g(k)), for any path of the graphs; so these tests are exact or nearly
 so, and find what the time means hardly show. With noise or loss of messages, and in real time, the same holds given the
-values that the agents received (see ``heard_values``), for any timing. See docs/statistics.md.
+values that the agents received (``received_values``), for any timing. See docs/statistics.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -33,6 +33,9 @@ from msg_analysis.inference.statistics import (
     quadratic_form,
 )
 from msg_analysis.model.step_model import StepModel
+
+if TYPE_CHECKING:
+    from msg_analysis.inference.evidence_sums import WatchedEvidence
 
 LAGS = 10
 QUIET_ROUNDING = 1e-9  # relative size of what counts as rounding in directions without noise
@@ -59,28 +62,14 @@ class _Directions:
     quiet: FloatArray  # (m, m - r) orthonormal basis of the directions without noise
 
 
-class Follower(Protocol):
-    """What else is computed from the residuals of a run, in the same pass."""
-
-    @property
-    def numbers_per_step(self) -> int:
-        """Of temporary arrays."""
-
-    def add(self, first: int, last: int, received: tuple[ReceivedValues, FloatArray] | None = None) -> None:
-        """The steps first..last-1, in order, with what was received and the residuals; None: not computed yet."""
-
-
 class ResidualSums:
-    """Sums over the residuals of runs of one experiment: enough for the tests and the search for causes.
-
-    In real time, ``position`` is that of ``event_order.EventOrder``, (N, m). ``follower`` is given every step, too.
-    """
+    """Sums over residuals of runs, for the tests and the search for causes; ``follower`` is given every step."""
 
     def __init__(
         self,
         observation: Observation,
         position: IntArray | None = None,
-        follower: Follower | None = None,
+        follower: WatchedEvidence | None = None,
         most_regressors: int = MAX_REGRESSORS,
     ) -> None:
         step, noise = observation.step, observation.prediction.experiment.noise
@@ -110,8 +99,8 @@ class ResidualSums:
         if self.independent:
             self._add(observation, regression, follower)
         elif follower:
-            for first, last in observation.blocks(follower.numbers_per_step, "evidence"):
-                follower.add(first, last)
+            for first, last in observation.blocks(follower.sums.numbers_per_step, "evidence"):
+                follower.add(observation, first, last)
         self.terms = regression.terms
         self.score, self.covariance = regression.statistic()  # (K,), (K, K)
         self.gram = regression.gram()  # (K, K), see ``StateRegression.gram``; None where it is not available
@@ -171,20 +160,23 @@ class ResidualSums:
         return direction_p(weights, self.score, self.covariance)
 
     def _add(
-        self, observation: Observation, regression: StateRegression | ReceivedRegression, follower: Follower | None
+        self,
+        observation: Observation,
+        regression: StateRegression | ReceivedRegression,
+        follower: WatchedEvidence | None,
     ) -> None:
         """One pass over the run."""
         m = observation.step.agents
         numbers = max(observation.states[0].size, regression.numbers_per_step)
         if follower:
-            numbers = max(numbers, follower.numbers_per_step)
+            numbers = max(numbers, follower.sums.numbers_per_step)
         for first, last in observation.blocks(numbers, "residuals"):
             modes = observation.modes[first:last]
             if isinstance(regression, ReceivedRegression):
                 reception = ReceivedValues.of(observation, first, last)
                 e = residuals(observation, first, last, reception)
                 if follower:
-                    follower.add(first, last, (reception, e))
+                    follower.add(observation, first, last, (reception, e))
                 if self._repeated:
                     e, link_variance = self._repeated.free(e, reception)
                     reception = replace(reception, link_variance=link_variance)
@@ -195,7 +187,7 @@ class ResidualSums:
             else:
                 e = residuals(observation, first, last)
                 if follower:
-                    follower.add(first, last, (ReceivedValues.of(observation, first, last), e))
+                    follower.add(observation, first, last, (ReceivedValues.of(observation, first, last), e))
                 regression.add(modes, observation.states[first:last], e)
             states = observation.states[first : last + 1]
             self.largest = max(self.largest, float(np.abs(states[:-1]).max()))
@@ -229,10 +221,7 @@ class ResidualSums:
 
 
 def residuals(observation: Observation, first: int, last: int, reception: ReceivedValues | None = None) -> FloatArray:
-    """(last - first, m, R): residuals e(k) of the steps first..last-1, given what was received.
-
-    Without a ``reception`` of these steps, all agents received the states themselves.
-    """
+    """(last - first, m, R): residuals e(k) of steps first..last-1; without ``reception``, states were received."""
     step, now = observation.step, observation.states[first:last]
     after = observation.states[first + 1 : last + 1].copy()
     if reception is not None:

@@ -90,19 +90,9 @@ class Precision:
 
 
 def precision_of(prediction: Prediction, sought: float) -> Precision:
-    """Precision of the runs of an experiment.
+    """Precision of the runs of an experiment; ``sought``: share of the error that the start has after the warm-up.
 
-    Parameters
-    ----------
-    prediction
-        of the experiment
-    sought
-        precision for the warm-up: the expected error is then within this share of the steady one
-
-    Raises
-    ------
-    InputError
-        fourth moments of the states do not exist, or the errors take too long to settle
+    InputError: fourth moments of the states do not exist, or the errors take too long to settle.
     """
     experiment = prediction.experiment
     stationary = experiment.run.start == "stationary" and experiment.switching.initial == "stationary"
@@ -269,28 +259,7 @@ def plan(
     rate: float | None = None,
     level: float = 0.01,
 ) -> RunPlan:
-    """Plan runs of an experiment; nothing is simulated.
-
-    Parameters
-    ----------
-    prediction
-        of the experiment
-    precision
-        half-width of the 95 % interval of the system error that is sought, relative to the predicted error; above 0,
-        below 1
-    seconds
-        time budget [s]; None: none
-    rate
-        steps per second of a run in lockstep, such as ``msg-agents run`` prints; None: not known, or in real time,
-        where the clock says it
-    level
-        probability of a false "disagrees", all tests together
-
-    Raises
-    ------
-    InputError
-        an argument that is not valid, a system error of 0, or states without fourth moments
-    """
+    """Plan runs of an experiment, see ``Experiment.plan``; nothing is simulated."""
     run, dt = prediction.experiment.run, prediction.step.dt
     if not 0.0 < precision < 1.0:
         raise InputError(f"precision: {precision:g}: expected a share of the error above 0, below 1: for example 0.01")

@@ -93,10 +93,7 @@ MOST_SHARE = 0.5  # of the rate beyond which the mean is infinite
 
 
 class ErrorMartingale:
-    """Steps of the logarithm of the martingale, for every rate (L,).
-
-    ValueError for a system with lost messages, whose next state is not normal given this one.
-    """
+    """Steps of the logarithm of the martingale, for every rate (L,); ValueError for a system with lost messages."""
 
     _known: ClassVar[WeakKeyDictionary[MomentSolver, dict[int, ErrorMartingale]]] = WeakKeyDictionary()
 

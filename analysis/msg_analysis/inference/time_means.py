@@ -35,10 +35,7 @@ FEW_SWITCHES = 10.0  # expected, below which intervals over all paths cover too 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeMeans:
-    """Time means over the steps 0..N-1 of q linear functions of y y^T.
-
-    All entries of y y^T, packed (joint, q = p), the node errors (q = m), or the system error (q = 1).
-    """
+    """Time means over the steps 0..N-1 of q linear functions of y y^T: see ``forms_of``."""
 
     second_moments: FloatArray  # (f, f) time mean of y y^T, y the agents' coordinates in ``JumpSystem.frame``
     expected_moments: FloatArray  # (f, f) its exact expectation for the run's start and length
@@ -187,20 +184,10 @@ class SharedValue:
 
 
 def expected_mean(observation: Observation) -> FloatArray:
-    """Exact mean of E[y y^T] over the steps of a run: steady, or transient from the known start.
+    """(f, f): exact mean of E[y y^T] over the steps of a run: steady, or transient from the known start.
 
     A run that did not start from the stationary law is conditioned on the x(0) of its record and the first logged
     graph: the effect of one draw of g(0) on a transient is not an error.
-
-    Parameters
-    ----------
-    observation
-        of a run in lockstep
-
-    Returns
-    -------
-    FloatArray
-        (f, f) in the frame of the agents
     """
     prediction = observation.prediction
     step, system, steady = prediction.step, prediction.system, prediction.steady
@@ -214,11 +201,7 @@ def expected_mean(observation: Observation) -> FloatArray:
 
 
 def time_means(observation: Observation) -> TimeMeans:
-    """Second moments of a run in lockstep and their standard errors, by the martingale method of this module.
-
-    Where agents keep values from step to step, f depends on more than is logged: then there are no standard errors.
-    Time and memory per step are those of p = d (d + 1) / 2 second moments.
-    """
+    """Second moments of a run in lockstep and their standard errors, by the martingale method of this module."""
     system, steps = observation.prediction.system, observation.steps
     if system.readout is not None:
         return _without_errors(observation)
@@ -292,15 +275,7 @@ def _expected_switches(observation: Observation) -> float:
 
 
 def values_of(prediction: Prediction, forms: FloatArray) -> list[Value | SharedValue]:
-    """Values f of the Poisson equation, one object for each graph.
-
-    Parameters
-    ----------
-    prediction
-        of the experiment
-    forms
-        (q, p) on packed y y^T
-    """
+    """Values f of the Poisson equation of ``forms`` (q, p) on packed y y^T, one object for each graph."""
     system = prediction.system
     dual = prediction.solver.dual(packed_symmetric.unpack(forms, system.dimension))
     _, kappa = mode_potential(system, dual)
@@ -326,20 +301,9 @@ def values_of(prediction: Prediction, forms: FloatArray) -> list[Value | SharedV
 def forms_of(
     system: JumpSystem, kind: Literal["joint", "nodes", "system"]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Linear functions of packed y y^T to be estimated: all second moments, the node errors, or the system error.
+    """Functions (q, p) of packed y y^T, and as their combinations the node errors (m, q) and the system error (q,).
 
-    Parameters
-    ----------
-    system
-        reduced system of the run's steps
-    kind
-        what is estimated
-
-    Returns
-    -------
-    tuple[FloatArray, FloatArray, FloatArray]
-        the forms (q, p); the node errors as combinations of them (m, q), or (0, q) if only the system error is
-        estimated; the system error (q,), which is the sum of the node errors
+    All second moments ("joint"), the node errors, or only the system error, where the node errors are (0, q).
     """
     frame = system.frame
     per_node = packed_symmetric.pack(frame[:, :, None] * frame[:, None, :])
@@ -357,17 +321,12 @@ def moments(observation: Observation, first: int, last: int, states: FloatArray)
 
 
 def packed_moments(deviations: FloatArray, system: JumpSystem, largest: float) -> FloatArray:
-    """(b, p): packed y y^T of deviations (b, m, R) from what the states should be, averaged over the replicas.
-
-    ``largest`` is the size of the largest state of the run.
-    """
+    """(b, p): packed y y^T of deviations (b, m, R), averaged over the replicas; ``largest`` state of the run."""
     y = without_rounding(deviations.transpose(0, 2, 1) @ system.frame, system, largest)
     return packed_symmetric.pack(y.transpose(0, 2, 1) @ y / deviations.shape[2])
 
 
 def without_rounding(y: FloatArray, system: JumpSystem, largest: float) -> FloatArray:
-    """Reduced coordinates y of any shape, without what rounding leaves of them where the system has no noise.
-
-    Where agents have the same noise, for example: they move together, and their disagreement is rounding.
-    """
+    """Reduced coordinates y without what rounding leaves of them where the system has no noise."""
+    # Agents with the same noise, for example, move together, and their disagreement is rounding.
     return y if system.noise.any() else np.where(np.abs(y) <= ROUNDING * largest, 0.0, y)

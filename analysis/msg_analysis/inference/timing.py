@@ -101,10 +101,7 @@ class Quantiles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timing:
-    """Timing of a run in real time.
-
-    Times in ms are those of the agents' clock: simulated time over the speed of the run.
-    """
+    """Timing of a run in real time, in ms of the agents' clock: simulated time over the speed of the run."""
 
     period_ms: float  # nominal time between two steps of an agent
     lateness_ms: Quantiles  # of a step after it was due

@@ -17,7 +17,7 @@ from msg_analysis.inference.counts import LossTally, Transitions, loss_test, swi
 from msg_analysis.inference.e_values import log_mean
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates, rank_agents
 from msg_analysis.inference.event_order import order_events
-from msg_analysis.inference.evidence_sums import AnyTimeEvidence, Watch, WatchedEvidence, any_time_evidence
+from msg_analysis.inference.evidence_sums import AnyTimeEvidence, WatchedEvidence, any_time_evidence
 from msg_analysis.inference.given_path import GivenPath, means_given_path
 from msg_analysis.inference.observation import Measurement, Observation, spaced_steps
 from msg_analysis.inference.question import Search, Statistics
@@ -82,8 +82,8 @@ class Evidence:
             means = time_means(observation)
             kept = observation.prediction.system.readout is not None
             given = means_in_lockstep(observation) if kept else means_given_path(observation)
-        watch = Watch(observation, analyses)
-        residuals = ResidualSums(observation, position, watch)
+        watched = WatchedEvidence(observation, analyses)
+        residuals = ResidualSums(observation, position, watched)
         return cls(
             steps=observation.steps,
             means=means,
@@ -93,18 +93,15 @@ class Evidence:
             transitions=Transitions.of(observation.modes, observation.step.modes),
             loss=LossTally.of(observation),
             broadcast=BroadcastSums.of(observation),
-            watched=watch.result(),
+            watched=watched,
             timing=timing,
             laws=laws,
         )
 
     def merged(self, other: Evidence) -> Evidence:
-        """The evidence of these and other runs of the same experiment; the sums of ``self`` are changed in place.
-
-        Time means are weighted with the numbers of steps, so that every step, and every martingale increment, counts
-        the same.
-        """
+        """The evidence of these and other runs of the same experiment; the sums of ``self`` are changed in place."""
         self.residuals.merge(other.residuals)
+        self.watched.merge(other.watched)
         if self.loss and other.loss:
             self.loss.merge(other.loss)
         if self.broadcast and other.broadcast:
@@ -119,7 +116,6 @@ class Evidence:
             decisive=self.decisive and other.decisive,
             given=given,
             transitions=self.transitions.merged(other.transitions),
-            watched=self.watched.merged(other.watched),
             timing=None,
             laws=None,
         )
@@ -132,6 +128,7 @@ def usual_analyses(steps: int) -> int:
 
 
 def _merged_means(one: TimeMeans, steps: int, other: TimeMeans, more: int) -> TimeMeans:
+    # So every step, and every martingale increment, counts the same.
     a, b = steps / (steps + more), more / (steps + more)
     if one.joint != other.joint or len(one.nodes) != len(other.nodes):
         one, other = _coarser(one, other), _coarser(other, one)
@@ -167,24 +164,12 @@ MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
 
 
 def compare_run(trajectory: Run, *, level: float = 0.01) -> Comparison:
-    """Compare a run, or its complete beginning, with what theory predicts for it; see ``api.compare``.
+    """Compare a run, or its complete beginning, with what theory predicts for it.
 
     Every test assumes exactly the law that the record says was run; the probability of any false rejection in the
-    family is at most ``level`` (Holm). A test with nothing to test (no noise, one graph, no loss) is left out. In real
-    time, the family has only tests that are exact whatever the timing was. Where the law has no prediction (a protocol
-    that is not linear, or is not installed), only graphs and losses are tested.
-
-    Parameters
-    ----------
-    trajectory
-        of a bag or of the twin
-    level
-        probability of a false "disagrees", all tests together
-
-    Raises
-    ------
-    InputError
-        no prediction (too large, unbounded), or a log without what is needed
+    family is at most ``level`` (Holm). In real time, the family has only tests that are exact whatever the timing was.
+    Where the law has no prediction (a protocol that is not linear, or is not installed), only graphs and losses are
+    tested. InputError: no prediction (too large, unbounded), or a log without what is needed.
     """
     unpredicted = trajectory.record.experiment.unpredictable()
     if unpredicted:
@@ -207,10 +192,7 @@ def evaluate(
     level: float,
     p_alike: float | None = None,
 ) -> Comparison:
-    """The verdict on the evidence of one run, or of several, of which ``p_alike`` is the p-value of their being alike.
-
-    Of several runs, ``trajectory`` is one with the completeness of all.
-    """
+    """The verdict on the evidence of one run, or of several, of which ``trajectory`` has the completeness."""
     means, lockstep = evidence.means, prediction.experiment.run.pace == "lockstep"
     system_error, node_errors = _over_all_paths(means, prediction.system)
     covariance = _covariance(evidence, prediction.system)
