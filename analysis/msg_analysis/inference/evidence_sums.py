@@ -122,7 +122,7 @@ class EvidenceSums:
             self.add_broadcast(observation.published[first:last] - observation.states[first:last], parts, analyses)
         if self.error is not None and len(now):
             a = np.ones((len(graphs), self.error.numbers))
-            a[:, :-1] = moments(observation, first, first + len(graphs), observation.states)
+            a[:, :-1] = moments(observation, first, first + len(graphs))
             steps = np.zeros((last - first, len(self.error.rates)))
             steps[: len(now)] = self.error.steps(now, following, a[:-1], a[1:])
             parts.error += analyses.sums(steps)

@@ -151,7 +151,7 @@ def _backwards(
     for first in reversed(range(0, steps, length)):
         last = min(first + length, steps)
         tell("errors given the path", steps - last, steps)
-        found = moments(observation, first, last, observation.states)
+        found = moments(observation, first, last)
         seen += found.sum(axis=0)
         series[first:last] = found @ (trace @ forms)
         last = min(last, steps - 1)  # the noise of the last step is in no error

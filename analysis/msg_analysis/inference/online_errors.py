@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,19 +19,14 @@ from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray, IntArray
 from msg_analysis.common.text import number_text
 from msg_analysis.inference.estimates import Estimate, beside
 from msg_analysis.inference.observation import bounded
-from msg_analysis.inference.online_evidence import AnyTime, RunningEvidence, needs_log, supports
-from msg_analysis.inference.online_steps import Lateness, Recent, RecentSteps, StepCollector
+from msg_analysis.inference.online_evidence import AnyTime, ReceivedEvidence, RunningEvidence, needs_log, supports
+from msg_analysis.inference.online_steps import Lateness, LoggedStates, Recent, RecentSteps, StateLog, StepCollector
 from msg_analysis.inference.statistics import RunningBatches, simultaneous_half_width, steps_to_half_width
-from msg_analysis.inference.time_means import Value, forms_of, packed_moments, values_of
+from msg_analysis.inference.time_means import Value, forms_of, known_start, packed_moments, values_of
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.prediction import Prediction, predict
-
-if TYPE_CHECKING:
-    from msg_analysis.inference.online_evidence import ReceivedEvidence
-    from msg_analysis.inference.online_steps import LoggedStates, StateLog
-
 
 TUNING_STEPS = 500  # before the interval is given: their variances say how it is tuned
 
@@ -111,9 +105,6 @@ class LiveEstimate:
         self.log: StateLog | None = None  # None: the messages are not needed
         if evidence and prediction is not None and supports(prediction):
             if needs_log(experiment):
-                from msg_analysis.inference.online_evidence import ReceivedEvidence  # most runs need none of these
-                from msg_analysis.inference.online_steps import StateLog
-
                 self._received, self.log = ReceivedEvidence(prediction, experiment.run.replicas), StateLog(record)
             else:
                 self._plain = RunningEvidence(prediction, experiment.run.replicas)
@@ -351,8 +342,7 @@ class _Expected:
 
     def __init__(self, prediction: Prediction) -> None:
         self._prediction = prediction
-        steady = prediction.steady
-        self._steady = np.diag(prediction.system.lifted(steady.sum(axis=0)))
+        self._steady = np.diag(prediction.system.lifted(prediction.steady.sum(axis=0)))
         self._away: FloatArray | None = None  # (n, d, d) from the steady state, of the next step
         self._law = np.empty(0)
         self._scale = 0.0
@@ -361,33 +351,21 @@ class _Expected:
 
     def add(self, steps: IntArray, record: RunRecord, first_mode: int | None) -> None:
         """Add steps; ``first_mode`` is g(0), which counts if it is known in the first call."""
-        if self._away is None:
-            self._begin(record, first_mode)
-        assert self._away is not None
         system, last = self._prediction.system, int(steps.max())
-        while len(self._series) <= last and not self._arrived():
+        if self._away is None:
+            steady = self._prediction.steady
+            initial, law = known_start(self._prediction, record.start, first_mode)
+            self._away, self._law = initial - steady, law - system.stationary
+            self._scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))
+        while len(self._series) <= last and (
+            np.abs(self._away).max(initial=0.0) > 1e-17 * self._scale or np.abs(self._law).max() > 1e-17
+        ):
             self._series.append(np.diag(system.lifted(self._away.sum(axis=0))))
             self._away, self._law = system.advance(self._away, self._law)
         self.total += len(steps) * self._steady
         early = steps[steps < len(self._series)]
         if len(early):
             self.total += np.sum([self._series[step] for step in early.tolist()], axis=0)
-
-    def _begin(self, record: RunRecord, first_mode: int | None) -> None:
-        step, system, steady = self._prediction.step, self._prediction.system, self._prediction.steady
-        law = system.of_modes(step.initial)
-        if record.experiment.run.start == "stationary":
-            initial = system.started_steady(steady, law)
-        else:
-            if first_mode is not None:
-                law = system.of_modes(np.eye(step.modes)[first_mode])
-            initial = system.started((record.start - step.reference).T, law)
-        self._away, self._law = initial - steady, law - system.stationary
-        self._scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))
-
-    def _arrived(self) -> bool:
-        assert self._away is not None
-        return bool(np.abs(self._away).max(initial=0.0) <= 1e-17 * self._scale and np.abs(self._law).max() <= 1e-17)
 
 
 LEAST_STEPS = 100  # before an interval counts

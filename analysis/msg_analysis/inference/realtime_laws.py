@@ -307,14 +307,13 @@ def _continuous(observation: Observation, sequential: Estimate, level: float, la
     law, experiment = observation.prediction.continuous_moments, observation.prediction.experiment
     if law is None:
         return Law(Estimate(sequential.measured), None, "not available for this experiment")
-    predicted = law.system_error
+    predicted, untested = law.system_error, Estimate(sequential.measured, law.system_error)
     if sequential.standard_error is None:
-        return Law(Estimate(sequential.measured, predicted), None, "its errors have no standard error here")
+        return Law(untested, None, "its errors have no standard error here")
     if not sequential.standard_error or sequential.measured is None or not predicted:
-        return Law(Estimate(sequential.measured, predicted), None, "without noise the errors cannot be tested")
+        return Law(untested, None, "without noise the errors cannot be tested")
     if experiment.run.start != "stationary":
-        why = "only its steady state is predicted, and the run did not start there"
-        return Law(Estimate(sequential.measured, predicted), None, why)
+        return Law(untested, None, "only its steady state is predicted, and the run did not start there")
     z = (sequential.measured - predicted) / sequential.standard_error
     p = float(two_sided(z))
     error = Estimate(sequential.measured, predicted, sequential.standard_error, z, p)
