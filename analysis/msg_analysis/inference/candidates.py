@@ -166,21 +166,6 @@ class Cause:
     p: float | None = None  # adjusted for all candidate causes; 0 where the law makes it impossible
     steps: tuple[int, int] | None = None  # first and last, where the cause is a stretch of the run
 
-    def to_json(self) -> dict[str, Any]:
-        """The JSON document."""
-        return {
-            "kind": self.kind,
-            "words": self.words,
-            "agent": self.agent,
-            "link": list(self.link) if self.link else None,
-            "graph": self.graph,
-            "estimate": self.estimate,
-            "interval": list(self.interval) if self.interval else None,
-            "expected": self.expected,
-            "p": self.p,
-            "steps": list(self.steps) if self.steps else None,
-        }
-
 
 def numbers_text(value: float, interval: tuple[float, float]) -> str:
     """A number and its interval."""

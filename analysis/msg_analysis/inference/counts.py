@@ -15,12 +15,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy import special
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.markov_chain import stationary_law
 from msg_analysis.inference.observation import Measurement, Observation
 from msg_analysis.inference.received_values import mode_links
-from msg_analysis.inference.statistics import chi2_quantile, chi2_tail, gamma_tail
+from msg_analysis.inference.statistics import add_sums, chi2_quantile, chi2_tail
 from msg_analysis.model.reception import neighbour_tables
 
 PATHS = 9999
@@ -91,12 +92,7 @@ class Transitions:
         if above or drawn.std() == 0.0:
             return (above + 1) / (number + 1)
         shape = (drawn.mean() / drawn.std()) ** 2
-        return float(min(1 / (number + 1), gamma_tail(observed, shape, drawn.mean() / shape)))
-
-
-def switching_test(modes: IntArray, transition: FloatArray) -> SwitchingTest:
-    """See ``Transitions.test``; graphs (N,) from 0, and P (n, n)."""
-    return Transitions.of(modes, len(transition)).test(transition)
+        return float(min(1 / (number + 1), special.gammaincc(shape, observed / (drawn.mean() / shape))))
 
 
 def likelihood_ratio(counts: IntArray, transition: FloatArray) -> FloatArray:
@@ -211,13 +207,7 @@ class LossTally:
 
     def merge(self, other: LossTally) -> None:
         """Add the tally of another run of the same experiment, with another seed."""
-        self.messages += other.messages
-        self.lost += other.lost
-        self.repeated += other.repeated
-        self._tried += other._tried
-        self._failed += other._failed
-        self._successive += other._successive
-        self._same_step += other._same_step
+        add_sums(self, other, "messages", "lost", "repeated", "_tried", "_failed", "_successive", "_same_step")
 
     def score(self) -> tuple[FloatArray, FloatArray]:
         """(links,) each: losses beyond the expected ones, and their information, of what says most about the chance."""

@@ -31,7 +31,7 @@ from msg_analysis.inference.question import (
     Search,
     agent_words,
 )
-from msg_analysis.inference.statistics import binomial_interval, log_normal_tail
+from msg_analysis.inference.statistics import add_sums, binomial_interval, log_normal_tail
 
 
 class Whiteness(Question):
@@ -147,9 +147,7 @@ class LagSums:
 
     def merge(self, other: Self) -> None:
         """No lag goes over from one run to another."""
-        self.score += other.score
-        self.information += other.information
-        self.products += other.products
+        add_sums(self, other, "score", "information", "products")
 
     def clearest(self, *, pooled: bool = False) -> Lag | None:
         """Of all lags and columns (Bonferroni), or of the columns together; None where there are too few numbers."""

@@ -151,17 +151,6 @@ class Distinction:
     confidence: float  # 1 - p, adjusted for all pairs (Holm)
     predicted: bool | None  # whether the predicted order is the same; None if equal or unknown
 
-    def to_json(self) -> dict[str, Any]:
-        """The JSON document."""
-        return {
-            "better": self.better,
-            "worse": self.worse,
-            "difference": self.difference,
-            "standard_error": self.standard_error,
-            "confidence": self.confidence,
-            "predicted": self.predicted,
-        }
-
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
@@ -196,8 +185,8 @@ class Ranking:
             "pairs": self.pairs,
             "distinguished": len(self.distinctions),
             "ties": [list(pair) for pair in self.ties],
-            "contradictions": [pair.to_json() for pair in self.contradictions],
-            "distinctions": [pair.to_json() for pair in self.distinctions],
+            "contradictions": [asdict(pair) for pair in self.contradictions],
+            "distinctions": [asdict(pair) for pair in self.distinctions],
         }
 
 
@@ -229,10 +218,15 @@ def rank_estimates(
     first, second, difference, error = first[usable], second[usable], difference[usable], np.sqrt(variance[usable])
     adjusted = holm(two_sided(difference / error))
     apart = np.flatnonzero(adjusted < level)
-    found = [
-        _distinction(*_sorted(first[a], second[a], difference[a]), abs(difference[a]), error[a], adjusted[a], predicted)
-        for a in apart[np.argsort(adjusted[apart], kind="stable")]
-    ]
+    found = []
+    for a in apart[np.argsort(adjusted[apart], kind="stable")].tolist():
+        better, worse = (first[a], second[a]) if difference[a] > 0.0 else (second[a], first[a])
+        agrees = None
+        if predicted is not None:
+            gap = float(predicted[worse] - predicted[better])
+            agrees = None if abs(gap) <= EQUAL * float(predicted.max()) else gap > 0.0
+        size, confidence = abs(float(difference[a])), 1.0 - float(adjusted[a])
+        found.append(Distinction(int(better) + 1, int(worse) + 1, size, float(error[a]), confidence, agrees))
     return Ranking(
         ranking=_ranking(measured),
         predicted_ranking=None if predicted is None else _ranking(predicted),
@@ -240,20 +234,6 @@ def rank_estimates(
         pairs=len(first),
         level=level,
     )
-
-
-def _sorted(first: int, second: int, difference: float) -> tuple[int, int]:
-    return (first, second) if difference > 0.0 else (second, first)
-
-
-def _distinction(
-    better: int, worse: int, difference: float, error: float, p: float, predicted: FloatArray | None
-) -> Distinction:
-    agrees: bool | None = None
-    if predicted is not None:
-        gap = float(predicted[worse] - predicted[better])
-        agrees = None if abs(gap) <= EQUAL * float(predicted.max()) else gap > 0.0
-    return Distinction(int(better) + 1, int(worse) + 1, float(difference), float(error), 1.0 - float(p), agrees)
 
 
 def _ranking(values: FloatArray) -> tuple[int, ...]:

@@ -75,7 +75,9 @@ def order_events(observation: Observation, ties_at_once: int = TIES_AT_ONCE) -> 
         contradiction = contradiction or "agents used new values of each other at the same time"
     order = EventOrder(_zeros(*timers.graphs.shape), newest, contradiction)
     placed = 0
-    for first, last in _blocks_of_periods(observation):
+    numbers = (4 + observation.step.most_neighbours) * observation.step.agents
+    ends = [last for _, last in observation.blocks(numbers, "order of the steps")]
+    for first, last in pairwise([0, *ends[:-1], observation.steps + 2]):  # so that all events are in one of the blocks
         steps, agents = order.events(first, last)
         chosen = np.lexsort((agents, steps, turn[steps + 1, agents], timers.made[steps + 1, agents]))
         order.position[steps[chosen], agents[chosen]] = np.arange(placed, placed + len(chosen))
@@ -83,13 +85,6 @@ def order_events(observation: Observation, ties_at_once: int = TIES_AT_ONCE) -> 
         for array in (order.position, order.newest, turn):
             release(array)
     return order
-
-
-def _blocks_of_periods(observation: Observation) -> Iterator[tuple[int, int]]:
-    """As for ``EventOrder.events``, so that all events are in one of the blocks."""
-    numbers = (4 + observation.step.most_neighbours) * observation.step.agents
-    ends = [last for _, last in observation.blocks(numbers, "order of the steps")]
-    return pairwise([0, *ends[:-1], observation.steps + 2])
 
 
 def _early_and_equal(observation: Observation, timers: Timers) -> tuple[str | None, IntArray]:

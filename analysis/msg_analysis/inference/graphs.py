@@ -188,7 +188,10 @@ class HoldingTimes(SummedDiagnostic):
         """(..., G + 1, K): of each graph that is left, and of all, from counts (..., n, PARTS)."""
         if not len(self._left):
             return np.empty((*sums[0].shape[:-2], 0, 1))
-        steps, left = (_in_parts(each[..., self._left, :]) for each in sums)  # (..., G, 8 + 4 + 2)
+        steps, left = (
+            np.concatenate([each.reshape(*each.shape[:-1], -1, joined).sum(axis=-1) for joined in JOINED], axis=-1)
+            for each in (counts[..., self._left, :] for counts in sums)
+        )  # (..., G, 8 + 4 + 2)
         each = proportion_evidence(left, steps, self._leaving[self._left, None], self._known)
         ends = np.cumsum([PARTS // joined for joined in JOINED])
         parts = np.concatenate([group.sum(axis=-2) for group in np.split(each, ends[:-1], axis=-2)], axis=-1)
@@ -210,11 +213,6 @@ class HoldingTimes(SummedDiagnostic):
             f"the probability of leaving graph {names[found.graph]} depends on how long it has lasted: it is "
             f"{found.numbers} {part}, not {found.expected:.3g}"
         )
-
-
-def _in_parts(counts: IntArray) -> IntArray:
-    """(..., 8 + 4 + 2): counts (..., 8) of the parts, and of each ``JOINED`` number of them."""
-    return np.concatenate([counts.reshape(*counts.shape[:-1], -1, each).sum(axis=-1) for each in JOINED], axis=-1)
 
 
 def _edges(leaving: float) -> IntArray:

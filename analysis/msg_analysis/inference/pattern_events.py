@@ -126,22 +126,19 @@ class Periods:
         self._observation.release()
 
     def _law(self, graph: int, agent: int) -> _Law:
-        found = self._laws.get((graph, agent))
-        if found is None:
-            found = self._laws[graph, agent] = self._new_law(graph, agent)
-        return found
-
-    def _new_law(self, graph: int, agent: int) -> _Law:
+        if (graph, agent) in self._laws:
+            return self._laws[graph, agent]
         tables, gain = neighbour_tables(self._step), self._step.noise_gain[graph, agent]
         senders = tables.senders[graph, agent, : tables.count[graph, agent]].tolist()
         weights = neighbour_weights(self._step)[graph, agent].tolist()
         shared = np.flatnonzero(self._shared & (gain != 0.0)).tolist()
-        return _Law(
+        self._laws[graph, agent] = found = _Law(
             float(self._step.nominal[graph, agent, agent]),
             list(zip(senders, weights, strict=False)),
             [(which, float(gain[which])) for which in shared],
             float((gain[~self._shared] ** 2).sum()),
         )
+        return found
 
     def _compile(self, events: IntArray, before: IntArray, after: IntArray) -> Period:
         """Event by event; values are kept as long as they are used."""

@@ -197,10 +197,6 @@ class Law:
     supported: bool | None  # whether the log supports it; None where that is not decided
     why: str
 
-    def to_json(self) -> dict[str, Any]:
-        """The JSON document."""
-        return {"system_error": self.system_error.to_json(), "supported": self.supported, "why": self.why}
-
 
 @dataclass(frozen=True, slots=True)
 class Laws:
@@ -225,12 +221,8 @@ class Laws:
 
     def to_json(self) -> dict[str, Any]:
         """The JSON document."""
-        return {
-            "pattern": self.pattern.to_json(),
-            "sequential": self.sequential.to_json(),
-            "continuous": self.continuous.to_json(),
-            "why": self.why,
-        }
+        laws = {"pattern": self.pattern, "sequential": self.sequential, "continuous": self.continuous}
+        return laws | {"why": self.why}
 
 
 def measure_laws(observation: Observation, order: EventOrder, timing: Timing, level: float) -> tuple[TimeMeans, Laws]:

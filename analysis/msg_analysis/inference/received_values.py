@@ -19,7 +19,7 @@ import numpy as np
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.statistics import chi2_below, chi2_tail
+from msg_analysis.inference.statistics import add_sums, chi2_below, chi2_tail
 from msg_analysis.model.reception import neighbour_tables
 from msg_analysis.model.step_model import StepModel, Wiring
 
@@ -199,8 +199,8 @@ class Equalizer:
 
     def merge(self, other: Equalizer) -> None:
         """Add the sums of another run of the same experiment, with another seed."""
-        self.possible &= other.possible
-        self.chi2, self.dof, self.quiet = self.chi2 + other.chi2, self.dof + other.dof, max(self.quiet, other.quiet)
+        add_sums(self, other, "chi2", "dof")
+        self.possible, self.quiet = self.possible and other.possible, max(self.quiet, other.quiet)
 
     def p_size(self) -> float | None:
         """Two-sided p-value of the total size of all residuals; None without noise."""

@@ -27,6 +27,7 @@ from msg_analysis.inference.received_values import (
 )
 from msg_analysis.inference.regression import MAX_REGRESSORS, ReceivedRegression, StateRegression
 from msg_analysis.inference.statistics import (
+    add_sums,
     chi2_tail,
     covariance_statistic,
     direction_p,
@@ -54,14 +55,6 @@ class ResidualTests:
     samples: int | None = None  # of each agent, replicas counted; samples * ratio is chi-square(samples)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Directions:
-    """Directions of the noise of one graph, N_g = (basis * variances) basis^T, largest variance first."""
-
-    whitener: FloatArray  # (r, m)
-    quiet: FloatArray  # (m, m - r) orthonormal basis of the directions without noise
-
-
 class ResidualSums:
     """Sums over residuals of runs, for the tests and the search for causes; ``follower`` is given every step."""
 
@@ -81,9 +74,9 @@ class ResidualSums:
         self.samples, self.scatter = np.zeros(n, np.int64), np.zeros((n, m, m))
         self.still = np.zeros((n, m), np.int64)  # steps in which no replica of an agent changed
         self.quiet = self.largest = 0.0  # largest |e| in directions without noise; largest |x|
-        self._directions = [_directions(matrix) for matrix in self.noises]
+        self._directions = [noise_directions(matrix) for matrix in self.noises]
         # Graphs may differ in the number of noisy directions; the strongest ones that all graphs have are iid N(0, I).
-        self._whiteness = Whiteness(min(len(d.whitener) for d in self._directions))
+        self._whiteness = Whiteness(min(len(whitener) for whitener, _ in self._directions))
         self._repeated = RepeatedNoise.of(observation)
         # False where residuals depend on each other in a way that is not followed here.
         self.independent = self._repeated is None or not _correlated(step)
@@ -112,15 +105,11 @@ class ResidualSums:
 
     def merge(self, other: ResidualSums) -> None:
         """Add the sums of another run of the same experiment, with another seed."""
-        self.samples += other.samples
-        self.scatter += other.scatter
-        self.still += other.still
+        add_sums(self, other, "samples", "scatter", "still", "score", "covariance")
         self.quiet, self.largest = max(self.quiet, other.quiet), max(self.largest, other.largest)
         self._whiteness.merge(other._whiteness)
         if self._equalizer and other._equalizer:
             self._equalizer.merge(other._equalizer)
-        self.score += other.score
-        self.covariance += other.covariance
         self.gram = None if self.gram is None or other.gram is None else self.gram + other.gram
 
     def tests(self) -> ResidualTests:
@@ -193,7 +182,7 @@ class ResidualSums:
             self.largest = max(self.largest, float(np.abs(states[:-1]).max()))
             unmoved = (states[1:] == states[:-1]).all(axis=2)
             white = np.empty((last - first, self._whiteness.rank, observation.replicas))
-            for mode, direction in enumerate(self._directions):
+            for mode, (whitener, quiet) in enumerate(self._directions):
                 at = np.flatnonzero(modes == mode)
                 if not at.size:
                     continue
@@ -201,8 +190,8 @@ class ResidualSums:
                 self.samples[mode] += flat.shape[1]
                 self.scatter[mode] += flat @ flat.T
                 self.still[mode] += unmoved[at].sum(axis=0)
-                self.quiet = max(self.quiet, float(np.abs(direction.quiet.T @ flat).max(initial=0.0)))
-                white[at] = direction.whitener[: self._whiteness.rank] @ e[at]
+                self.quiet = max(self.quiet, float(np.abs(quiet.T @ flat).max(initial=0.0)))
+                white[at] = whitener[: self._whiteness.rank] @ e[at]
             self._whiteness.add(white)
 
     def _covariance_p(self) -> float | None:
@@ -211,7 +200,7 @@ class ResidualSums:
         groups = [list(modes)] if (self.noises == self.noises[0]).all() else [[g] for g in modes]
         statistic, dof = 0.0, 0.0
         for group in groups:
-            whitener = self._directions[group[0]].whitener
+            whitener, _ = self._directions[group[0]]
             samples = int(self.samples[group].sum())
             if len(whitener) and samples:
                 scatter = whitener @ self.scatter[group].sum(axis=0) @ whitener.T
@@ -244,11 +233,12 @@ def _correlated(step: StepModel) -> bool:
     return bool((together - np.diag(np.diag(together))).any())
 
 
-def _directions(noise: FloatArray) -> _Directions:
+def noise_directions(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Whitener (r, m) of the directions with noise, the largest first; orthonormal basis (m, m - r) of the others."""
     values, vectors = np.linalg.eigh(noise)
     values, vectors = values[::-1], vectors[:, ::-1]
     rank = int((values > NO_NOISE * values[0]).sum()) if values[0] > 0.0 else 0
-    return _Directions((vectors[:, :rank] / np.sqrt(values[:rank])).T, vectors[:, rank:])
+    return (vectors[:, :rank] / np.sqrt(values[:rank])).T, vectors[:, rank:]
 
 
 class Whiteness:
@@ -287,11 +277,7 @@ class Whiteness:
 
     def merge(self, other: Whiteness) -> None:
         """Add the sums of another run with another seed; no lags are counted across runs."""
-        self._products += other._products
-        self._counts += other._counts
-        self._squares += other._squares
-        self._pairs += other._pairs
-        self._steps += other._steps
+        add_sums(self, other, "_products", "_counts", "_squares", "_pairs", "_steps")
 
     def p_value(self) -> float | None:
         """None without noise or with at most LAGS steps. Coordinates are scaled by their size, tested elsewhere."""
@@ -333,8 +319,7 @@ class BroadcastSums:
 
     def merge(self, other: BroadcastSums) -> None:
         """Add the sums of another run of the same experiment, with another seed."""
-        self.scatter += other.scatter
-        self.samples += other.samples
+        add_sums(self, other, "scatter", "samples")
 
     def p_value(self) -> float:
         """p-value of published - state being N(0, s^2 I), s = ``noise.broadcast``."""

@@ -165,36 +165,27 @@ class RunPlan:
             "notes": self._notes(),
         }
 
-    def _wall_time(self, steps: float) -> float | None:
-        return steps / self.rate if self.rate else None
+    def _length(self, steps: int | None) -> dict[str, float | None]:
+        if steps is None:
+            return dict.fromkeys(("steps", "duration", "wall_time"))
+        wall_time = steps / self.rate if self.rate else None
+        return {"steps": steps, "duration": steps * self.prediction.step.dt, "wall_time": wall_time}
 
-    def _run(self, steps: int, replicas: int) -> dict[str, Any]:
+    def _run(self, steps: int, replicas: int) -> dict[str, float | None]:
         error = self.precision.standard_error(steps, replicas)
         return {
             "replicas": replicas,
-            "steps": steps,
-            "duration": steps * self.prediction.step.dt,
-            "wall_time": self._wall_time(steps),
+            **self._length(steps),
             "standard_error": error,
             "half_width": HALF_WIDTH_95 * error,
             "any_time_half_width": ANY_TIME_95 * error if self.precision.any_time else None,
         }
 
-    def _lengths(self, replicas: int) -> dict[str, Any]:
-        steps = self.precision.steps(self.sought, replicas)
-        any_time = None
-        if self.precision.any_time:
-            any_time = self.precision.steps(self.sought, replicas, any_time=True)
-        dt = self.prediction.step.dt
-        return {
-            "replicas": replicas,
-            "steps": steps,
-            "duration": steps * dt,
-            "wall_time": self._wall_time(steps),
-            "any_time_steps": any_time,
-            "any_time_duration": None if any_time is None else any_time * dt,
-            "any_time_wall_time": None if any_time is None else self._wall_time(any_time),
-        }
+    def _lengths(self, replicas: int) -> dict[str, float | None]:
+        precision, sought = self.precision, self.sought
+        at_any_time = precision.steps(sought, replicas, any_time=True) if precision.any_time else None
+        any_time = {f"any_time_{key}": value for key, value in self._length(at_any_time).items()}
+        return {"replicas": replicas, **self._length(precision.steps(sought, replicas)), **any_time}
 
     def _budget(self) -> dict[str, Any] | None:
         if self.seconds is None or self.rate is None:

@@ -72,24 +72,10 @@ def chi2_quantile(tail: Any, dof: Any) -> Any:
     return special.chdtri(dof, tail)
 
 
-def noncentral_chi2_tail(x: Any, dof: Any, noncentrality: Any) -> Any:
-    """P(X > x) of a noncentral chi-square variable."""
-    return 1.0 - special.chndtr(x, dof, noncentrality)
-
-
-def needed_noncentrality(x: Any, dof: Any, tail: Any) -> Any:
-    """The noncentrality parameter with P(X > x) = ``tail``."""
-    return special.chndtrinc(x, dof, 1.0 - tail)
-
-
-def student_quantile(below: Any, dof: Any) -> Any:
-    """The t with P(T <= t) = ``below`` for a variable of Student's law with ``dof`` degrees of freedom."""
-    return special.stdtrit(dof, below)
-
-
-def gamma_tail(x: Any, shape: Any, scale: Any) -> Any:
-    """P(X > x) of a gamma variable."""
-    return special.gammaincc(shape, x / scale)
+def add_sums(one: Any, other: Any, *names: str) -> None:
+    """Add these attributes of another object to those of ``one``."""
+    for name in names:
+        setattr(one, name, getattr(one, name) + getattr(other, name))
 
 
 def binomial_interval(count: int, total: int) -> tuple[float, float]:
@@ -182,7 +168,7 @@ def batch_interval(series: FloatArray, level: float = 0.95) -> tuple[float, floa
         return None
     # The remainder is dropped at the beginning, where the start may still have an effect.
     means = series[len(series) - length * BATCHES :].reshape(BATCHES, length).mean(axis=1)
-    half = student_quantile(0.5 + level / 2, BATCHES - 1) * means.std(ddof=1) / np.sqrt(BATCHES)
+    half = special.stdtrit(BATCHES - 1, 0.5 + level / 2) * means.std(ddof=1) / np.sqrt(BATCHES)
     return float(means.mean() - half), float(means.mean() + half)
 
 

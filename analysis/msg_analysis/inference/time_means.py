@@ -226,6 +226,9 @@ def time_means(observation: Observation) -> TimeMeans:
     for value, total in zip(values, totals, strict=False):
         if isinstance(value, Value):
             covariance += value.spread(total) / observation.replicas
+    step = observation.step  # in its steady state:
+    leaving = steps * step.stationary * (1.0 - np.diag(step.transition))
+    switches = math.inf if step.modes == 1 else float(leaving.min())
     return TimeMeans.of(
         (forms, nodes, trace),
         totals.sum(axis=0)[:p] / steps,
@@ -233,18 +236,9 @@ def time_means(observation: Observation) -> TimeMeans:
         covariance / steps**2,
         (series, variances),
         joint=False,
-        switches=_expected_switches(observation) if values else 0.0,
+        switches=switches if values else 0.0,
         heavy=observation.prediction.fourth_moment.finite is not True,
     )
-
-
-def _expected_switches(observation: Observation) -> float:
-    """``TimeMeans.switches``: in the steady state."""
-    step = observation.step
-    if step.modes == 1:
-        return math.inf
-    leaving = step.stationary * (1.0 - np.diag(step.transition))
-    return float(observation.steps * leaving.min())
 
 
 def values_of(prediction: Prediction, forms: FloatArray) -> list[Value | SharedValue]:

@@ -138,20 +138,20 @@ class Timing:
         (edges, counts), (age_edges, age_counts) = self.histogram, self.ages
         return {
             "period_ms": self.period_ms,
-            "lateness_ms": _document(self.lateness_ms),
+            "lateness_ms": self.lateness_ms,
             "deadlines": {"steps": self.steps, "missed": self.missed, "share": self.missed_share},
-            "jitter_ms": _document(self.jitter_ms),
-            "staleness_ms": _document(self.staleness_ms),
-            "staleness_steps": _document(self.staleness_steps),
+            "jitter_ms": self.jitter_ms,
+            "staleness_ms": self.staleness_ms,
+            "staleness_steps": self.staleness_steps,
             "ideal_uses": {"uses": self.uses, "ideal": self.ideal_uses, "share": self.ideal_share},
             "never_heard": self.never_heard,
-            "unheard": self.lost_messages.to_json(),
+            "unheard": self.lost_messages,
             "outdated_graph": {"steps": self.outdated_graphs, "share": self.outdated_share},
             "histogram": {
-                "lateness_ms": edges.tolist(),
-                "steps": counts.tolist(),
-                "staleness_ms": age_edges.tolist(),
-                "uses": age_counts.tolist(),
+                "lateness_ms": edges,
+                "steps": counts,
+                "staleness_ms": age_edges,
+                "uses": age_counts,
             },
         }
 
@@ -269,10 +269,6 @@ def _histogram(values: Pieces) -> tuple[FloatArray, AnyArray]:
     ends = min(0.0, low), max(high, 1e-3)
     counts = sum((np.histogram(piece, BINS, ends)[0] for piece in values()), np.zeros(BINS, np.int64))
     return np.histogram_bin_edges(np.empty(0), BINS, ends), counts
-
-
-def _document(quantiles: Quantiles) -> dict[str, float | None]:
-    return {"p50": quantiles.p50, "p95": quantiles.p95, "p99": quantiles.p99, "max": quantiles.max}
 
 
 SHOWN_LINKS = 20

@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.resources import blas_threads
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.comparison import Comparison, trusted
-from msg_analysis.inference.counts import LossTally, Transitions, loss_test, switching_test
+from msg_analysis.inference.counts import LossTally, Transitions, loss_test
 from msg_analysis.inference.e_values import log_mean
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates, rank_agents
 from msg_analysis.inference.event_order import order_events
@@ -68,22 +68,18 @@ class Evidence:
     def of(cls, observation: Observation, level: float, *, decided: bool = False) -> Evidence:
         """Of one run, which ended when its evidence ``decided``; in real time, laws are tested at ``level``."""
         analyses = spaced_steps(observation.steps, DECIDED_ANALYSES if decided else usual_analyses(observation.steps))
-        with blas_threads(observation.step.agents):
-            return cls._of(observation, level, analyses)
-
-    @classmethod
-    def _of(cls, observation: Observation, level: float, analyses: IntArray) -> Evidence:
         laws, timing, position, given = None, None, None, None
-        if observation.timers:
-            timing, order = measure_timing(observation), order_events(observation)
-            position = order.position
-            means, laws = measure_laws(observation, order, timing, level)
-        else:
-            means = time_means(observation)
-            kept = observation.prediction.system.readout is not None
-            given = means_in_lockstep(observation) if kept else means_given_path(observation)
         watched = WatchedEvidence(observation, analyses)
-        residuals = ResidualSums(observation, position, watched)
+        with blas_threads(observation.step.agents):
+            if observation.timers:
+                timing, order = measure_timing(observation), order_events(observation)
+                position = order.position
+                means, laws = measure_laws(observation, order, timing, level)
+            else:
+                means = time_means(observation)
+                kept = observation.prediction.system.readout is not None
+                given = means_in_lockstep(observation) if kept else means_given_path(observation)
+            residuals = ResidualSums(observation, position, watched)
         return cls(
             steps=observation.steps,
             means=means,
@@ -186,11 +182,7 @@ def compare_run(trajectory: Run, *, level: float = 0.01) -> Comparison:
 
 
 def evaluate(
-    trajectory: Run,
-    prediction: Prediction,
-    evidence: Evidence,
-    level: float,
-    p_alike: float | None = None,
+    trajectory: Run, prediction: Prediction, evidence: Evidence, level: float, p_alike: float | None = None
 ) -> Comparison:
     """The verdict on the evidence of one run, or of several, of which ``trajectory`` has the completeness."""
     means, lockstep = evidence.means, prediction.experiment.run.pace == "lockstep"
@@ -280,7 +272,8 @@ def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
     if measurement.steps < MIN_STEPS and not trajectory.completeness.complete:
         enough = False
     series, covariance = measurement.system_series, measurement.covariance if enough else None
-    switching = switching_test(measurement.modes, measurement.step.transition) if enough else None
+    transition = measurement.step.transition
+    switching = Transitions.of(measurement.modes, len(transition)).test(transition) if enough else None
     loss = loss_test(measurement) if enough else None
     run = Statistics(p_switching=switching.p if switching else None, p_loss=loss.p if loss else None)
     nodes = [Estimate()] * agents if covariance is None else [Estimate(float(error)) for error in np.diag(covariance)]

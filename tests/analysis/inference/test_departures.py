@@ -463,7 +463,7 @@ def test_a_fault_is_found_and_named(departures, fault: str) -> None:
     assert re.fullmatch(WORDS[fault], first.words), first.words
     stretch = first.kind == "noise" and first.graph is None and "steps before" not in first.words
     in_time = stretch or first.kind in ("frozen", "graph", "outlier")
-    steps = first.to_json()["steps"]
+    steps = first.steps
     assert (steps is not None) == in_time
     assert steps is None or f"{steps[0]:,}" in first.words
 

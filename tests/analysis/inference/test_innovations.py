@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from experiments import observed, pieces
-from msg_analysis.inference.counts import simulate_counts, switching_test
+from msg_analysis.inference.counts import SwitchingTest, Transitions, simulate_counts
 from msg_analysis.inference.regression import regressors
 from msg_analysis.inference.residuals import ResidualSums, residuals
 
@@ -146,6 +146,10 @@ def path(transition, steps, seed, first=0):
     for _ in range(steps - 1):
         modes.append(int(random.choice(len(transition), p=transition[modes[-1]])))
     return np.array(modes)
+
+
+def switching_test(modes: np.ndarray, transition: np.ndarray) -> SwitchingTest:
+    return Transitions.of(modes, len(transition)).test(transition)
 
 
 P = np.array([[0.9, 0.1], [0.3, 0.7]])
