@@ -325,8 +325,7 @@ def _block(
 
 def _uses(observation: Observation, links: int, first: int, last: int) -> tuple[BoolArray, BoolArray, BoolArray]:
     """The same of a run in real time."""
-    step, timers = observation.step, observation.timers
-    assert timers is not None
+    step, timers = observation.step, observation.timed
     tables, agents = neighbour_tables(step), np.arange(step.agents)
     graphs, used = timers.graphs[first:last], timers.used[first:last]
     numbers = (np.cumsum(step.listens().ravel()) - 1).reshape(step.agents, step.agents)

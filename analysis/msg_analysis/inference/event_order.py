@@ -67,7 +67,7 @@ def _zeros(rows: int, columns: int) -> IntArray:
 def order_events(observation: Observation, ties_at_once: int = TIES_AT_ONCE) -> EventOrder:
     """Order the events of a run in real time by time; at equal times, a value comes before the steps that use it."""
     # Equal times are common where the agents' clock moves in jumps, and when a late agent catches up.
-    timers = _timers(observation)
+    timers = observation.timed
     newest = newest_steps(observation)
     contradiction, ties = _early_and_equal(observation, timers)
     turn, circular = _turns_of(timers, ties, ties_at_once)
@@ -156,7 +156,7 @@ def _turns(source: IntArray, target: IntArray, count: int) -> tuple[IntArray, bo
 
 def newest_steps(observation: Observation) -> IntArray:
     """``EventOrder.newest`` of a run in real time."""
-    made, times = _timers(observation).made, sampling_times(observation)
+    made, times = observation.timed.made, sampling_times(observation)
     newest = _zeros(*made.shape)
     for i in range(made.shape[1]):
         found = np.searchsorted(np.maximum.accumulate(column(made, i)), times, side="right") - 1
@@ -188,11 +188,6 @@ def spread(first: IntArray, last: IntArray) -> tuple[IntArray, IntArray]:
 def sampling_times(observation: Observation) -> IntArray:
     """(N + 1,): k dt [ns of simulated time]."""
     return StepClock(observation.step.dt).times(np.arange(observation.steps + 1))
-
-
-def _timers(observation: Observation) -> Timers:
-    assert observation.timers is not None
-    return observation.timers
 
 
 OWN = int(np.iinfo(np.int32).min)  # stands for a value that was never received; the agent's own value takes its place
@@ -233,8 +228,7 @@ class Entries:
 
 def period_tables(observation: Observation, order: EventOrder) -> PeriodTables:
     """The tables of a run in real time, made in blocks of steps, then in blocks of periods."""
-    assert observation.timers is not None
-    return _Maker(observation, observation.timers, order).tables()
+    return _Maker(observation, observation.timed, order).tables()
 
 
 class _Maker:

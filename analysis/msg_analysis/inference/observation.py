@@ -166,6 +166,12 @@ class Observation:
         return len(self.modes)
 
     @property
+    def timed(self) -> Timers:
+        """The timers, in real time."""
+        assert self.timers is not None
+        return self.timers
+
+    @property
     def sure_messages(self) -> int:
         """Steps at the beginning whose messages say nothing about losses."""
         return self.step.delay + (1 if self.step.holds else 0)

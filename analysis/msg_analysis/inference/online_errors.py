@@ -316,15 +316,10 @@ class _ErrorVariances:
     def _sum_squares(self, mode: int, rows: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
         """(len(rows),): the part that is not linear in a, for some combinations of the forms."""
         value = self._values[mode]
-        total = np.zeros(len(rows))
         if isinstance(value, Value):
-            seen = a
-        else:
-            seen = b
-            total += ((value.increments(a, b) @ rows.T) ** 2).sum(axis=0)
-        for probability, surprise in zip(value.probability, value.surprises, strict=True):
-            total += probability * ((seen @ (rows @ surprise).T) ** 2).sum(axis=0)
-        return total
+            return np.asarray(value.jump_variances(rows, a).sum(axis=0))
+        increments = value.increments(a, b) @ rows.T
+        return np.asarray((increments**2 + value.jump_variances(rows, b)).sum(axis=0))
 
     def variances(self) -> FloatArray:
         """(1,) or (1 + m,): of the sums over all steps, of the system error and of the node errors."""

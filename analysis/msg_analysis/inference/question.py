@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from operator import attrgetter
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -19,12 +19,14 @@ from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import candidates
 from msg_analysis.inference.candidates import Cause, CauseKind, Parameters, Selected, numbers_text, select
-from msg_analysis.inference.counts import LossTally, Transitions
 from msg_analysis.inference.e_values import Analyses
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.received_values import ReceivedValues
-from msg_analysis.inference.residuals import BroadcastSums, ResidualSums, ResidualTests
+from msg_analysis.inference.residuals import ResidualTests
 from msg_analysis.model.step_model import StepModel
+
+if TYPE_CHECKING:
+    from msg_analysis.inference.verdict import Evidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,19 +140,13 @@ class Search:
     """The search for the causes of a disagreement: sums over runs, and what was found in them so far."""
 
     def __init__(
-        self,
-        experiment: Experiment,
-        residuals: ResidualSums,
-        transitions: Transitions,
-        loss: LossTally | None,
-        broadcast: BroadcastSums | None,
-        findings: Mapping[str, Finding],
-        level: float,
+        self, experiment: Experiment, evidence: Evidence, findings: Mapping[str, Finding], level: float
     ) -> None:
         self.experiment, self.names = experiment, [graph.name for graph in experiment.graph_list]
-        self.residuals, self.transitions, self.loss = residuals, transitions, loss
+        self.residuals, self.transitions, self.loss = evidence.residuals, evidence.transitions, evidence.loss
         self.findings, self.level = findings, level
         self.families = 0  # classes of candidates, all questions together
+        residuals, loss, broadcast = evidence.residuals, evidence.loss, evidence.broadcast
         self.frozen = candidates.frozen(residuals)
         # Agents whose states are constant are no evidence on gains and noise.
         self.excluded = [agent for agent, _, _ in self.frozen]

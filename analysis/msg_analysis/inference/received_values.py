@@ -12,7 +12,7 @@ what was used.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -92,18 +92,8 @@ class ReceivedValues:
 
     def part(self, first: int, last: int) -> ReceivedValues:
         """Of the steps first..last-1 of the block."""
-        cut = slice(first, last)
-        return replace(
-            self,
-            modes=self.modes[cut],
-            graphs=self.graphs[cut],
-            states=self.states[cut],
-            used=self.used[cut],
-            senders=self.senders[cut],
-            weights=self.weights[cut],
-            own=self.own[cut],
-            link_variance=self.link_variance[cut],
-        )
+        names = [each.name for each in fields(self) if each.name != "published"]
+        return replace(self, **{name: getattr(self, name)[first:last] for name in names})
 
     def received(self, at: IntArray, agents: IntArray, which: IntArray) -> FloatArray:
         """(k, a, R): what ``agents`` (a,) used of neighbours ``which`` (a,) in the steps ``at`` (k,) of the block."""

@@ -115,9 +115,9 @@ class _Jumps:
         return total
 
     def jump_variances(self, combination: FloatArray, a: FloatArray) -> FloatArray:
-        """(b,): the part of Var(D_k | now) of one combination of the forms that is due to the next graph."""
-        parts = [(a @ (combination @ surprise)) ** 2 for surprise in self.surprises]
-        return np.asarray(self.probability @ np.array(parts))
+        """(b,): the part of Var(D_k | now) that is due to the next graph; of several combinations (r, q), (b, r)."""
+        parts = [(a @ (combination @ surprise).T) ** 2 for surprise in self.surprises]
+        return np.tensordot(self.probability, np.array(parts), axes=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

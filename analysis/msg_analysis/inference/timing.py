@@ -186,8 +186,7 @@ class _TimingLog:
     """What blocks of steps say about timing, times in ms of the agents' clock."""
 
     def __init__(self, observation: Observation) -> None:
-        assert observation.timers is not None
-        self._observation, self._timers, self._step = observation, observation.timers, observation.step
+        self._observation, self._timers, self._step = observation, observation.timed, observation.step
         experiment = observation.prediction.experiment
         self.milliseconds = 1e-6 / experiment.run.speed  # of the agents' clock, in a nanosecond of simulated time
         self.period = observation.step.dt * 1e9
@@ -347,8 +346,7 @@ class LostMessages:
 
 def lost_messages(observation: Observation) -> LostMessages:
     """The messages of a run in real time, see ``LostMessages``; with a delay, so many steps later."""
-    timers, step = observation.timers, observation.step
-    assert timers is not None
+    timers, step = observation.timed, observation.step
     tables = neighbour_tables(step)
     links = np.argwhere(step.listens())
     messages, lost = np.zeros(len(links), np.int64), np.zeros(len(links), np.int64)

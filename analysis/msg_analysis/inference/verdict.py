@@ -210,8 +210,7 @@ def evaluate(
     rejected = [test.name for test in tests if test.rejected]
     causes: list[Cause] = []
     if rejected and trajectory.completeness.complete:
-        sums = evidence.residuals, evidence.transitions, evidence.loss, evidence.broadcast
-        causes = causes_of(Search(prediction.experiment, *sums, run.findings, level), rejected)
+        causes = causes_of(Search(prediction.experiment, evidence, run.findings, level), rejected)
     return Comparison(
         trajectory=trajectory,
         level=level,
