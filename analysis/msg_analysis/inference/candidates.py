@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -131,31 +131,11 @@ def _distinct(classes: Sequence[Sequence[Candidate]], families: int) -> tuple[li
     return kept, np.array(penalties)
 
 
-CauseKind = Literal[
-    "frozen",
-    "graph",
-    "gain",
-    "ignored",
-    "reference",
-    "offset",
-    "noise",
-    "correlation",
-    "lag",
-    "outlier",
-    "stale",
-    "switching",
-    "sojourns",
-    "loss",
-    "broadcast",
-    "unknown",
-]
-
-
 @dataclass(frozen=True, slots=True)
 class Cause:
     """One thing that is wrong."""
 
-    kind: CauseKind
+    kind: str  # such as "gain"; of a diagnostic, its ``kind``
     words: str  # a sentence
     agent: int | None = None  # from 1; None where the cause is not one agent
     link: tuple[int, int] | None = None  # from 1: sender and receiver, or the two ends of an edge or of a correlation

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
 from typing import Self
 
@@ -104,22 +104,6 @@ LAGS = 100
 MIN_SAMPLES = 100  # fewest products for the normal law of their sum
 
 
-@dataclass(frozen=True, slots=True)
-class Lag:
-    """The clearest dependence on earlier numbers."""
-
-    log_p: float  # of all lags and columns together
-    column: int
-    steps: int
-    coefficient: float
-    standard_error: float
-
-    def finding(self, agent: int | None, log_p: float) -> Finding:
-        """Of an agent; ``log_p`` of the whole test."""
-        span, error = (self.steps, self.steps), self.standard_error
-        return Finding(log_p, agent, span=span, estimate=self.coefficient, standard_error=error, expected=0.0)
-
-
 class LagSums:
     """Regression of N(0, 1) numbers on those of the same column 1 to 100 steps before; expected coefficient 0."""
 
@@ -149,8 +133,8 @@ class LagSums:
         """No lag goes over from one run to another."""
         add_sums(self, other, "score", "information", "products")
 
-    def clearest(self, *, pooled: bool = False) -> Lag | None:
-        """Of all lags and columns (Bonferroni), or of the columns together; None where there are too few numbers."""
+    def clearest(self, *, pooled: bool = False) -> Finding | None:
+        """Of all lags and columns (as agents; Bonferroni), or of the columns together; None with too few numbers."""
         lags = np.flatnonzero(self.products >= MIN_SAMPLES)
         score, information = self.score[lags], self.information[lags]
         if not score.size:
@@ -163,7 +147,14 @@ class LagSums:
         row, column = np.unravel_index(int(np.argmax(np.abs(z))), z.shape)
         log_p = math.log(2.0 * z.size) + float(log_normal_tail(abs(z[row, column])))
         known = float(information[row, column])
-        return Lag(log_p, int(column), int(lags[row]) + 1, float(score[row, column] / known), 1.0 / math.sqrt(known))
+        return Finding(
+            log_p,
+            agent=None if pooled else int(column),
+            span=(int(lags[row]) + 1, int(lags[row]) + 1),
+            estimate=float(score[row, column] / known),
+            standard_error=1.0 / math.sqrt(known),
+            expected=0.0,
+        )
 
 
 def _products(joined: FloatArray, old: int, analyses: Analyses) -> FloatArray:
@@ -216,7 +207,7 @@ class LongLags(Diagnostic):
             return None
         best = min((lag for lag in (each, whole) if lag), key=lambda lag: lag.log_p)
         log_p = min(0.0, best.log_p + math.log(1.0 + self.together))  # half of the level each
-        return best.finding(None if best is whole else self.agent(best.column), log_p)
+        return replace(best, agent=None if best.agent is None else self.agent(best.agent), log_p=log_p)
 
     def logarithms(self) -> FloatArray:
         """(100 (agents + 1), K): lags of each agent, and of all together."""

@@ -20,33 +20,14 @@ from scipy.special import betaln, gammaln
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Analyses:
     """Analyses at a block of b steps."""
 
-    ends: IntArray  # (T,) numbers of steps before each analysis, from 1, ascending; the last is b
-
-    @classmethod
-    def at_the_end(cls, steps: int) -> Analyses:
-        """Only one, after so many steps."""
-        return cls(np.array([steps]))
-
-    @property
-    def count(self) -> int:
-        """T."""
-        return len(self.ends)
-
-    @property
-    def begins(self) -> IntArray:
-        """(T,): first step between each analysis and the one before it."""
-        begins = np.zeros_like(self.ends)
-        begins[1:] = self.ends[:-1]
-        return begins
-
-    @property
-    def lengths(self) -> IntArray:
-        """(T,): steps between each analysis and the one before it."""
-        return self.ends - self.begins
+    def __init__(self, ends: IntArray) -> None:
+        self.ends = ends  # (T,) numbers of steps before each analysis, from 1, ascending; the last is b
+        self.count = len(ends)  # T
+        self.begins: IntArray = np.append(0, ends[:-1])  # (T,) first step between each analysis and the one before it
+        self.lengths = ends - self.begins  # (T,) steps between these
 
     def after(self, steps: IntArray) -> IntArray:
         """The analysis that comes next after each of these steps, from 0."""

@@ -194,23 +194,14 @@ OWN = int(np.iinfo(np.int32).min)  # stands for a value that was never received;
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PeriodTables:
-    """All that the maps of the periods depend on, of period K in the rows ends[K] to ends[K + 1]."""
+class PeriodTable:
+    """Rows of the periods, of period K those from ends[K] to ends[K + 1]."""
 
-    # Agent, graph, step - K of the noise that is shared, own step, steps of the values used, and whether a message is
-    # used once (0), for the first of several times (1) or again (2): steps from the newest ones at K - 1.
-    events: IntArray
-    event_ends: IntArray
-    extras: IntArray  # entry, step from the newest one (of a source of noise: from K) of what is stacked at K
-    extra_ends: IntArray
+    rows: IntArray
+    ends: IntArray
 
-    def of_events(self, number: int) -> IntArray:
-        """The events of a period, in their order."""
-        return self.events[self.event_ends[number] : self.event_ends[number + 1]]
-
-    def of_extras(self, number: int) -> IntArray:
-        """What is stacked after the newest states."""
-        return self.extras[self.extra_ends[number] : self.extra_ends[number + 1]]
+    def __getitem__(self, number: int) -> IntArray:
+        return self.rows[self.ends[number] : self.ends[number + 1]]
 
 
 class Entries:
@@ -226,8 +217,11 @@ class Entries:
         self.shared: BoolArray = np.asarray((step.noise_gain != 0.0).any(axis=0).sum(axis=0) > 1)
 
 
-def period_tables(observation: Observation, order: EventOrder) -> PeriodTables:
-    """The tables of a run in real time, made in blocks of steps, then in blocks of periods."""
+def period_tables(observation: Observation, order: EventOrder) -> tuple[PeriodTable, PeriodTable]:
+    """All that the maps of the periods of a run in real time depend on: events, in their order, and what is stacked."""
+    # Events: agent, graph, step - K of the noise that is shared, own step, steps of the values used, and whether a
+    # message is used once (0), for the first of several times (1) or again (2): steps from the newest ones at K - 1.
+    # What is stacked at K after the newest states: entry, step from the newest one (of a source of noise: from K).
     return _Maker(observation, observation.timed, order).tables()
 
 
@@ -243,7 +237,7 @@ class _Maker:
         if observation.step.link:
             self._begun = self._first_uses()
 
-    def tables(self) -> PeriodTables:
+    def tables(self) -> tuple[PeriodTable, PeriodTable]:
         """Of all periods."""
         steps, most = self._observation.steps, self._step.most_neighbours
         lives, parts = self._lives()
@@ -257,7 +251,7 @@ class _Maker:
             release(lives)
             extras.append(found[:, 1:])
             extra_ends[first + 1 : last + 1] = np.bincount(found[:, 0] - first, minlength=last - first)
-        return PeriodTables(events.array(), np.cumsum(event_ends), extras.array(), np.cumsum(extra_ends))
+        return PeriodTable(events.array(), np.cumsum(event_ends)), PeriodTable(extras.array(), np.cumsum(extra_ends))
 
     def _blocks(self) -> Iterator[tuple[int, int]]:
         numbers = 4 * (4 + 2 * self._step.most_neighbours) * self._step.agents
@@ -292,7 +286,7 @@ class _Maker:
         return begun
 
     def _events(self, first: int, last: int) -> IntArray:
-        """Rows of the period and of ``PeriodTables.events``."""
+        """Rows of the period and of its events."""
         k, i = self._order.events(first, last)
         by = np.argsort(self._order.position[k, i])
         k, i = k[by], i[by]
@@ -357,7 +351,7 @@ class _Maker:
             yield np.column_stack([entry, np.arange(begin, end), first, last])
 
     def _stacked(self, lives: AnyArray, parts: list[tuple[int, int, slice]], first: int, last: int) -> IntArray:
-        """Rows of the sampling time and of ``PeriodTables.extras``, each once, sorted."""
+        """Rows of the sampling time and of what is stacked there, each once, sorted."""
         chosen = [lives[rows].astype(np.int64) for low, high, rows in parts if low < last and high >= first]
         entry, step, begin, end = np.concatenate([np.empty((0, 4), np.int64), *chosen]).T
         at, which = spread(np.maximum(begin, first), np.minimum(end, last - 1))

@@ -102,7 +102,7 @@ class EvidenceSums:
     ) -> tuple[RunningSums, dict[str, FloatArray]]:
         """Add the next steps first..last-1: the sums and the evidence of the diagnostics after each analysis."""
         # ``received`` in the steps, and their residuals (b, m, R), where these are known.
-        analyses = analyses or Analyses.at_the_end(last - first)
+        analyses = analyses or Analyses(np.array([last - first]))
         # One analysis needs no copies of what may be large.
         parts = self.total if analyses.count == 1 else self._zeros(analyses.count)
         found: dict[str, FloatArray] = {}
@@ -149,14 +149,14 @@ class EvidenceSums:
     ) -> None:
         """Add what was published minus the states (b, m, R)."""
         if self._noise.broadcast:
-            parts, analyses = parts or self.total, analyses or Analyses.at_the_end(len(added))
+            parts, analyses = parts or self.total, analyses or Analyses(np.array([len(added)]))
             parts.broadcast_samples += analyses.lengths * added.shape[2]
             parts.broadcast_squares += analyses.sums((added**2).sum(axis=2)) / self._noise.broadcast**2
 
     def add_received(self, reception: ReceivedValues, e: FloatArray, lost: BoolArray | None, largest: float) -> None:
         """Add steps, in any order: residuals (b, m, R), lost messages (b, m, D), and size of the ``largest`` state."""
         # Of a step with an infinite ``link_variance``, the agent is left out.
-        analyses = Analyses.at_the_end(len(e))
+        analyses = Analyses(np.array([len(e)]))
         scale = self._scales(self.total, analyses, reception, e, largest)
         self._add_received(self.total, analyses, reception, e / scale[:, :, None], scale, lost)
 

@@ -233,7 +233,7 @@ class NoiseOverTime(Diagnostic):
         window, lag = self._window(), self._lags.clearest()
         found = [window] if window else []
         if lag:
-            found.append(lag.finding(self.agent(lag.column), lag.log_p))
+            found.append(replace(lag, agent=self.agent(lag.agent or 0)))
         if not found:
             return None
         best = min(found, key=lambda one: one.log_p)

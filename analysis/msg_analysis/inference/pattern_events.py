@@ -51,16 +51,14 @@ class Periods:
     def __init__(self, observation: Observation, order: EventOrder) -> None:
         self._step = step = observation.step
         self._observation, self._newest = observation, order.newest
-        self._tables = period_tables(observation, order)
+        self._events, self._extras = period_tables(observation, order)
         self._numbers = Entries(step)
         self._shared = self._numbers.shared
         self._laws: dict[tuple[int, int], _Law] = {}  # by graph and agent
         self._cache: dict[bytes, Period] = {}
         self._cached, self._most_cached = 0, CACHED_BLOCKS * observation.block_numbers
         self.steps = observation.steps
-        self.largest = step.agents + int(
-            np.diff(self._tables.extra_ends).max(initial=0)
-        )  # entries of the largest stack
+        self.largest = step.agents + int(np.diff(self._extras.ends).max(initial=0))  # entries of the largest stack
 
     @property
     def agents(self) -> int:
@@ -69,12 +67,12 @@ class Periods:
 
     def entries(self, number: int) -> int:
         """Entries of the stack at sampling time ``number``, from 0."""
-        return self._step.agents + len(self._tables.of_extras(number))
+        return self._step.agents + len(self._extras[number])
 
     def start(self, moment: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(S, S) each, of the stack at the start: without noise, from that of the states (m, m); of noise."""
         m = self._step.agents
-        entries = np.concatenate([np.arange(m), self._tables.of_extras(0)[:, 0]])
+        entries = np.concatenate([np.arange(m), self._extras[0][:, 0]])
         owners = self._numbers.owners[entries]
         noise = np.diag(np.where(entries >= 2 * m, self._step.broadcast**2, 0.0))
         return moment[np.ix_(owners, owners)], noise
@@ -86,7 +84,7 @@ class Periods:
         if self._shared.any():
             return None
         step, m, observation = self._step, self._step.agents, self._observation
-        extra = self._tables.of_extras(number)
+        extra = self._extras[number]
         entries = np.concatenate([np.arange(m), extra[:, 0]])
         steps = self._newest[number, self._numbers.owners[entries]]
         steps[m:] += extra[:, 1]
@@ -107,8 +105,8 @@ class Periods:
 
     def __getitem__(self, number: int) -> Period:
         """The period that ends at sampling time ``number`` (1..N-1)."""
-        events = self._tables.of_events(number)
-        before, after = self._tables.of_extras(number - 1), self._tables.of_extras(number)
+        events = self._events[number]
+        before, after = self._extras[number - 1], self._extras[number]
         key = b"|".join((events.tobytes(), before.tobytes(), after.tobytes()))
         if key not in self._cache:
             found = self._compile(events, before, after)
@@ -121,7 +119,7 @@ class Periods:
 
     def release(self) -> None:
         """Give the memory of a long run back to the system: after every block of periods."""
-        for array in (self._tables.events, self._tables.extras, self._newest):
+        for array in (self._events.rows, self._extras.rows, self._newest):
             release(array)
         self._observation.release()
 

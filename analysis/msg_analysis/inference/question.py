@@ -18,7 +18,7 @@ import numpy as np
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import candidates
-from msg_analysis.inference.candidates import Cause, CauseKind, Parameters, Selected, numbers_text, select
+from msg_analysis.inference.candidates import Cause, Parameters, Selected, numbers_text, select
 from msg_analysis.inference.e_values import Analyses
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.received_values import ReceivedValues
@@ -323,7 +323,7 @@ class Diagnostic(Question, ABC):
 
     # While a run goes on, none is asked: all together take as much time as all other questions.
 
-    kind: ClassVar[CauseKind]  # of its cause
+    kind: ClassVar[str]  # of its cause
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)

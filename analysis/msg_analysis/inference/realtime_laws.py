@@ -190,7 +190,7 @@ SUPPORT = {True: "supported", False: "not supported", None: "not decided"}
 
 
 @dataclass(frozen=True, slots=True)
-class Law:
+class CheckedLaw:
     """A law next to the log."""
 
     system_error: Estimate  # measured, and predicted by this law
@@ -202,9 +202,9 @@ class Law:
 class Laws:
     """The laws of a run in real time."""
 
-    pattern: Law  # given the values and graphs that the agents logged as used; exact for any timing
-    sequential: Law  # no step is late, every value is received at once
-    continuous: Law  # the paper's
+    pattern: CheckedLaw  # given the values and graphs that the agents logged as used; exact for any timing
+    sequential: CheckedLaw  # no step is late, every value is received at once
+    continuous: CheckedLaw  # the paper's
 
     @property
     def measured_against(self) -> Literal["pattern", "sequential"]:
@@ -241,7 +241,7 @@ def measure_laws(observation: Observation, order: EventOrder, timing: Timing, le
         effect = timing_effect(observation, means)
     except PatternUnavailableError as reason:
         means = sequential
-        pattern = Law(Estimate(error.measured), None, f"not available: {reason}")
+        pattern = CheckedLaw(Estimate(error.measured), None, f"not available: {reason}")
     late = timing.missed_share > MAX_MISSED
     # Where agents keep values from step to step, the sequential law has no standard error of its own.
     untested = p is None and observation.prediction.system.readout is not None and pattern.supported
@@ -249,15 +249,15 @@ def measure_laws(observation: Observation, order: EventOrder, timing: Timing, le
     return means, Laws(pattern, law, _continuous(observation, error, level, late))
 
 
-def _pattern(observation: Observation, means: TimeMeans, level: float) -> Law:
+def _pattern(observation: Observation, means: TimeMeans, level: float) -> CheckedLaw:
     error, p = _least(observation, means)
     if p is None:
-        return Law(error, None, "without noise the errors cannot be tested")
+        return CheckedLaw(error, None, "without noise the errors cannot be tested")
     logged = "the prediction for the values and graphs that the agents logged"
     if p >= level:
-        return Law(error, True, f"the errors agree with {logged}")
+        return CheckedLaw(error, True, f"the errors agree with {logged}")
     why = "this law holds for any timing, so an agent did not follow its law, or its log is wrong"
-    return Law(error, False, f"the errors differ from {logged} ({_tested(error, p)}); {why}")
+    return CheckedLaw(error, False, f"the errors differ from {logged} ({_tested(error, p)}); {why}")
 
 
 def _deviations(timing: Timing) -> list[str]:
@@ -274,7 +274,7 @@ def _deviations(timing: Timing) -> list[str]:
 
 def _sequential(
     error: Estimate, p: float | None, level: float, deviations: list[str], effect: float | None, late: bool
-) -> Law:
+) -> CheckedLaw:
     why = "assumes that every step is on time and every message arrives at once"
     if not deviations:
         why += ", as in this log"
@@ -284,28 +284,28 @@ def _sequential(
         if effect is not None:
             why += f", which changes the system error by {_change(effect)}"
     if p is None:
-        return Law(error, None, why)
+        return CheckedLaw(error, None, why)
     if p < level:
-        return Law(error, False, f"{why}; the measured errors differ ({_tested(error, p)})")
+        return CheckedLaw(error, False, f"{why}; the measured errors differ ({_tested(error, p)})")
     if late:
-        return Law(error, False, why)
+        return CheckedLaw(error, False, why)
     if not deviations or (effect is not None and abs(effect) <= MAX_EFFECT):
-        return Law(error, True, why)
-    return Law(error, None, f"{why}; the run is too short to show a difference")
+        return CheckedLaw(error, True, why)
+    return CheckedLaw(error, None, f"{why}; the run is too short to show a difference")
 
 
-def _continuous(observation: Observation, sequential: Estimate, level: float, late: bool) -> Law:
+def _continuous(observation: Observation, sequential: Estimate, level: float, late: bool) -> CheckedLaw:
     """With the standard error of the sequential law, from which that of the continuous law would hardly differ."""
     law, experiment = observation.prediction.continuous_moments, observation.prediction.experiment
     if law is None:
-        return Law(Estimate(sequential.measured), None, "not available for this experiment")
+        return CheckedLaw(Estimate(sequential.measured), None, "not available for this experiment")
     predicted, untested = law.system_error, Estimate(sequential.measured, law.system_error)
     if sequential.standard_error is None:
-        return Law(untested, None, "its errors have no standard error here")
+        return CheckedLaw(untested, None, "its errors have no standard error here")
     if not sequential.standard_error or sequential.measured is None or not predicted:
-        return Law(untested, None, "without noise the errors cannot be tested")
+        return CheckedLaw(untested, None, "without noise the errors cannot be tested")
     if experiment.run.start != "stationary":
-        return Law(untested, None, "only its steady state is predicted, and the run did not start there")
+        return CheckedLaw(untested, None, "only its steady state is predicted, and the run did not start there")
     z = (sequential.measured - predicted) / sequential.standard_error
     p = float(two_sided(z))
     error = Estimate(sequential.measured, predicted, sequential.standard_error, z, p)
@@ -315,12 +315,12 @@ def _continuous(observation: Observation, sequential: Estimate, level: float, la
         f"system error by {_change(effect)}"
     )
     if p < level:
-        return Law(error, False, f"{why}; the measured system error differs ({_z(error)})")
+        return CheckedLaw(error, False, f"{why}; the measured system error differs ({_z(error)})")
     if late:
-        return Law(error, False, f"{why}, and that deadlines were missed")
+        return CheckedLaw(error, False, f"{why}, and that deadlines were missed")
     if abs(effect) <= MAX_EFFECT:
-        return Law(error, True, why)
-    return Law(error, None, f"{why}; the run is too short to show a difference")
+        return CheckedLaw(error, True, why)
+    return CheckedLaw(error, None, f"{why}; the run is too short to show a difference")
 
 
 def _least(observation: Observation, means: TimeMeans) -> tuple[Estimate, float | None]:

@@ -76,7 +76,7 @@ class ResidualSums:
         self.quiet = self.largest = 0.0  # largest |e| in directions without noise; largest |x|
         self._directions = [noise_directions(matrix) for matrix in self.noises]
         # Graphs may differ in the number of noisy directions; the strongest ones that all graphs have are iid N(0, I).
-        self._whiteness = Whiteness(min(len(whitener) for whitener, _ in self._directions))
+        self._whiteness = WhitenessSums(min(len(whitener) for whitener, _ in self._directions))
         self._repeated = RepeatedNoise.of(observation)
         # False where residuals depend on each other in a way that is not followed here.
         self.independent = self._repeated is None or not _correlated(step)
@@ -241,7 +241,7 @@ def noise_directions(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
     return (vectors[:, :rank] / np.sqrt(values[:rank])).T, vectors[:, rank:]
 
 
-class Whiteness:
+class WhitenessSums:
     """Portmanteau test of iid N(0, I) vectors of length r: lags 1..LAGS, and lag 0 between replicas.
 
     The sum of squared sample correlations, each over its variance under the null hypothesis, is chi-square with LAGS
@@ -275,7 +275,7 @@ class Whiteness:
             self._counts[lag - 1] += len(late) * self._replicas
         self._tail = joined[-LAGS:]
 
-    def merge(self, other: Whiteness) -> None:
+    def merge(self, other: WhitenessSums) -> None:
         """Add the sums of another run with another seed; no lags are counted across runs."""
         add_sums(self, other, "_products", "_counts", "_squares", "_pairs", "_steps")
 

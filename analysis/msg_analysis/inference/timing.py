@@ -83,20 +83,11 @@ def _of_ranks(
 BINS = 60
 
 
-@dataclass(frozen=True, slots=True)
-class Quantiles:
-    """Quantiles of a measure; None where there was nothing to measure."""
-
-    p50: float | None
-    p95: float | None
-    p99: float | None
-    max: float | None
-
-    @classmethod
-    def of(cls, values: Pieces) -> Quantiles:
-        """Of all numbers."""
-        found = quantiles(values, (0.5, 0.95, 0.99, 1.0))
-        return cls(*found) if found else cls(None, None, None, None)
+def shown_quantiles(pieces: Pieces) -> dict[str, float | None]:
+    """Some of all numbers; None where there are none."""
+    names, shares = ("p50", "p95", "p99", "max"), (0.5, 0.95, 0.99, 1.0)
+    found = quantiles(pieces, shares)
+    return dict(zip(names, found, strict=True)) if found else dict.fromkeys(names)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,12 +95,12 @@ class Timing:
     """Timing of a run in real time, in ms of the agents' clock: simulated time over the speed of the run."""
 
     period_ms: float  # nominal time between two steps of an agent
-    lateness_ms: Quantiles  # of a step after it was due
+    lateness_ms: dict[str, float | None]  # of a step after it was due
     steps: int  # of all agents
     missed: int  # steps made more than a period after they were due
-    jitter_ms: Quantiles  # |time between two successive steps of an agent - period|
-    staleness_ms: Quantiles  # age of the values at the time of use
-    staleness_steps: Quantiles  # step of the new state - step of the value; 0 or 1 with ideal timers
+    jitter_ms: dict[str, float | None]  # |time between two successive steps of an agent - period|
+    staleness_ms: dict[str, float | None]  # age of the values at the time of use
+    staleness_steps: dict[str, float | None]  # step of the new state - step of the value; 0 or 1 with ideal timers
     uses: int  # neighbours' values that steps needed, those never received or lost included
     ideal_uses: int  # uses of the value that ideal timers would have used, the own one for a lost one included
     never_heard: int  # uses in which nothing had been received yet of the neighbour
@@ -166,12 +157,12 @@ def measure_timing(observation: Observation) -> Timing:
     steps, m = observation.steps, observation.step.agents
     return Timing(
         period_ms=log.period * log.milliseconds,
-        lateness_ms=Quantiles.of(log.pieces(log.lateness)),
+        lateness_ms=shown_quantiles(log.pieces(log.lateness)),
         steps=steps * m,
         missed=missed,
-        jitter_ms=Quantiles.of(log.pieces(log.jitter)),
-        staleness_ms=Quantiles.of(log.pieces(log.ages)),
-        staleness_steps=Quantiles.of(log.pieces(log.ages_in_steps)),
+        jitter_ms=shown_quantiles(log.pieces(log.jitter)),
+        staleness_ms=shown_quantiles(log.pieces(log.ages)),
+        staleness_steps=shown_quantiles(log.pieces(log.ages_in_steps)),
         uses=uses,
         ideal_uses=ideal_uses,
         never_heard=never_heard,

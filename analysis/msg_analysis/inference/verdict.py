@@ -29,7 +29,6 @@ from msg_analysis.inference.time_means import TimeMeans, time_means
 from msg_analysis.inference.timing import Timing, measure_timing
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
-from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.prediction import Prediction, predict
 
 ANALYSES = 20, 80  # at the evidence over time, in short and in long runs: each takes as long as some hundred steps
@@ -186,8 +185,13 @@ def evaluate(
 ) -> Comparison:
     """The verdict on the evidence of one run, or of several, of which ``trajectory`` has the completeness."""
     means, lockstep = evidence.means, prediction.experiment.run.pace == "lockstep"
-    system_error, node_errors = _over_all_paths(means, prediction.system)
-    covariance = _covariance(evidence, prediction.system)
+    system_error, node_errors = estimates(means, prediction.system)
+    if not means.long_enough:  # too short for standard errors over all paths of the graphs
+        system_error, node_errors = system_error.without_error(), [node.without_error() for node in node_errors]
+    covariance = covariance_test(means, prediction.system)
+    if evidence.given:  # tested given the path
+        tested = covariance_test(evidence.given, prediction.system)
+        covariance = replace(tested, measured=covariance.measured, predicted=covariance.predicted)
     law = evidence.tested
     tested_error, tested_nodes = estimates(law, prediction.system) if law else (None, [])
     switching = evidence.transitions.test(prediction.step.transition)
@@ -247,21 +251,6 @@ def _any_time(
         wanted = record.until.precision * prediction.emulated.system_error
         planned = min(planned, steps_to_half_width(error.variance, wanted))
     return any_time_evidence(evidence.watched, level, families, variance, evidence.steps, planned)
-
-
-def _over_all_paths(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Estimate]]:
-    """The system error and the node errors; without standard errors where the run is too short for these."""
-    error, nodes = estimates(means, system)
-    if means.long_enough:
-        return error, nodes
-    return error.without_error(), [node.without_error() for node in nodes]
-
-
-def _covariance(evidence: Evidence, system: JumpSystem) -> CovarianceTest:
-    """The second moments and their expectation over all paths, tested given the path."""
-    shown = covariance_test(evidence.means, system)
-    tested = covariance_test(evidence.given, system) if evidence.given else shown
-    return replace(tested, measured=shown.measured, predicted=shown.predicted)
 
 
 def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:

@@ -89,7 +89,7 @@ def test_the_evidence_of_windows_is_their_mean(seen: int) -> None:
     evidence = WindowEvidence(windows, 1)
     ended = windows.add(np.zeros((seen, 1)))
     if seen:
-        evidence.add(ended, (logs[ended.first] / (ended.level + 1))[:, None], Analyses.at_the_end(seen))
+        evidence.add(ended, (logs[ended.first] / (ended.level + 1))[:, None], Analyses(np.array([seen])))
     levels = [
         [
             np.exp(logs[first] / (level + 1)) if first + 2**level <= seen else float(first >= seen)
@@ -125,7 +125,7 @@ def sojourns(transition: list[list[float]], steps: int) -> HoldingTimes:
 
 def count(sums: HoldingTimes, graphs: np.ndarray) -> None:
     """Add steps with these graphs, the last one being that of the next step."""
-    sums.add(SimpleNamespace(graphs=graphs, analyses=Analyses.at_the_end(len(graphs))))  # type: ignore[arg-type]
+    sums.add(SimpleNamespace(graphs=graphs, analyses=Analyses(np.array([len(graphs)]))))  # type: ignore[arg-type]
 
 
 def made(step: StepModel, steps: int, replicas: int, noisy: np.ndarray) -> Law:
@@ -250,7 +250,7 @@ def test_noise_over_time_by_lags(agent: int | None) -> None:
     sums = NoiseOverTime(made(observation.step, 1200, 2, np.ones(5, dtype=bool)))
     for first in range(0, 1200, 37):
         part = SimpleNamespace(
-            first=first, white=white[first : first + 37], analyses=Analyses.at_the_end(min(37, 1200 - first))
+            first=first, white=white[first : first + 37], analyses=Analyses(np.array([min(37, 1200 - first)]))
         )
         sums.add(part)  # type: ignore[arg-type]
     squares = (white**2).sum(axis=2)
