@@ -6,7 +6,6 @@ import importlib
 import json
 import re
 import sys
-from bisect import bisect_right
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, TypeVar
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiments import Experiment, Observation, compare, five, observed, predict, simulate
+from experiments import Experiment, Observation, chain_path, compare, five, observed, predict, simulate
 from msg_analysis.inference.dependence import ConstantState, LongLags
 from msg_analysis.inference.e_values import Analyses, WindowEvidence, Windows, variance_evidence
 from msg_analysis.inference.evidence_sums import EvidenceSums
@@ -106,14 +105,6 @@ def test_the_evidence_of_windows_is_their_mean(seen: int) -> None:
     assert twice.logarithms()[0] == pytest.approx(2.0 * alone)
 
 
-def chain(transition: list[list[float]], steps: int, seed: int) -> np.ndarray:
-    random, up_to = np.random.default_rng(seed).random(steps), np.cumsum(transition, axis=1)[:, :-1].tolist()
-    path = [0]
-    for chance in random[1:].tolist():
-        path.append(bisect_right(up_to[path[-1]], chance))
-    return np.array(path)
-
-
 THREE = [[0.8, 0.1, 0.1], [0.3, 0.5, 0.2], [0.2, 0.2, 0.6]]
 SLOW = [[0.95, 0.05], [0.05, 0.95]]
 
@@ -154,7 +145,7 @@ def law_of(transition: str, steps: int) -> Law:
 
 
 def test_sojourns_are_counted_as_by_a_loop() -> None:
-    path = chain(SLOW, 900, 2)
+    path = chain_path(SLOW, 900, 2)
     sums = sojourns(SLOW, 900)
     for first in range(0, 900, 50):
         count(sums, path[first : first + 51])
@@ -170,7 +161,7 @@ def test_sojourns_are_counted_as_by_a_loop() -> None:
 
 
 def test_the_statistic_of_sojourns_is_that_of_a_table() -> None:
-    path = chain(SLOW, 20_000, 4)
+    path = chain_path(SLOW, 20_000, 4)
     sums = sojourns(SLOW, 20_000)
     count(sums, path)
     finding = sums.finding()
@@ -185,7 +176,7 @@ def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], s
     p = []
     for seed in range(200):
         sums = sojourns(transition, steps)
-        count(sums, chain(transition, steps, seed))
+        count(sums, chain_path(transition, steps, seed))
         finding = sums.finding()
         p.append(np.exp(finding.log_p))
     assert stats.kstest(p, "uniform").pvalue > 1e-3
@@ -193,7 +184,7 @@ def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], s
 
 def test_few_sojourns_are_not_tested() -> None:
     sums = sojourns(SLOW, 300)
-    count(sums, chain(SLOW, 300, 1))
+    count(sums, chain_path(SLOW, 300, 1))
     assert sums.finding() is None
 
 
@@ -474,4 +465,5 @@ def test_the_stretch_is_the_right_one(departures) -> None:
     states = result.trajectory.states[:, 2]
     still = np.flatnonzero((states[1:] == states[:-1]).all(axis=1)) + 1
     assert result.causes[0].steps == (still[0], still[-1])
+    assert result.causes[0].estimate == pytest.approx(20 / (len(states) - 1))
     assert len(still) == 20
