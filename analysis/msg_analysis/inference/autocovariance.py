@@ -214,11 +214,7 @@ def _moments(which: IntArray, matrices: FloatArray, noise: FloatArray, start: Fl
 
 
 def _covariance(
-    kinds: tuple[IntArray, FloatArray, FloatArray],
-    y: FloatArray,
-    forms: FloatArray,
-    felt: FloatArray,
-    left: FloatArray,
+    kinds: tuple[IntArray, FloatArray, FloatArray], y: FloatArray, forms: FloatArray, felt: FloatArray, left: FloatArray
 ) -> FloatArray:
     """(L, L): sum of Cov(D_j | past), from H (``forms``), what enters a_j (``felt``) and leaves it (``left``)."""
     # The first two are overwritten. In H (N + 1, d, L, d) the lags are an inner axis: one product is for all of them.

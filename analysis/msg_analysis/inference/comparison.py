@@ -333,7 +333,13 @@ class Comparison:
 
     def to_json(self) -> dict[str, Any]:
         """The document of ``msg-analysis compare --json``; every number is finite or None."""
-        record = self.trajectory.record
+        record, until = self.trajectory.record, None
+        if record.until is not None:
+            until = {
+                "rule": str(record.until),
+                "planned_steps": record.planned_steps,
+                "ended_early": record.planned is not None,
+            }
         document = {
             "verdict": self.verdict,
             "unpredicted": self.unpredicted,
@@ -345,7 +351,7 @@ class Comparison:
             "leaders": (np.flatnonzero(record.experiment.leader_gains) + 1).tolist(),
             "seed": None if self.pool else record.experiment.run.seed,
             "level": self.level,
-            "until": _until(record),
+            "until": until,
             "completeness": asdict(self.trajectory.completeness) | {"stretch": self.trajectory.stretch},
             "steps": self.steps,
             "simulated_time": self.steps * record.experiment.step_length,
@@ -371,14 +377,6 @@ class Comparison:
             "trust": self.trust,
         }
         return {key: _plain(value) for key, value in document.items()}
-
-
-def _until(record: RunRecord) -> dict[str, Any] | None:
-    """Of a run that was to end early."""
-    if record.until is None:
-        return None
-    early = record.planned is not None
-    return {"rule": str(record.until), "planned_steps": record.planned_steps, "ended_early": early}
 
 
 def _plain(value: Any) -> Any:

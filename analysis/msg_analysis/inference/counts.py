@@ -1,12 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Counted transitions of the graphs and counted losses of messages, and their tests (docs/statistics.md).
-
-Given the graphs, the losses of a link are independent, or with ``noise.burst`` a Markov chain with two states. In
-lockstep the log says of every message of an active link whether it was lost. In real time it says so of every use: a
-message that is used again counts again, which leaves the share of the lost ones right, but not its variance.
-"""
+"""Counted transitions of the graphs and counted losses of messages, and their tests (docs/statistics.md)."""
 
 from __future__ import annotations
 
@@ -58,13 +53,7 @@ class Transitions:
         return Transitions(self.counts + other.counts, self.paths + other.paths)
 
     def test(self, transition: FloatArray) -> SwitchingTest:
-        """Test the paths of the graph against P (n, n), by the likelihood-ratio statistic G.
-
-        Its law is chi-square when every possible transition is expected often enough; else it is simulated: paths of
-        the same length from the same first graph (fixed seed), with a gamma fit where none of them is as extreme. With
-        two graphs and 6 expected switches each way, 2.3 % of Pearson's p-values would be below 0.01; of these, 0.9 %
-        (20 000 paths).
-        """
+        """Likelihood-ratio test of the paths against P (n, n): chi-square, or simulated where switches are rare."""
         counts = self.counts
         visits = counts.sum(axis=1)
         expected = visits[:, None] * transition
@@ -75,6 +64,7 @@ class Transitions:
         if dof == 0:
             return SwitchingTest(counts, expected, None)
         # Decided by the expectation of the chain, not by the data: a choice made from the data would be a bias.
+        # With 6 expected switches each way, 2.3 % of Pearson's p-values are below 0.01, and 0.9 % of these.
         usual = counts.sum() * stationary_law(transition)[:, None] * transition
         if usual[transition > 0.0].min() >= MIN_EXPECTED_TRANSITIONS:
             chi2 = float(likelihood_ratio(counts, transition))
@@ -151,13 +141,7 @@ class LossTest:
 
 
 def loss_test(observation: Observation | Measurement) -> LossTest | None:
-    """Test that messages are lost with the probability of their link, as the law says; None without (logged) loss.
-
-    The statistic adds one chi-square per link, in bursts one for the messages after a lost one and one for those after
-    another, and two for products of (lost - expected) in standard errors: of messages of one link in successive steps,
-    and of pairs of messages in one step. What has too few messages for a chi-square law is pooled, with all of the same
-    probability, and tested by the exact binomial law; products that are too rare are left out.
-    """
+    """Test that messages are lost with the probability of their link, as the law says; None without (logged) loss."""
     tally = LossTally.of(observation)
     return tally.test() if tally else None
 
@@ -325,6 +309,7 @@ def _block(
 
 def _uses(observation: Observation, links: int, first: int, last: int) -> tuple[BoolArray, BoolArray, BoolArray]:
     """The same of a run in real time."""
+    # A message that is used again counts again: the share of the lost ones stays right, but not its variance.
     step, timers = observation.step, observation.timed
     tables, agents = neighbour_tables(step), np.arange(step.agents)
     graphs, used = timers.graphs[first:last], timers.used[first:last]

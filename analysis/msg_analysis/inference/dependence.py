@@ -237,13 +237,7 @@ EPSILON = float(np.finfo(np.float64).eps)
 
 
 class ConstantState(Diagnostic):
-    """Steps in which no replica of an agent moves.
-
-    The density of a normal number is below 0.4 over its standard deviation, so the probability q of such a step is at
-    most that of hitting an interval of a few roundings, for every replica. The mean of 1 / q over the steps that stood
-    still, 0 for the others and 1 for those to come, is evidence; half of the whole always counts 1. Its inverse is the
-    p of the test (Markov).
-    """
+    """Steps in which no replica of an agent moves; the less probable, the more evidence, of which 1 / it is the p."""
 
     name = "residuals: constant state"
     meaning = "the state of an agent with noise does not change for some steps"
@@ -264,6 +258,7 @@ class ConstantState(Diagnostic):
         before, after = block.reception.states, block.after
         still: BoolArray = (after[:, self.agents] == before[:, self.agents]).all(axis=2)
         at, which = np.nonzero(still)
+        # At most that of all replicas hitting an interval of a few roundings: a normal density is below 0.4 / sd.
         size = np.spacing(np.abs(before[at]).max(axis=1))  # (s, R)
         chance = ROUNDINGS * (size / block.scale[at, self.agents[which]][:, None] + EPSILON)
         seen, logarithms = analyses.lengths * len(self.agents), -np.log(np.minimum(chance, 1.0)).sum(axis=1)
@@ -292,14 +287,14 @@ class ConstantState(Diagnostic):
         """The longest stretch."""
         if not len(self.agents):
             return None
-        log_p, longest = min(0.0, -self._evidence.logarithm()), self._longest
+        log_p, longest = min(0.0, -float(self._evidence.logarithms()[0, 0])), self._longest
         if not longest.of:
             return Finding(log_p)
         return Finding(log_p, agent=int(longest.of[0]), place=longest.place, estimate=longest.value, expected=0.0)
 
     def logarithms(self) -> FloatArray:
         """(1, 1)."""
-        return np.array([[self._evidence.logarithm()]]) if len(self.agents) else np.empty((0, 1))
+        return self._evidence.logarithms()
 
     @classmethod
     def words(cls, found: Finding, names: Sequence[str]) -> str:

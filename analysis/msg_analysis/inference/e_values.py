@@ -290,11 +290,13 @@ class EventEvidence:
 
     def merge(self, other: EventEvidence) -> None:
         """With that of other runs."""
-        self._others += other.logarithm()
+        self._others += float(other.logarithms().sum())
 
-    def logarithm(self) -> float:
-        """Of the evidence so far."""
-        return float(self._after(np.array(self._seen), np.array(self._ended)))
+    def logarithms(self) -> FloatArray:
+        """(1, 1) of the evidence so far; (0, 1) where there is no event."""
+        if not self.planned:
+            return np.empty((0, 1))
+        return self._after(np.array([[self._seen]]), np.array([[self._ended]]))
 
     def _after(self, seen: IntArray, ended: FloatArray) -> FloatArray:
         """Of so many events, and the log of the sum over them."""

@@ -201,10 +201,7 @@ def rank_agents(means: TimeMeans, level: float) -> Ranking | None:
 def rank_estimates(
     measured: FloatArray, covariance: FloatArray, predicted: FloatArray | None, level: float
 ) -> Ranking | None:
-    """Order estimates (q,) with covariance (q, q), and distinguish pairs of them by z-tests, adjusted by Holm.
-
-    None where there is no pair, no noise, or more than ``MAX_RANKED_PAIRS``; ``predicted`` (q,): what they should be.
-    """
+    """Order estimates (q,), and distinguish pairs of them by z-tests (Holm); None without pairs or noise."""
     q = len(measured)
     first, second = np.triu_indices(q, 1)
     if not 0 < len(first) <= MAX_RANKED_PAIRS:

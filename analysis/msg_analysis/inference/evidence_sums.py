@@ -32,11 +32,7 @@ FARTHEST = 1e4
 
 
 class EvidenceSums:
-    """Sums for the evidence of all questions; with ``in_detail``, of the diagnostics, too.
-
-    Given its past and, with reception noise and in real time, what was received, each is exact; the system error only
-    in lockstep without noise or loss of messages.
-    """
+    """Sums for the evidence of all questions; with ``in_detail``, of the diagnostics, too."""
 
     def __init__(self, prediction: Prediction, replicas: int, *, in_detail: bool = False) -> None:
         experiment, step = prediction.experiment, prediction.step
@@ -59,6 +55,7 @@ class EvidenceSums:
         first, second = np.triu_indices(m, 1)
         paired = usable[first] & usable[second] & (len(first) <= MOST_PAIRS) & (not correlated)
         independent_losses = step.burst is None and not real_time
+        # Given its past and what was received, each sum is exact; the system error only where nothing is added or lost.
         self.error = ErrorMartingale.of(prediction, replicas) if self.plain else None
         self._law = law = Law(
             step=step,
@@ -77,20 +74,11 @@ class EvidenceSums:
         self.questions = {kind.name: kind(law) for kind in asked}
         self.diagnostics = [each for each in self.questions.values() if isinstance(each, Diagnostic)]
         self.total = self._zeros(1)
-
-    @property
-    def numbers_per_analysis(self) -> int:
-        """Of temporary arrays, of one interim analysis."""
-        m, n = self._step.agents, self._step.modes
-        lags = 10 * LAGS * (m + 1) if self.diagnostics else 0
-        return 8 * m**2 + n**2 + lags
-
-    @property
-    def numbers_per_step(self) -> int:
-        """Of temporary arrays, of one step."""
-        step, error = self._step, self.error
-        numbers = (4 + step.most_neighbours) * step.agents * self._law.replicas + step.agents**2
-        return numbers if error is None else max(numbers, error.numbers * (1 + len(error.rates)))
+        # Of temporary arrays: of one interim analysis, and of one step.
+        self.numbers_per_analysis = 8 * m**2 + step.modes**2 + (10 * LAGS * (m + 1) if self.diagnostics else 0)
+        numbers = (4 + step.most_neighbours) * m * replicas + m**2
+        error = self.error
+        self.numbers_per_step = max(numbers, error.numbers * (1 + len(error.rates))) if error else numbers
 
     def add(
         self,

@@ -90,11 +90,9 @@ class FaultPower:
         return min(float(n) / test.noncentrality if test.noncentrality > 0.0 else math.inf for n, test in each)
 
     def evidence_steps(self) -> float:
-        """Steps after which the evidence at any time is expected to pass: half of the runs stop before, about.
-
-        The mixed likelihood ratio of a coefficient with the noncentrality L is exp(L^2 / (2 (1 + L))) / sqrt(1 + L),
-        for a prior of the size of the fault.
-        """
+        """Steps after which the evidence at any time is expected to pass: half of the runs stop before, about."""
+        # The mixed likelihood ratio of a coefficient with the noncentrality L is exp(L^2 / (2 (1 + L))) / sqrt(1 + L),
+        # for a prior of the size of the fault.
         information = max(test.noncentrality for test in self.tests)
         if not information > 0.0 or math.isinf(self.log_price):
             return math.inf

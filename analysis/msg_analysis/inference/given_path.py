@@ -91,10 +91,7 @@ def _variance(means: TimeMeans, combination: FloatArray) -> float:
 
 
 def means_given_path(
-    observation: Observation,
-    *,
-    most_work: float = MAX_WORK,
-    most_numbers: int = MAX_NUMBERS,
+    observation: Observation, *, most_work: float = MAX_WORK, most_numbers: int = MAX_NUMBERS
 ) -> TimeMeans | None:
     """Time means of a run in lockstep given the path of the graphs; None where that is more than ``most_work``."""
     system, steps = observation.prediction.system, observation.steps
@@ -135,10 +132,7 @@ def _expected_sum(which: IntArray, matrices: FloatArray, noise: FloatArray, star
 
 
 def _backwards(
-    observation: Observation,
-    kinds: tuple[IntArray, FloatArray, FloatArray],
-    forms: FloatArray,
-    trace: FloatArray,
+    observation: Observation, kinds: tuple[IntArray, FloatArray, FloatArray], forms: FloatArray, trace: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Sum of packed y y^T (p,), sum of Cov(D | now) (q, q), and of every step the system error and its Var(D | now)."""
     which, matrices, noise = kinds

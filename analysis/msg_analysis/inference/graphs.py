@@ -117,10 +117,7 @@ MIN_EXPECTED = 15.0  # fewest steps with, and fewest without, a switch in a part
 class HoldingTimes(SummedDiagnostic):
     """Switches counted by graph and by the age of the holding time, in parts.
 
-    Given the past, a step ends its holding time with the probability 1 - P_gg. So every part is a binomial question of
-    its own, and the product of their evidence is evidence. The test is the likelihood ratio of one probability for each
-    part against a common one, whatever that is (rates have their own test): chi-square with parts - 1 degrees of
-    freedom for each graph. Parts with few expected switches are joined.
+    Likelihood ratio of one probability for each part against a common one, whatever that is: rates have their own test.
     """
 
     name = "holding times"
@@ -188,6 +185,7 @@ class HoldingTimes(SummedDiagnostic):
         """(..., G + 1, K): of each graph that is left, and of all, from counts (..., n, PARTS)."""
         if not len(self._left):
             return np.empty((*sums[0].shape[:-2], 0, 1))
+        # Given the past, every part is a binomial question of its own, so the product of their evidence is evidence.
         steps, left = (
             np.concatenate([each.reshape(*each.shape[:-1], -1, joined).sum(axis=-1) for joined in JOINED], axis=-1)
             for each in (counts[..., self._left, :] for counts in sums)
@@ -249,12 +247,7 @@ MOST_GRAPHS = 20  # of a law for which this is tested
 
 
 class SwappedGraphs(Diagnostic):
-    """Likelihood ratios of two graphs whose names are swapped, in windows of 1, 2, 4, ... steps, for every pair.
-
-    The product over the steps of a window is evidence against the law, and so is the mean over all windows of a run and
-    over the pairs; its inverse is the p of the test (Markov). Only in lockstep where all agents receive the states
-    themselves and have noise, independent of each other.
-    """
+    """Likelihood ratios of two graphs whose names are swapped, in windows of 1, 2, 4, ... steps, for every pair."""
 
     name = "residuals: swapped graphs"
     meaning = "two graphs have each other's name in the log"
@@ -274,6 +267,7 @@ class SwappedGraphs(Diagnostic):
         """The windows that end in the block."""
         if not len(self._pairs):
             return np.empty((block.analyses.count, 0, 1))
+        # The product over the steps of a window is evidence, so is the mean over windows and pairs; 1 / it is the p.
         logged, modes = _log_density(block.white, block.scale), block.reception.modes
         density = np.empty((len(logged), self._step.modes))
         for graph, deviation in enumerate(self._deviation):

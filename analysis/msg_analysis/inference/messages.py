@@ -110,11 +110,7 @@ MIN_SAMPLES = 100  # fewest steps of all replicas for the normal law of a score
 
 
 class StaleValues(SummedDiagnostic):
-    """Regression of the residuals on weight * (neighbour's previous value - the one that was used).
-
-    The coefficient is the share of stale values, expected 0. The test takes the clearest link, or all links together
-    where agents are independent, with half of the level each and the number of coefficients as a factor (Bonferroni).
-    """
+    """Regression of residuals on weight * (neighbour's previous value - the used one): the share of stale values."""
 
     name = "residuals: stale values"
     meaning = "agents use values that are one step older than the log says"

@@ -75,10 +75,7 @@ class Noise(Question):
 
 
 class NoiseByGraph(SummedDiagnostic):
-    """Squares of standardised residuals by graph and agent, and of all agents together where these are independent.
-
-    Each sum is chi-square; the test is two-sided, with the number of sums as a factor (Bonferroni).
-    """
+    """Squares of standardised residuals, chi-square, by graph and agent, and of all agents together."""
 
     name = "residuals: noise by graph"
     meaning = "the size of the noise is wrong under some graph"
@@ -135,8 +132,10 @@ class NoiseByGraph(SummedDiagnostic):
 
     @classmethod
     def words(cls, found: Finding, names: Sequence[str]) -> str:
-        """A variance in one graph."""
-        return _variance_words(found, names)
+        """A variance in one graph, or in some steps."""
+        when = found.place.words if found.place else f"in graph {names[found.graph or 0]}"
+        whose = agent_words(found.agent)
+        return f"the noise variance of {whose} is {found.numbers} times what the file says {when}"
 
 
 def _variance_finding(log_p: float, ratio: float, numbers: float, agent: int | None, **place: Any) -> Finding:
@@ -145,27 +144,12 @@ def _variance_finding(log_p: float, ratio: float, numbers: float, agent: int | N
     return Finding(log_p, agent, estimate=ratio, standard_error=error, expected=1.0, **place)
 
 
-def _variance_words(found: Finding, names: Sequence[str]) -> str:
-    """A noise variance in one graph, or in some steps."""
-    when = found.place.words if found.place else f"in graph {names[found.graph or 0]}"
-    whose = agent_words(found.agent)
-    return f"the noise variance of {whose} is {found.numbers} times what the file says {when}"
-
-
 SHARE = 0.1  # of the logarithm of the p-value
 LEVELS = 63  # lengths of windows, of any run
 
 
 class NoiseOverTime(Diagnostic):
-    """Squares of standardised residuals in windows of 1, 2, 4, ... steps, by agent and of all where independent.
-
-    The sum over a window is chi-square. The law of the largest and the smallest is bounded by the union over windows:
-    every length has the same share of the level, and within it every window and agent (weighted Bonferroni).
-
-    A variance that swings faster than windows can show, or that depends on itself, is found by the correlation of the
-    sums of single steps with those 1 to 100 steps before (McLeod and Li 1983), on normal scores, Phi^-1 of their
-    chi-square distribution function, which are exactly N(0, 1). Windows and lags have half of the level each.
-    """
+    """Squares of standardised residuals in windows of 1, 2, 4, ... steps, and their correlation with earlier ones."""
 
     name = "residuals: noise over time"
     meaning = "the size of the noise is wrong in a part of the run, or changes with time"
@@ -193,6 +177,7 @@ class NoiseOverTime(Diagnostic):
         if not self._columns:
             return np.empty((analyses.count, 0, 1))
         squares = self.columns((block.white[:, self.agents] ** 2).sum(axis=2))
+        # Of a variance that depends on itself (McLeod and Li 1983), on normal scores, which are exactly N(0, 1).
         lags = lag_evidence(*self._lags.add(normal_score(squares, self._numbers)[:, :, None], analyses))
         ended = self._windows.add(squares)
         self._keep(ended)
@@ -248,6 +233,7 @@ class NoiseOverTime(Diagnostic):
             return None
         candidates = []
         for level in lengths:
+            # Every length has the same share of the level, and within it every window and agent (weighted Bonferroni).
             share = math.log(2.0 * len(lengths) * float(counts[level]) * self._columns)
             for column, numbers in enumerate((self._numbers << level).tolist()):
                 largest, smallest = self._extreme[:, level, column].tolist()
@@ -274,7 +260,7 @@ class NoiseOverTime(Diagnostic):
     def words(cls, found: Finding, names: Sequence[str]) -> str:
         """A variance in some steps, or one that depends on its own past."""
         if found.span is None:
-            return _variance_words(found, names)
+            return NoiseByGraph.words(found, names)
         return (
             f"the size of the noise of {agent_words(found.agent)} has correlation {found.numbers} with its own "
             f"{found.span[0]} steps before, not 0: its variance changes in time"
@@ -295,12 +281,7 @@ LARGE = 4.0  # standard deviations; smaller residuals have the evidence 0
 
 
 class LargestResidual(Diagnostic):
-    """Every residual by itself, N(0, 1) after division by its standard deviation.
-
-    The test is that of the largest, with their number as a factor (Bonferroni). The evidence is the mean over all
-    residuals of a run of that of each one against a larger variance; those to come count 1. Half of the whole always
-    counts 1.
-    """
+    """Every residual by itself, N(0, 1) over its standard deviation; the test is that of the largest."""
 
     name = "residuals: largest"
     meaning = "a single step is much larger than the noise"
@@ -344,7 +325,7 @@ class LargestResidual(Diagnostic):
 
     def logarithms(self) -> FloatArray:
         """(1, 1)."""
-        return np.array([[self._evidence.logarithm()]]) if self._evidence.planned else np.empty((0, 1))
+        return self._evidence.logarithms()
 
     @classmethod
     def words(cls, found: Finding, names: Sequence[str]) -> str:

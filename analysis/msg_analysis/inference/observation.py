@@ -87,9 +87,11 @@ def transient_length(series: FloatArray) -> int:
     return BATCH * int(np.argmin(scores[: count // 2 + 1]))
 
 
-def _blocks(first: int, end: int, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
+def _blocks(
+    first: int, end: int, numbers_per_step: int, what: str, most: int = BLOCK_NUMBERS
+) -> Iterator[tuple[int, int]]:
     """Blocks of the steps first..end-1; other arguments as of ``Observation.blocks``."""
-    length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
+    length = max(1, most // max(1, numbers_per_step))
     for begin in range(first, end, length):
         tell(what, begin, end)
         yield begin, min(begin + length, end)
@@ -208,10 +210,8 @@ class Observation:
 
     def blocks(self, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
         """(first, last + 1) of blocks of steps with few temporary numbers; ``what`` is done, for those who watch."""
-        length = max(1, self.block_numbers // max(1, numbers_per_step))
-        for first in range(0, self.steps, length):
-            tell(what, first, self.steps)
-            yield first, min(first + length, self.steps)
+        for block in _blocks(0, self.steps, numbers_per_step, what, self.block_numbers):
+            yield block
             self.release()
 
     def release(self) -> None:

@@ -3,9 +3,7 @@
 
 """Errors of a network next to their prediction while it runs: the numbers of a comparison, one step at a time.
 
-Measured are time means with the standard errors of ``time_means``: of a complete run of up to ``EVERY_STEP`` agents,
-both give the same. Only sums are kept; a step takes O(m^2), and while the effect of a start that is not stationary
-lasts, O(n m^3). Incomplete steps are left out of both means.
+Only sums are kept; a step takes O(m^2), and while the effect of a start that is not stationary lasts, O(n m^3).
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray, IntArray
+from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import number_text
 from msg_analysis.inference.estimates import Estimate, beside
 from msg_analysis.inference.observation import bounded
@@ -87,11 +85,7 @@ class LiveReport:
 
 
 class LiveEstimate:
-    """The errors of a run next to their prediction, from the states as they arrive.
-
-    ``nodes`` asks for standard errors of the nodes, ``evidence`` for the evidence, which may need the messages.
-    InputError where there is no prediction (too large, unbounded).
-    """
+    """The errors of a run next to their prediction, from the states as they arrive; InputError without one."""
 
     def __init__(self, record: RunRecord, *, nodes: bool = True, evidence: bool = True) -> None:
         experiment = record.experiment
@@ -109,6 +103,8 @@ class LiveEstimate:
             else:
                 self._plain = RunningEvidence(prediction, experiment.run.replicas)
         self.evidence = self._received or self._plain
+        # Whether what the agents publish is needed, too, because it is not their states.
+        self.needs_published = self.log is not None and self.log.truth
         self.steps = StepCollector(
             experiment.agents,
             len(experiment.graph_list),
@@ -130,11 +126,6 @@ class LiveEstimate:
             self._note = "fourth moments are infinite, so that errors have no standard errors: compare the bag"
         elif prediction is not None and not self._errors.nodes_tested:
             self._note = "too many agents for intervals of the agent errors"
-
-    @property
-    def needs_published(self) -> bool:
-        """Whether what the agents publish is needed, too, because it is not their states."""
-        return self.log is not None and self.log.truth
 
     def end_at(self, step: int) -> None:
         """The run ends at this step, or has ended there: what was done after it is not a part of it."""
@@ -289,16 +280,15 @@ class _ErrorVariances:
 
     def add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
         """Arrays as in ``RunningErrors.add``, with deviations in place of states."""
-        for first in range(0, len(steps), self._length):
-            at = slice(first, first + self._length)
-            self._add(steps[at], modes[at], deviations[at], later[at])
-
-    def _add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
-        a = self._packed(deviations)
-        b = self._packed(later) if self.needs_later else a
-        sampled = steps % self._stride == 0
-        self._sampled += int(sampled.sum())
         self._count += len(steps)
+        for first in range(0, len(steps), self._length):
+            block = slice(first, first + self._length)
+            a = self._packed(deviations[block])
+            b = self._packed(later[block]) if self.needs_later else a
+            self._add(modes[block], a, b, steps[block] % self._stride == 0)
+
+    def _add(self, modes: IntArray, a: FloatArray, b: FloatArray, sampled: BoolArray) -> None:
+        self._sampled += int(sampled.sum())
         for mode in np.unique(modes).tolist():
             here = modes == mode
             self._totals[mode] += a[here].sum(axis=0)

@@ -3,10 +3,8 @@
 
 """Evidence against the law of a running network, and the interval of its system error that holds at all times at once.
 
-The sums of ``evidence_sums``; O(1) per step. Which steps are left out, because they were not seen whole, must not
-depend on what happened in them. With reception noise, with delay and in real time, the newest steps are stored until
-the values that were used in them are there. A value that is not there, because its step was not seen or is too old,
-leaves out the agent that used it: that depends on times and losses only, never on states. Memory is bounded.
+Which steps are left out, because they were not seen whole, must not depend on what happened in them. A received value
+that is not there, because its step was not seen or is too old, leaves out the agent that used it.
 """
 
 from __future__ import annotations
@@ -86,11 +84,8 @@ class EvidenceWatch:
         self.sums = EvidenceSums(prediction, replicas)
         self.count = 0  # steps that have been added
         self._crossed: int | None = None
-
-    @property
-    def variance(self) -> float | None:
-        """Of the martingale difference of the system error in a step, by which its interval is tuned."""
-        return self.sums.error.variance if self.sums.error is not None else None
+        # Of the martingale difference of the system error in a step, by which its interval is tuned.
+        self.variance = self.sums.error.variance if self.sums.error is not None else None
 
     def report(self, half_width: float | None) -> AnyTime:
         """The evidence now; ``half_width``: of the interval of the system error, which is passed on."""

@@ -155,11 +155,7 @@ class _Row:
 
 
 class StepCollector:
-    """Collects the states of m agents, in any order, into whole steps.
-
-    In lockstep a step is ready only with its successor, which says which graph was used. ``logged``: keep the messages,
-    too. ``truth``: a step is whole when what was published of its states is there, too.
-    """
+    """Collects the states of m agents, in any order, into whole steps; ``logged``: with their messages."""
 
     def __init__(
         self, agents: int, modes: int, last: int, *, lockstep: bool, logged: bool = False, truth: bool = False

@@ -57,13 +57,8 @@ class Periods:
         self._laws: dict[tuple[int, int], _Law] = {}  # by graph and agent
         self._cache: dict[bytes, Period] = {}
         self._cached, self._most_cached = 0, CACHED_BLOCKS * observation.block_numbers
-        self.steps = observation.steps
+        self.steps, self.agents = observation.steps, step.agents
         self.largest = step.agents + int(np.diff(self._extras.ends).max(initial=0))  # entries of the largest stack
-
-    @property
-    def agents(self) -> int:
-        """M."""
-        return self._step.agents
 
     def entries(self, number: int) -> int:
         """Entries of the stack at sampling time ``number``, from 0."""

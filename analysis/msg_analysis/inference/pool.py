@@ -66,12 +66,7 @@ def compare(*runs: Run | str | Path, level: float = 0.01) -> Comparison:
 
 
 def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> Comparison:
-    """Compare several runs of one experiment, by name and read one after the other, with its prediction.
-
-    Sums are added up over the runs, so that every step counts the same. A further test of the family asks whether the
-    runs are alike (Cochran's Q). No trajectory is kept. InputError: no run, different experiments, a run or seed that
-    is there twice, or no prediction.
-    """
+    """Compare several runs of one experiment, by name and read one after the other, with its prediction."""
     total: Evidence | None = None
     prediction: Prediction | None = None
     trajectory: Run | None = None

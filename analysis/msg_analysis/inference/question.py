@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -54,10 +54,6 @@ class Place:
     last: int
     run: int = 1  # of several runs, from 1 in the order of the comparison
 
-    def later(self, runs: int) -> Place:
-        """The same place with so many runs before it."""
-        return Place(self.first, self.last, self.run + runs)
-
     @property
     def words(self) -> str:
         """Such as "from step 10 to 12"."""
@@ -84,7 +80,8 @@ class Largest:
     def merge(self, other: Largest) -> None:
         """With that of other runs."""
         if other.value > self.value:
-            self.value, self.of, self.place = other.value, other.of, other.place.later(self.runs)
+            place = replace(other.place, run=other.place.run + self.runs)
+            self.value, self.of, self.place = other.value, other.of, place
         self.runs += other.runs
 
 

@@ -6,16 +6,10 @@
 Timing does not depend on the states. So given the log the states are linear in independent normal numbers, and replicas
 are independent. With z(K) the stack of ``pattern_events``,
 
-    z(K) = A_K z(K-1) + noise N_K,     M(K) = E[z z^T] = A_K M(K-1) A_K^T + N_K,     Y(K-1) = H + A_K^T Y(K) A_K.
+    z(K) = A_K z(K-1) + noise N_K,     M(K) = E[z z^T] = A_K M(K-1) A_K^T + N_K,     Y(K-1) = H + A_K^T Y(K) A_K,
 
-M gives the exact expectation of the time mean. For quadratic forms H the dual Y gives E[sum of what is still to come |
-z], with martingale increments D. The covariance of their sum is estimated by the sum of
-
-    Cov(D_a, D_b | z(K-1)) = tr( Y_a N Y_b (2 N + 4 A z z^T A^T) ) / R
-
-as in ``errors.given_path``; what z contains that is not logged, noise, is replaced by its expectation given the rest.
-In lockstep the same law, with all steps on time, is that of runs in which values are kept from step to step.
-M is computed forwards, Y backwards, in blocks: going backwards, the M of a block are computed again from its beginning.
+and means and covariances follow as in ``given_path``; what z contains that is not logged, noise, is replaced by its
+expectation given the rest. In lockstep, with all steps on time, it is the law of runs in which values are kept.
 """
 
 from __future__ import annotations
@@ -62,11 +56,7 @@ def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
 
 
 def pattern_means(
-    observation: Observation,
-    order: EventOrder,
-    *,
-    most_work: float = MAX_WORK,
-    most_entries: int = MAX_ENTRIES,
+    observation: Observation, order: EventOrder, *, most_work: float = MAX_WORK, most_entries: int = MAX_ENTRIES
 ) -> TimeMeans:
     """Time means of the sampled states, with expectation and standard errors given the log."""
     if order.contradiction:
@@ -226,12 +216,7 @@ class Laws:
 
 
 def measure_laws(observation: Observation, order: EventOrder, timing: Timing, level: float) -> tuple[TimeMeans, Laws]:
-    """Compare a run in real time with each law; also the time means under the pattern law, else the sequential law.
-
-    The pattern law is supported unless the errors reject it at ``level``. The others are not supported if the errors
-    reject them, or if more deadlines were missed than ``MAX_MISSED``. They are supported if what they leave out is
-    known to change the system error by at most ``MAX_EFFECT``; otherwise the run is too short to decide.
-    """
+    """Compare a run in real time with each law; also the means under the pattern law, else the sequential law."""
     sequential = time_means(replace(observation, states=sampled(observation, order)))
     error, p = _least(observation, sequential)
     effect = None
@@ -282,7 +267,7 @@ def _sequential(
         first = ", ".join(deviations[:-1])
         why += ", but " + (f"{first} and " if first else "") + deviations[-1]
         if effect is not None:
-            why += f", which changes the system error by {_change(effect)}"
+            why += f", which changes the system error by {100 * effect:+.2g} %"
     if p is None:
         return CheckedLaw(error, None, why)
     if p < level:
@@ -312,7 +297,7 @@ def _continuous(observation: Observation, sequential: Estimate, level: float, la
     effect = observation.prediction.emulated.system_error / predicted - 1.0
     why = (
         f"ignores that the agents make steps of {observation.step.dt:g}, one after the other, which changes the "
-        f"system error by {_change(effect)}"
+        f"system error by {100 * effect:+.2g} %"
     )
     if p < level:
         return CheckedLaw(error, False, f"{why}; the measured system error differs ({_z(error)})")
@@ -332,10 +317,6 @@ def _least(observation: Observation, means: TimeMeans) -> tuple[Estimate, float 
     tests = [error.p, *(node.p for node in nodes), covariance_test(means, system).p]
     tested = np.array([p for p in tests if p is not None], dtype=float)
     return error, float(holm(tested).min()) if len(tested) else None
-
-
-def _change(effect: float) -> str:
-    return f"{100 * effect:+.2g} %"
 
 
 def _tested(error: Estimate, p: float) -> str:

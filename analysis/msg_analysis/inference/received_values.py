@@ -3,10 +3,8 @@
 
 """What the agents received in the steps of a run, with noise or loss of messages, and in real time.
 
-The log gives, for every step, what each agent used: which values of its neighbours, and in real time their steps and
-the graph. Given that, the residuals are normal and independent, with an exactly known covariance: process noise, by the
-graph that each agent used, plus the link noise of the received messages. Broadcast noise, losses and delays are part of
-what was used.
+Given that, the residuals are normal and independent, with an exactly known covariance: process noise, by the graph that
+each agent used, plus the link noise of the received messages. The rest is part of what was used.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ import numpy as np
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.statistics import add_sums, chi2_below, chi2_tail
+from msg_analysis.inference.statistics import add_sums
 from msg_analysis.model.reception import neighbour_tables
 from msg_analysis.model.step_model import StepModel, Wiring
 
@@ -148,19 +146,15 @@ def process_noise(step: StepModel, graphs: IntArray) -> FloatArray:
 
 
 class Equalizer:
-    """Transforms residuals of steps with different covariances to the covariance of a regular step.
-
-    With N the covariance of a step and M that of a step of the network's graph in which all messages arrived and all
-    agents knew the graph, M^1/2 N^-1/2 e has the covariance M. Where N and M differ in their number of noisy directions
-    (an agent without process noise received nothing), that is not possible: then only the total size of all residuals
-    can be tested. ``full`` are the M of all graphs, (n, m, m).
-    """
+    """Transforms residuals of steps with covariance N to that of a regular step, M (``full``): M^1/2 N^-1/2 e."""
 
     def __init__(self, step: StepModel, full: FloatArray) -> None:
         self._step = step
         self._roots = [_root(matrix, 0.5) for matrix in full]
         self._ranks = [rank for _, rank in self._roots]
-        self.possible = True  # for every step so far
+        # False after a step whose N and M differ in rank (an agent without process noise received nothing): then only
+        # the total size of all residuals can be tested.
+        self.possible = True
         # Sum of e^T N^+ e, its degrees of freedom, and the largest residual in directions without noise.
         self.chi2, self.dof, self.quiet = 0.0, 0, 0.0
 
@@ -191,12 +185,6 @@ class Equalizer:
         """Add the sums of another run of the same experiment, with another seed."""
         add_sums(self, other, "chi2", "dof")
         self.possible, self.quiet = self.possible and other.possible, max(self.quiet, other.quiet)
-
-    def p_size(self) -> float | None:
-        """Two-sided p-value of the total size of all residuals; None without noise."""
-        if not self.dof:
-            return None
-        return float(min(1.0, 2.0 * min(chi2_tail(self.chi2, self.dof), chi2_below(self.chi2, self.dof))))
 
 
 def _root(matrix: FloatArray, power: float) -> tuple[FloatArray, int]:

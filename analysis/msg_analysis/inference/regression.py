@@ -47,11 +47,7 @@ class StateRegression:
         size = step.agents + 1
         self._scores = np.zeros((step.modes, step.agents, size))  # sum of e z^T
         self._inputs = np.zeros((step.modes, size, size))  # sum of z z^T
-
-    @property
-    def numbers_per_step(self) -> int:
-        """Size of the largest temporary array, per step; 0: not limiting."""
-        return 0
+        self.numbers_per_step = 0  # size of the largest temporary array, per step: not limiting
 
     def add(self, modes: IntArray, states: FloatArray, residuals: FloatArray) -> None:
         """Add a block of steps: graphs (b,) from 0, states x(k) and residuals (b, m, R)."""
@@ -132,7 +128,6 @@ class ReceivedRegression:
 
     def __init__(self, observation: Observation, most: int, position: IntArray | None = None) -> None:
         self._step = step = observation.step
-        self._replicas = observation.replicas
         self._position = position
         self._pull = step.nominal.sum(axis=2) - 1.0  # of the leaders: weight of the own deviation from the reference
         self.terms = terms_of(step, step.nominal, most)  # (K)
@@ -143,15 +138,10 @@ class ReceivedRegression:
             if term.kind != "constant":
                 graph, sender = slice(None) if term.graph is None else term.graph, term.sender
                 self._place[graph, term.agent, term.agent if sender is None else sender] = place
+        self.numbers_per_step = (2 + step.most_neighbours) * step.agents * observation.replicas
         count = len(self.terms)
         self._score, self._covariance = np.zeros(count), np.zeros((count, count))
         self._gram = np.zeros((count, count))
-
-    @property
-    def numbers_per_step(self) -> int:
-        """Size of the largest temporary array, per step."""
-        m, d = self._step.agents, self._step.most_neighbours
-        return max((2 + d) * m * self._replicas, m * d)
 
     def statistic(self) -> tuple[FloatArray, FloatArray]:
         """Scores U (K,) and their covariance (K, K)."""

@@ -28,6 +28,7 @@ from msg_analysis.inference.received_values import (
 from msg_analysis.inference.regression import MAX_REGRESSORS, ReceivedRegression, StateRegression
 from msg_analysis.inference.statistics import (
     add_sums,
+    chi2_below,
     chi2_tail,
     covariance_statistic,
     direction_p,
@@ -121,7 +122,8 @@ class ResidualSums:
         hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in self.noises))
         p_whiteness = self._whiteness.p_value()
         if self._equalizer and not self._equalizer.possible:
-            p_covariance, p_whiteness = self._equalizer.p_size(), None
+            chi2, dof, p_whiteness = self._equalizer.chi2, self._equalizer.dof, None  # two-sided, of the total size
+            p_covariance = min(1.0, 2.0 * float(min(chi2_tail(chi2, dof), chi2_below(chi2, dof)))) if dof else None
         else:
             p_covariance, ratios = self._covariance_p(), self._ratios()
         if self.quiet > max(QUIET_ROUNDING * self.largest, hidden):
@@ -242,11 +244,7 @@ def noise_directions(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 class WhitenessSums:
-    """Portmanteau test of iid N(0, I) vectors of length r: lags 1..LAGS, and lag 0 between replicas.
-
-    The sum of squared sample correlations, each over its variance under the null hypothesis, is chi-square with LAGS
-    r^2 degrees of freedom, and r more where there are replicas.
-    """
+    """Portmanteau test of iid N(0, I) vectors of length r: lags 1..LAGS, and lag 0 between replicas."""
 
     def __init__(self, rank: int) -> None:
         self.rank = rank

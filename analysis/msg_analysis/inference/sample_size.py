@@ -90,10 +90,7 @@ class Precision:
 
 
 def precision_of(prediction: Prediction, sought: float) -> Precision:
-    """Precision of the runs of an experiment; ``sought``: share of the error that the start has after the warm-up.
-
-    InputError: fourth moments of the states do not exist, or the errors take too long to settle.
-    """
+    """Precision of runs; ``sought``: share of the error that the start has after the warm-up."""
     experiment = prediction.experiment
     stationary = experiment.run.start == "stationary" and experiment.switching.initial == "stationary"
     error = prediction.emulated.system_error

@@ -178,17 +178,13 @@ def known_start(prediction: Prediction, start: FloatArray, first: int | None) ->
     system, law = prediction.system, prediction.system.of_modes(prediction.step.initial)
     if prediction.experiment.run.start == "stationary":
         return system.started_steady(prediction.steady, law), law
-    if first is not None:
+    if first is not None:  # the effect of one draw of g(0) on a transient is not an error
         law = system.of_modes(np.eye(prediction.step.modes)[first])
     return system.started((start - prediction.step.reference).T, law), law
 
 
 def expected_mean(observation: Observation) -> FloatArray:
-    """(f, f): exact mean of E[y y^T] over the steps of a run: steady, or transient from the known start.
-
-    A run that did not start from the stationary law is conditioned on the x(0) of its record and the first logged
-    graph: the effect of one draw of g(0) on a transient is not an error.
-    """
+    """(f, f): exact mean of E[y y^T] over the steps of a run: steady, or transient from the known start."""
     prediction = observation.prediction
     initial, law = known_start(prediction, observation.start, int(observation.modes[0]))
     mean = transient_mean(prediction.system, prediction.steady, initial, law, observation.steps)

@@ -138,12 +138,7 @@ class Timing:
             "never_heard": self.never_heard,
             "unheard": self.lost_messages,
             "outdated_graph": {"steps": self.outdated_graphs, "share": self.outdated_share},
-            "histogram": {
-                "lateness_ms": edges,
-                "steps": counts,
-                "staleness_ms": age_edges,
-                "uses": age_counts,
-            },
+            "histogram": {"lateness_ms": edges, "steps": counts, "staleness_ms": age_edges, "uses": age_counts},
         }
 
 

@@ -54,11 +54,8 @@ class Evidence:
 
     @property
     def tested(self) -> TimeMeans | None:
-        """The errors next to the exact law that they are tested against; None where there is none.
-
-        In lockstep that given the path, which holds for every run, before that over all paths, which needs long runs;
-        but one with the errors of the agents before one without.
-        """
+        """The errors next to the exact law that they are tested against; None where there is none."""
+        # Given the path holds for every run, over all paths needs long runs; but with the errors of the agents first.
         laws = [self.given, self.means if self.means.long_enough else None] if self.decisive else []
         known = [law for law in laws if law]
         return next((law for law in known if len(law.nodes)), known[0] if known else None)
@@ -159,13 +156,7 @@ MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
 
 
 def compare_run(trajectory: Run, *, level: float = 0.01) -> Comparison:
-    """Compare a run, or its complete beginning, with what theory predicts for it.
-
-    Every test assumes exactly the law that the record says was run; the probability of any false rejection in the
-    family is at most ``level`` (Holm). In real time, the family has only tests that are exact whatever the timing was.
-    Where the law has no prediction (a protocol that is not linear, or is not installed), only graphs and losses are
-    tested. InputError: no prediction (too large, unbounded), or a log without what is needed.
-    """
+    """Compare a run, or its complete beginning, with what theory predicts for it, see ``pool.compare``."""
     unpredicted = trajectory.record.experiment.unpredictable()
     if unpredicted:
         return _measured(trajectory, level, unpredicted)
@@ -227,7 +218,9 @@ def evaluate(
         continuous_error=prediction.continuous.system_error if prediction.continuous_moments else None,
         batch=batch_interval(means.system_series),
         tests=tests,
-        running=_running(means, prediction.step.dt),
+        running=_running(
+            means.system_series, means.system_variances if means.long_enough else None, prediction.step.dt
+        ),
         loss=loss,
         p_broadcast=run.p_broadcast,
         timing=evidence.timing,
@@ -256,34 +249,33 @@ def _any_time(
 def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
     """Comparison without a prediction."""
     measurement = Measurement.of(trajectory)
-    agents, enough = measurement.step.agents, True
+    series, covariance, step = measurement.system_series, measurement.covariance, measurement.step
     if measurement.steps < MIN_STEPS and not trajectory.completeness.complete:
-        enough = False
-    series, covariance = measurement.system_series, measurement.covariance if enough else None
-    transition = measurement.step.transition
-    switching = Transitions.of(measurement.modes, len(transition)).test(transition) if enough else None
-    loss = loss_test(measurement) if enough else None
-    run = Statistics(p_switching=switching.p if switching else None, p_loss=loss.p if loss else None)
-    nodes = [Estimate()] * agents if covariance is None else [Estimate(float(error)) for error in np.diag(covariance)]
-    counts = spaced_steps(len(series)) if enough else np.empty(0, np.int64)
+        return Comparison(
+            trajectory=trajectory,
+            level=level,
+            steps=measurement.steps,
+            system_error=Estimate(),
+            node_errors=[Estimate()] * step.agents,
+            covariance=CovarianceTest(note="there is no prediction"),
+            running=_running(np.empty(0), None, step.dt),
+            unpredicted=unpredicted,
+        )
+    switching, loss = Transitions.of(measurement.modes, step.modes).test(step.transition), loss_test(measurement)
     return Comparison(
         trajectory=trajectory,
         level=level,
         steps=measurement.steps,
-        system_error=Estimate() if covariance is None else Estimate(float(np.trace(covariance))),
-        node_errors=nodes,
+        system_error=Estimate(float(np.trace(covariance))),
+        node_errors=[Estimate(float(error)) for error in np.diag(covariance)],
         covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
         switching=switching,
-        batch=batch_interval(series) if enough else None,
-        tests=decide(run, level),
-        running={
-            "time": np.asarray((measurement.first + counts) * measurement.step.dt, dtype=float),
-            "system_error": np.cumsum(series)[counts - 1] / counts if enough else np.empty(0),
-            "standard_error": np.zeros(len(counts)),
-        },
+        batch=batch_interval(series),
+        tests=decide(Statistics(p_switching=switching.p, p_loss=loss.p if loss else None), level),
+        running=_running(series, None, step.dt, measurement.first),
         loss=loss,
         unpredicted=unpredicted,
-        transient=measurement.first if enough else None,
+        transient=measurement.first,
     )
 
 
@@ -298,16 +290,17 @@ def without_numbers(trajectory: Run, level: float, prediction: Prediction, steps
         node_errors=[Estimate(predicted=float(error)) for error in predicted.node_errors],
         covariance=CovarianceTest(predicted=predicted.covariance),
         continuous_error=prediction.continuous.system_error if prediction.continuous_moments else None,
-        running={key: np.empty(0) for key in ("time", "system_error", "standard_error")},
+        running=_running(np.empty(0), None, prediction.step.dt),
     )
 
 
-def _running(means: TimeMeans, dt: float) -> dict[str, FloatArray]:
+def _running(series: FloatArray, variances: FloatArray | None, dt: float, first: int = 0) -> dict[str, FloatArray]:
     """Mean of the system error up to some steps, denser at the beginning, and its standard error."""
-    counts = spaced_steps(len(means.system_series))
-    errors = np.sqrt(np.cumsum(means.system_variances)[counts - 1]) / counts
+    counts = spaced_steps(len(series)) if len(series) else np.empty(0, np.int64)
     return {
-        "time": np.asarray(counts * dt, dtype=float),
-        "system_error": np.cumsum(means.system_series)[counts - 1] / counts,
-        "standard_error": errors if means.long_enough else np.zeros(len(counts)),
+        "time": np.asarray((first + counts) * dt, dtype=float),
+        "system_error": np.cumsum(series)[counts - 1] / counts,
+        "standard_error": np.zeros(len(counts))
+        if variances is None
+        else np.sqrt(np.cumsum(variances)[counts - 1]) / counts,
     }
