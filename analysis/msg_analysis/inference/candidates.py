@@ -325,7 +325,7 @@ class Rate:
     origin: int | None  # the graph that is left, where it is all jumps from one; else None
     factor: float  # measured over nominal
     interval: tuple[float, float]  # 95 %, by the likelihood ratio
-    log_p: float  # adjusted, see ``forward_selection``
+    log_p: float  # adjusted, see ``select``
 
 
 def find_rates(counts: IntArray, chain: MarkovChain, dt: float, families: int, level: float) -> list[Rate]:

@@ -287,8 +287,8 @@ class Comparison:
         ]
         rows += [("...", "", "", "", "")] * (len(self.node_errors) > SHOWN_AGENTS)
         table = markdown_table(("mean-square error", "measured", "± (95 %)", "predicted", "z"), rows)
-        blame = "".join(f"- {with_names(cause.words, names)}\n" for cause in self.causes)
-        return f"**{self.verdict}**\n\n{table}" + (f"\n{blame}" if blame else "")
+        causes = "".join(f"- {with_names(cause.words, names)}\n" for cause in self.causes)
+        return f"**{self.verdict}**\n\n{table}" + (f"\n{causes}" if causes else "")
 
     @property
     def verdict(self) -> Verdict:

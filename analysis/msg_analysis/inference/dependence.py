@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 from operator import attrgetter
 from typing import Self
 
@@ -32,6 +33,8 @@ from msg_analysis.inference.question import (
     agent_words,
 )
 from msg_analysis.inference.statistics import add_sums, binomial_interval, log_normal_tail
+
+MAX_NOISE_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
 
 
 class Whiteness(Question):
@@ -59,45 +62,37 @@ class Whiteness(Question):
 
     @classmethod
     def causes(cls, search: Search) -> list[Cause]:
-        """Correlations of pairs; where gains are wrong, these correlate the residuals, too."""
-        _, change = search.selected_gains
-        return [] if search.noise is None or change.any() else _correlations(search)
-
-
-MAX_NOISE_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
-
-
-def _correlations(search: Search) -> list[Cause]:
-    """Pairs of agents whose noise correlation differs from the expected one, by Fisher's z."""
-    sums, families, level = search.residuals, search.families, search.level
-    m = sums.still.shape[1]
-    agents = [i for i in range(m) if i not in search.excluded]
-    pairs = [(i, j) for place, i in enumerate(agents) for j in agents[:place]]
-    if not 0 < len(pairs) <= MAX_NOISE_PAIRS:
-        return []
-    samples = int(sums.samples.sum())
-    should = np.tensordot(sums.samples, sums.noises, axes=1)
-    scatter = sums.scatter.sum(axis=0)
-    found = []
-    for j, i in sorted((j, i) for i, j in pairs):
-        size, expected_size = scatter[i, i] * scatter[j, j], should[i, i] * should[j, j]
-        if size <= 0.0 or expected_size <= 0.0 or samples < candidates.MIN_SAMPLES:
-            continue
-        seen, expected = scatter[i, j] / math.sqrt(size), should[i, j] / math.sqrt(expected_size)
-        if 1.0 - expected**2 < 1e-6 or 1.0 - seen**2 < 1e-12:
-            continue
-        z = (math.atanh(seen) - math.atanh(expected)) * math.sqrt(samples - 3)
-        log_p = math.log(2.0 * len(pairs) * families) + float(log_normal_tail(abs(z)))
-        if log_p < math.log(level):
-            half = HALF_WIDTH_95 / math.sqrt(samples - 3)
-            interval = math.tanh(math.atanh(seen) - half), math.tanh(math.atanh(seen) + half)
-            words = (
-                f"the noise of agents {j + 1} and {i + 1} has correlation {numbers_text(seen, interval)}, "
-                f"not {expected:.3g}"
-            )
-            link = (j + 1, i + 1)
-            found.append(Cause("correlation", words, None, link, None, seen, interval, expected, math.exp(log_p)))
-    return found
+        """Pairs whose noise correlation differs from the expected one (Fisher's z); wrong gains correlate it, too."""
+        if search.noise is None or search.selected_gains[1].any():
+            return []
+        sums, families, level = search.residuals, search.families, search.level
+        agents = [i for i in range(sums.still.shape[1]) if i not in search.excluded]
+        pairs = list(combinations(agents, 2))
+        if not 0 < len(pairs) <= MAX_NOISE_PAIRS:
+            return []
+        samples = int(sums.samples.sum())
+        should = np.tensordot(sums.samples, sums.noises, axes=1)
+        scatter = sums.scatter.sum(axis=0)
+        found = []
+        for j, i in pairs:
+            size, expected_size = scatter[i, i] * scatter[j, j], should[i, i] * should[j, j]
+            if size <= 0.0 or expected_size <= 0.0 or samples < candidates.MIN_SAMPLES:
+                continue
+            seen, expected = scatter[i, j] / math.sqrt(size), should[i, j] / math.sqrt(expected_size)
+            if 1.0 - expected**2 < 1e-6 or 1.0 - seen**2 < 1e-12:
+                continue
+            z = (math.atanh(seen) - math.atanh(expected)) * math.sqrt(samples - 3)
+            log_p = math.log(2.0 * len(pairs) * families) + float(log_normal_tail(abs(z)))
+            if log_p < math.log(level):
+                half = HALF_WIDTH_95 / math.sqrt(samples - 3)
+                interval = math.tanh(math.atanh(seen) - half), math.tanh(math.atanh(seen) + half)
+                words = (
+                    f"the noise of agents {j + 1} and {i + 1} has correlation {numbers_text(seen, interval)}, "
+                    f"not {expected:.3g}"
+                )
+                link = (j + 1, i + 1)
+                found.append(Cause("correlation", words, None, link, None, seen, interval, expected, math.exp(log_p)))
+        return found
 
 
 LAGS = 100

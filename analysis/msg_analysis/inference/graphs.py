@@ -110,7 +110,7 @@ def _rate_cause(rate: Rate, chain: MarkovChain, names: Sequence[str]) -> Cause:
 
 
 PARTS = 8  # of the ages of a holding time, with as nearly as steps allow the same share of the ends of holding times
-JOINED = (1, 2, 4)  # parts that are one in the evidence: many parts cost evidence, few hide a departure
+JOINED = (1, 2, 4)  # parts that are one in the evidence: many parts cost evidence, few hide a deviation
 MIN_EXPECTED = 15.0  # fewest steps with, and fewest without, a switch in a part, for the chi-square law
 
 

@@ -191,7 +191,9 @@ class LiveEstimate:
 class RunningErrors:
     """Sums over steps that give errors and standard errors at any time; without a prediction, errors only."""
 
-    def __init__(self, record: RunRecord, prediction: Prediction | None, *, nodes: bool = True) -> None:
+    def __init__(
+        self, record: RunRecord, prediction: Prediction | None, *, nodes: bool = True, most_bytes: int = MOST_BYTES
+    ) -> None:
         experiment = record.experiment
         self._record, self._prediction = record, prediction
         self._agents, self._replicas = experiment.agents, experiment.run.replicas
@@ -205,7 +207,7 @@ class RunningErrors:
             self._expected = _Expected(prediction)
             heavy = prediction.fourth_moment.finite is not True
             if experiment.run.pace == "lockstep" and prediction.system.readout is None and not heavy:
-                self._variances = _ErrorVariances(prediction, self._replicas, nodes=nodes)
+                self._variances = _ErrorVariances(prediction, self._replicas, most_bytes if nodes else 0)
                 self.nodes_tested = self._variances.nodes
 
     def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> FloatArray:
@@ -253,14 +255,14 @@ class RunningErrors:
 
 
 class _ErrorVariances:
-    """Sums that give the variances of the time means, as in ``martingale.time_means``."""
+    """Sums that give the variances of the time means, as in ``time_means``."""
 
-    def __init__(self, prediction: Prediction, replicas: int, *, nodes: bool = True) -> None:
+    def __init__(self, prediction: Prediction, replicas: int, most_bytes: int) -> None:
         system = prediction.system
         p = packed_symmetric.size(system.dimension)
         agents = len(system.output)
         # Whether the node errors are tested, too, and not only the system error.
-        self.nodes = nodes and 8 * system.modes**2 * agents * (p + 1) <= MOST_BYTES
+        self.nodes = 8 * system.modes**2 * agents * (p + 1) <= most_bytes
         forms, _, trace = forms_of(system, "nodes" if self.nodes else "system")
         self._system, self._replicas = system, replicas
         self.needs_later = system.lossy  # whether the states after a step count, beside those before it

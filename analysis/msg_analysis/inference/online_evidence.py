@@ -65,14 +65,14 @@ def needs_log(experiment: Experiment) -> bool:
     return bool(noise.on_air or noise.delay or experiment.run.pace == "realtime")
 
 
-def supports(prediction: Prediction) -> bool:
+def supports(prediction: Prediction, most_bytes: int = MOST_BYTES) -> bool:
     """Whether there is evidence: of not too many agents."""
     step, system = prediction.step, prediction.system
     if needs_log(prediction.experiment):
         numbers = (8 + step.modes) * step.agents**2
     else:
         numbers = 16 * system.modes**2 * (packed_symmetric.size(system.dimension) + 1)
-    return 8 * numbers <= MOST_BYTES
+    return 8 * numbers <= most_bytes
 
 
 class EvidenceWatch:
@@ -82,10 +82,14 @@ class EvidenceWatch:
         if not supports(prediction):
             raise ValueError("too many agents for the evidence of this run")
         self.sums = EvidenceSums(prediction, replicas)
-        self.count = 0  # steps that have been added
+        self.count, self._end = 0, prediction.experiment.steps  # steps that have been added, and last one that counts
         self._crossed: int | None = None
         # Of the martingale difference of the system error in a step, by which its interval is tuned.
         self.variance = self.sums.error.variance if self.sums.error is not None else None
+
+    def end_at(self, step: int) -> None:
+        """The run ends at this step: what was done after it is not a part of it."""
+        self._end = min(step, self._end)
 
     def report(self, half_width: float | None) -> AnyTime:
         """The evidence now; ``half_width``: of the interval of the system error, which is passed on."""
@@ -110,13 +114,12 @@ class RunningEvidence(EvidenceWatch):
             raise ValueError("the states alone do not give the evidence of this run")
         self._prediction, self._replicas = prediction, replicas
         self._length = max(1, BLOCK_NUMBERS // self.sums.numbers_per_step)
-        self._end = prediction.experiment.steps
         # The newest step, which counts when the graph after it is known: its number, graph, states before it and after.
         self._kept: tuple[int, IntArray, FloatArray] | None = None
 
     def end_at(self, step: int) -> None:
-        """The run ends at this step: what was done after it is not a part of it, and the last step counts now."""
-        self._end = min(step, self._end)
+        """See ``EvidenceWatch``; the last step counts now."""
+        super().end_at(step)
         self._add_last()
 
     def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
@@ -184,14 +187,10 @@ class ReceivedEvidence(EvidenceWatch):
         self._published = np.zeros((kept, m, replicas)) if truth else self._states
         self._graphs = np.zeros((kept, m), dtype=np.int64)
         self._used = np.zeros((kept, m, step.most_neighbours), dtype=np.int64)
-        self._newest, self._end = -1, experiment.steps
+        self._newest = -1
         self._largest = 0.0
         self._length = max(1, BLOCK_NUMBERS // self.sums.numbers_per_step)
         self._path = NetworkPath()
-
-    def end_at(self, step: int) -> None:
-        """The run ends at this step: what was done after it is not a part of it."""
-        self._end = min(step, self._end)
 
     def add(self, logged: LoggedStates) -> None:
         """Add whole steps."""

@@ -119,7 +119,7 @@ class RecentSteps:
 
 
 class Lateness:
-    """Real time: how long after they were due the agents made their newest steps, as in ``realtime.timing``."""
+    """Real time: how long after they were due the agents made their newest steps, as in ``timing``."""
 
     def __init__(self, experiment: Experiment) -> None:
         self._clocks = [StepClock(experiment.step_length, phase) for phase in phases(experiment).tolist()]

@@ -63,7 +63,8 @@ class Evidence:
     @classmethod
     def of(cls, observation: Observation, level: float, *, decided: bool = False) -> Evidence:
         """Of one run, which ended when its evidence ``decided``; in real time, laws are tested at ``level``."""
-        analyses = spaced_steps(observation.steps, DECIDED_ANALYSES if decided else usual_analyses(observation.steps))
+        usual = int(np.clip(observation.steps // STEPS_PER_ANALYSIS, *ANALYSES))
+        analyses = spaced_steps(observation.steps, DECIDED_ANALYSES if decided else usual)
         laws, timing, position, given = None, None, None, None
         watched = WatchedEvidence(observation, analyses)
         with blas_threads(observation.step.agents):
@@ -111,12 +112,6 @@ class Evidence:
             timing=None,
             laws=None,
         )
-
-
-def usual_analyses(steps: int) -> int:
-    """At the evidence over time of a run with so many steps, at most."""
-    few, most = ANALYSES
-    return min(max(steps // STEPS_PER_ANALYSIS, few), most)
 
 
 def _merged_means(one: TimeMeans, steps: int, other: TimeMeans, more: int) -> TimeMeans:

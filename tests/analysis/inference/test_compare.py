@@ -75,12 +75,12 @@ def hard(case):
 @pytest.mark.parametrize("case", HARD)
 @pytest.mark.usefixtures("predicted_once")
 def test_the_level_holds_where_a_few_sojourns_decide(case):
-    """60 correct runs of 10 units (rare: 100), 1,000 for the documentation: alarms at 1e-4 by the binomial law.
+    """30 correct runs of 10 units (rare: 100), 1,000 for the documentation: alarms at 1e-4 by the binomial law.
 
     Over all paths of the graphs, the errors of such runs are far from normal: 3 to 7 % of the verdicts were wrong.
     """
     experiment = hard(case)
-    results = [compare(simulate(experiment.with_run(seed=seed))) for seed in range(60)]
+    results = [compare(simulate(experiment.with_run(seed=seed))) for seed in range(30)]
     assert_few_alarms(results)
     noisy = case in ("far", "rare")
     assert all(("system error, corrected" in p_values(result)) == noisy for result in results)
@@ -148,7 +148,7 @@ def test_document(short_run):
 
 
 def test_many_agents_get_no_joint_test_but_all_numbers():
-    run = simulate(line_ring(60, run={"duration": 10, "start": "zero"}))
+    run = simulate(line_ring(40, run={"duration": 10, "start": "zero"}))
     found = compare(run)
     assert (found.covariance.chi2, found.covariance.dof, found.covariance.p) == (None, None, None)
     assert "too many agents" in found.covariance.note

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.stats
+from tests.support.watched_run import sums_of
 
 from experiments import Observation, compare, predict, simulate
 from msg_analysis import Experiment, InputError, NotAvailableError
-from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.fault_power import Fault, FaultPower, StepInformation, fault_powers
 from msg_analysis.inference.sample_size import REPLICAS
 from msg_analysis.inference.statistics import simultaneous_half_width
@@ -117,8 +117,7 @@ def test_gains_have_the_information_of_a_run() -> None:
     experiment = line_ring(duration=4000, replicas=4)
     prediction = predict(experiment)
     run = Observation.of(simulate(experiment), prediction)
-    sums = EvidenceSums(prediction, run.replicas)
-    sums.add(run, 0, run.steps)
+    sums = sums_of(run)
     (found,) = powers(experiment, Fault("gain", 0.5))
     assert (found.agent, found.sender) in {(0, 4), (4, 0)}  # only the ring has this link
     by_name = {test.name: test for test in found.tests}

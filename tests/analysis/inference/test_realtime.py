@@ -156,9 +156,9 @@ IN_DETAIL = [
 
 @pytest.mark.parametrize("case", ["consensus", "noise by graph"])
 def test_calibration(late_timers, case):
-    """30 late runs of 400 steps."""
+    """20 late runs of 400 steps."""
     late = lateness(late_timers)
-    runs = [late_timers.run(CASES[case].with_run(seed=seed), timing_seed=seed, **late) for seed in range(30)]
+    runs = [late_timers.run(CASES[case].with_run(seed=seed), timing_seed=seed, **late) for seed in range(20)]
     results = [compare(run) for run in runs]
     names = ["system error", *(f"error of agent {i}" for i in (1, 2, 3)), "covariance"]
     names += [f"residuals: {what}" for what in ("covariance", "whiteness", "gains", "common gain")]

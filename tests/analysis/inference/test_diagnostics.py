@@ -13,11 +13,11 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 from scipy import stats
+from tests.support.watched_run import sums_of
 
 from experiments import Experiment, Observation, chain_path, compare, five, observed, predict, simulate
 from msg_analysis.inference.dependence import ConstantState, LongLags
 from msg_analysis.inference.e_values import Analyses, WindowEvidence, Windows, variance_evidence
-from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.graphs import PARTS, HoldingTimes, SwappedGraphs
 from msg_analysis.inference.messages import StaleValues
 from msg_analysis.inference.noise import LargestResidual, NoiseByGraph, NoiseOverTime
@@ -34,10 +34,7 @@ def seen(seed: int = 1, duration: float = 20.0, **changes: Any) -> Observation:
 
 def summed(observation: Observation, kind: type[Kind], size: int = 37) -> Kind:
     """The sums of a run, in blocks of so many steps."""
-    sums = EvidenceSums(observation.prediction, observation.replicas, in_detail=True)
-    for first in range(0, observation.steps, size):
-        sums.add(observation, first, min(first + size, observation.steps))
-    return next(each for each in sums.diagnostics if isinstance(each, kind))
+    return next(each for each in sums_of(observation, size, in_detail=True).diagnostics if isinstance(each, kind))
 
 
 def whitened(observation: Observation) -> np.ndarray:
