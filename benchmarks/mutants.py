@@ -35,7 +35,9 @@ TESTS = {
     "tests/analysis/theory/test_moments_precision.py "
     "tests/analysis/theory/test_prediction.py "
     "tests/analysis/theory/test_solvers.py -k 'not test_solvers or converge or dense'",
-    "analysis/msg_analysis/inference/verdict.py": "tests/analysis/inference/test_compare.py",
+    "analysis/msg_analysis/inference/verdict.py": "tests/analysis/inference/test_compare.py "
+    "tests/analysis/inference/test_pool.py "
+    "-k 'not calibration and not level_holds and not hardly and not common and not rounding and not many_agents'",
     "analysis/msg_analysis/bags/salvage.py": "tests/analysis/bags/test_trajectory_writer_and_salvage.py -k 'not 00'",
     "analysis/msg_analysis/messages/acceptance.py": "tests/analysis/wire/test_receiving.py",
 }
@@ -83,7 +85,9 @@ def forked(file: str, text: str | None, imports: str) -> int:
         sys.meta_path.insert(0, Changed(".".join(Path(file).with_suffix("").parts[1:]), text))
     code = int(pytest.main(["-x", "-p", "no:cacheprovider", *shlex.split(TESTS[file])]))
     if text is None:
-        Path(imports).write_text(json.dumps([name for name in sys.modules if not name.startswith(OURS)]))
+        own = str(ROOT / "tests")  # their helpers have names that mean something else outside pytest
+        found = {name for name, module in sys.modules.items() if own not in str(getattr(module, "__file__", ""))}
+        Path(imports).write_text(json.dumps(sorted(name for name in found if not name.startswith(OURS))))
     os._exit(code)
 
 
@@ -97,6 +101,8 @@ def survivors(file: str, seconds: float) -> tuple[list[str], int]:
         for name in json.loads(Path(imports.name).read_text()):
             with contextlib.suppress(Exception):
                 importlib.import_module(name)
+    _, code = os.waitpid(forked(file, (ROOT / file).read_text(encoding="utf-8"), ""), 0)
+    assert code == 0, f"{file}: its tests fail in a process with these imports, without a change"
     left, count = changes(file), 0
     running: dict[int, tuple[str, float]] = {}
     survived: list[str] = []

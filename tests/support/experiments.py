@@ -4,6 +4,8 @@ What most tests need of the package is imported from here, so that one place say
 """
 
 import dataclasses
+from bisect import bisect_right
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +104,15 @@ def cut(run: Run, step: int) -> Run:
     missing, count = int(np.isnan(states[:, :, 0]).sum()), states[:, :, 0].size
     completeness = Completeness(count, count - missing, missing, missing_modes=int((modes < 0).sum()))
     return dataclasses.replace(run, states=states, modes=modes, completeness=completeness)
+
+
+def chain_path(transition: Sequence[Sequence[float]], steps: int, seed: int) -> np.ndarray:
+    """Graphs (steps,) of a Markov chain from 0."""
+    random, up_to = np.random.default_rng(seed).random(steps), np.cumsum(transition, axis=1)[:, :-1].tolist()
+    path = [0]
+    for chance in random[1:].tolist():
+        path.append(bisect_right(up_to[path[-1]], chance))
+    return np.array(path)
 
 
 def late(run: Run, nanoseconds: int) -> Run:

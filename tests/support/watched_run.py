@@ -51,9 +51,13 @@ def watched(trajectory: Run, *, disorder: float = 0.0, every: int = 200) -> Live
 
 
 def whole_sums(trajectory: Run, prediction: Prediction) -> EvidenceSums:
-    """The sums of a comparison, without departures."""
-    observation = Observation.of(trajectory, prediction)
-    sums = EvidenceSums(prediction, observation.replicas)
-    for first, last in observation.blocks(1000, "evidence"):
-        sums.add(observation, first, last)
+    """The sums of a comparison, without diagnostics."""
+    return sums_of(Observation.of(trajectory, prediction), 400)
+
+
+def sums_of(observation: Observation, size: int = 10**9, *, in_detail: bool = False) -> EvidenceSums:
+    """The sums of a run, in blocks of so many steps."""
+    sums = EvidenceSums(observation.prediction, observation.replicas, in_detail=in_detail)
+    for first in range(0, observation.steps, size):
+        sums.add(observation, first, min(first + size, observation.steps))
     return sums

@@ -37,11 +37,7 @@ MOST_WINDOW = 4096  # steps, of Welch's method
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoggedAutocovariance:
-    """Measured autocovariances of the system error, R(l) = E[e(k + l) . e(k)], and their test.
-
-    Corrected are measured values minus what the path of the graphs should have changed: measured - (expected given the
-    path - predicted).
-    """
+    """Measured autocovariances of the system error, R(l) = E[e(k + l) . e(k)], and their test."""
 
     steps: int  # that were used, from the beginning of the run
     times: FloatArray  # (L,) lags [units of simulated time]
@@ -53,7 +49,7 @@ class LoggedAutocovariance:
 
     @property
     def corrected(self) -> FloatArray:
-        """(L,) see above."""
+        """(L,): measured - (expected given the path - predicted): without what the path should have changed."""
         return np.asarray(self.measured - self.expected + self.predicted)
 
     @property
@@ -118,24 +114,7 @@ def why_not_tested(observation: Observation) -> str | None:
 def logged_autocovariance(
     observation: Observation, lags: IntArray | None = None, most_numbers: float = MOST_NUMBERS
 ) -> LoggedAutocovariance | None:
-    """Autocovariances of a run in lockstep, with their expectation and covariance given its path.
-
-    Time and memory are those of the steps, lags and squared coordinates.
-
-    Parameters
-    ----------
-    observation
-        of a run of which ``why_not_tested`` is None
-    lags
-        (L,) ascending, >= 0 [steps]; None: 0 and up to 8 more, to where 5 % of the correlation is left
-    most_numbers
-        in the matrices of all lags and steps: of longer runs the beginning is tested
-
-    Returns
-    -------
-    LoggedAutocovariance | None
-        None where the losses make too many kinds of steps
-    """
+    """Autocovariances at ``lags`` (L,) [steps] given the path; None where the losses make too many kinds of steps."""
     kinds = steps_of_path(observation)
     if kinds is None:
         return None
@@ -235,17 +214,10 @@ def _moments(which: IntArray, matrices: FloatArray, noise: FloatArray, start: Fl
 
 
 def _covariance(
-    kinds: tuple[IntArray, FloatArray, FloatArray],
-    y: FloatArray,
-    forms: FloatArray,
-    felt: FloatArray,
-    left: FloatArray,
+    kinds: tuple[IntArray, FloatArray, FloatArray], y: FloatArray, forms: FloatArray, felt: FloatArray, left: FloatArray
 ) -> FloatArray:
-    """(L, L): sum of Cov(D_j | past).
-
-    ``forms`` (N + 1, d, L, d) H, and what enters (``felt``) and leaves (``left``) a_j, (L, N, R, d); the first two
-    are overwritten. In H the lags are an inner axis, so that a product of its recursion is one for all of them.
-    """
+    """(L, L): sum of Cov(D_j | past), from H (``forms``), what enters a_j (``felt``) and leaves it (``left``)."""
+    # The first two are overwritten. In H (N + 1, d, L, d) the lags are an inner axis: one product is for all of them.
     which, matrices, noise = kinds
     number, steps, replicas, d = felt.shape
     duals, columns = forms.reshape(-1, d * number, d), forms.reshape(-1, d, number * d)

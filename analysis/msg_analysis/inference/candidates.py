@@ -3,8 +3,6 @@
 
 """Candidate causes of a disagreement, and their words.
 
-Scores of the parameters that may be wrong (gains, noise, messages), and the single causes searched for.
-
 Every group has parameters with a score s and its information J, so that a change c of them gives s the mean J c.
 """
 
@@ -13,12 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
-from msg_analysis.common.text import HALF_WIDTH_95
+from msg_analysis.common.text import HALF_WIDTH_95, percent
 from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.inference.counts import LossTally
 from msg_analysis.inference.received_values import NO_NOISE
@@ -55,32 +53,21 @@ class Selected:
         half = HALF_WIDTH_95 * self.standard_error
         return self.estimate - half, self.estimate + half
 
+    @property
+    def factor(self) -> tuple[float, tuple[float, float]]:
+        """Estimate and interval of a change of a logarithm, as factors."""
+        low, high = self.interval
+        return math.exp(self.estimate), (math.exp(low), math.exp(high))
+
 
 def select(
     score: FloatArray, information: FloatArray, classes: Sequence[Sequence[Candidate]], families: int, level: float
 ) -> tuple[list[Selected], FloatArray]:
-    """Find the changes that explain a score, the smallest p-value first, each given the others.
+    """The changes that explain a score (K,), the smallest p-value first, each given the others; and their sum (K,).
 
-    A candidate's p-value is multiplied by the number of candidates of its class and by the number of classes
-    (Bonferroni): so a class of one (all messages alike) needs less evidence than one of many links.
-
-    Parameters
-    ----------
-    score
-        (K,) with mean information @ change
-    information
-        (K, K) covariance of the score where nothing is wrong
-    classes
-        candidates, class by class
-    families
-        number of classes, those of other scores included
-    level
-        probability of finding anything where nothing is wrong, at most
-
-    Returns
-    -------
-    tuple[list[Selected], FloatArray]
-        what was found, and the total change (K,) of the parameters
+    A candidate's p-value is multiplied by the number of candidates of its class and by the number of classes of all
+    scores, ``families`` (Bonferroni): so a class of one (all messages alike) needs less evidence than one of many
+    links. The probability of finding anything where nothing is wrong is at most ``level``.
     """
     candidates, penalties = _distinct(classes, families)
     if not candidates:
@@ -144,31 +131,11 @@ def _distinct(classes: Sequence[Sequence[Candidate]], families: int) -> tuple[li
     return kept, np.array(penalties)
 
 
-CauseKind = Literal[
-    "frozen",
-    "graph",
-    "gain",
-    "ignored",
-    "reference",
-    "offset",
-    "noise",
-    "correlation",
-    "lag",
-    "outlier",
-    "stale",
-    "switching",
-    "sojourns",
-    "loss",
-    "broadcast",
-    "unknown",
-]
-
-
 @dataclass(frozen=True, slots=True)
 class Cause:
     """One thing that is wrong."""
 
-    kind: CauseKind
+    kind: str  # such as "gain"; of a diagnostic, its ``kind``
     words: str  # a sentence
     agent: int | None = None  # from 1; None where the cause is not one agent
     link: tuple[int, int] | None = None  # from 1: sender and receiver, or the two ends of an edge or of a correlation
@@ -179,25 +146,15 @@ class Cause:
     p: float | None = None  # adjusted for all candidate causes; 0 where the law makes it impossible
     steps: tuple[int, int] | None = None  # first and last, where the cause is a stretch of the run
 
-    def to_json(self) -> dict[str, Any]:
-        """The JSON document."""
-        return {
-            "kind": self.kind,
-            "words": self.words,
-            "agent": self.agent,
-            "link": list(self.link) if self.link else None,
-            "graph": self.graph,
-            "estimate": self.estimate,
-            "interval": list(self.interval) if self.interval else None,
-            "expected": self.expected,
-            "p": self.p,
-            "steps": list(self.steps) if self.steps else None,
-        }
-
 
 def numbers_text(value: float, interval: tuple[float, float]) -> str:
     """A number and its interval."""
     return f"{value:#.3g} ({interval[0]:#.3g} to {interval[1]:#.3g})"
+
+
+def share_text(share: float, interval: tuple[float, float]) -> str:
+    """A share and its interval, in percent."""
+    return f"{percent(share)} ({100 * interval[0]:.3g} to {100 * interval[1]:.3g} %)"
 
 
 MIN_SAMPLES = 30  # fewest residuals for a variance
@@ -222,17 +179,15 @@ def frozen(sums: ResidualSums) -> list[tuple[int, int, int]]:
 
 
 def gains(sums: ResidualSums, excluded: Iterable[int]) -> Parameters | None:
-    """Parameters of the regression on received values, without the ``excluded``; None where it is not available.
-
-    Changes of gains are relative, those of the reference and of offsets (per step) absolute. The score G C^-1 U and the
-    information G C^-1 G follow from the regression's score U, covariance C and gram G.
-    """
+    """Of the regression on received values, without the ``excluded`` agents; None where it is not available."""
     if sums.gram is None or len(sums.terms) > MAX_PARAMETERS:
         return None
     out = set(excluded)
     kept = np.array([a for a, term in enumerate(sums.terms) if term.agent not in out], dtype=np.int64)
     if not kept.size:
         return None
+    # Of the regression's score U, covariance C and gram G: G C^-1 U, G C^-1 G. Changes of gains are relative, those of
+    # the reference and of offsets (per step) absolute.
     square = np.ix_(kept, kept)
     inverse = pseudo_inverse(sums.covariance[square])
     back = sums.gram[square] @ inverse
@@ -288,10 +243,7 @@ def _reference(terms: Sequence[Term]) -> FloatArray:
 
 
 def noise(sums: ResidualSums, excluded: Iterable[int], change: FloatArray) -> Parameters | None:
-    """Logarithms of the noise variances over their nominal values, by graph and agent; None without usable ones.
-
-    Left out are the ``excluded`` agents, and what the coefficients ``change`` (K,) of the regression explain.
-    """
+    """Log noise variances by graph and agent, less what the ``change`` (K,) of gains explains; None without any."""
     n, m = sums.still.shape
     out = np.zeros(m, np.bool_)
     out[list(excluded)] = True
@@ -319,10 +271,7 @@ def noise(sums: ResidualSums, excluded: Iterable[int], change: FloatArray) -> Pa
 
 
 def variances(squares: FloatArray, samples: int) -> Parameters:
-    """Logarithms of the variances of m kinds of independent normal numbers, nominally 1.
-
-    ``squares`` (m,) are sums of squares of as many numbers as ``samples``.
-    """
+    """Logarithms of variances, nominally 1, from sums of squares (m,) of so many normal ``samples`` each."""
     information = np.eye(len(squares)) * samples / 2.0
     classes = [
         [Candidate("agent", i, row) for i, row in enumerate(np.eye(len(squares)))],
@@ -376,23 +325,11 @@ class Rate:
     origin: int | None  # the graph that is left, where it is all jumps from one; else None
     factor: float  # measured over nominal
     interval: tuple[float, float]  # 95 %, by the likelihood ratio
-    log_p: float  # adjusted, see ``forward_selection``
+    log_p: float  # adjusted, see ``select``
 
 
 def find_rates(counts: IntArray, chain: MarkovChain, dt: float, families: int, level: float) -> list[Rate]:
-    """Find the rates that explain the counted transitions: score tests, then maximum likelihood of the factors.
-
-    Parameters
-    ----------
-    counts
-        (n, n) of transitions from step to step
-    chain
-        the nominal chain; with more than ``MAX_JUMPS`` kinds of jumps nothing is found
-    dt
-        length of a step [simulated time]
-    families, level
-        see ``selection.select``
-    """
+    """Rates that explain the transitions ``counts`` (n, n): score tests, then maximum likelihood of their factors."""
     n = chain.modes
     transition = chain.transition(dt)
     jumps = [(g, h) for g, h in np.argwhere(chain.matrix > 0.0).tolist() if g != h]

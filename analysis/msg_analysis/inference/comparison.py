@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -96,47 +96,36 @@ class Trust:
     reason: Reason | None = None
     words: str | None = None
 
-    def to_json(self) -> dict[str, Any]:
-        """The document."""
-        return asdict(self)
-
 
 def trusted(prediction: Prediction, means: TimeMeans, *, given: bool) -> Trust:
     """Which errors in lockstep to trust, from means over all paths; ``given``: whether there are corrected ones."""
-    reason = _reason(prediction, means)
-    if reason is None:
+    doubt = _doubt(prediction, means)
+    if doubt is None:
         return Trust("all_paths")
     instead = "Trust the tests of residuals and switching, which do not depend on this."
     if given:
         instead = "Trust the errors corrected for the graph sequence, and the tests, which do not depend on this."
-    return Trust("given_path" if given else None, reason, f"{_why(reason, prediction, means)} {instead}")
+    return Trust("given_path" if given else None, doubt[0], f"{doubt[1]} {instead}")
 
 
-def _reason(prediction: Prediction, means: TimeMeans) -> Reason | None:
+def _doubt(prediction: Prediction, means: TimeMeans) -> tuple[Reason, str] | None:
+    """What makes the intervals of the errors over all paths wrong, in words."""
     if means.heavy:
-        return "heavy_tails"
-    if prediction.system.readout is not None:
-        return "kept_values"
-    if not means.long_enough:
-        return "short_run"
-    return "few_sojourns" if means.few_sojourns else None
-
-
-def _why(reason: Reason, prediction: Prediction, means: TimeMeans) -> str:
-    if reason == "heavy_tails":
-        return (
+        return "heavy_tails", (
             f"The fourth moments of the states {_infinite(prediction.fourth_moment)}: rare large values make a large "
             "part of the mean error, so most runs measure less than the prediction, and the errors over all paths of "
             "the graphs have no standard error and no interval."
         )
-    if reason == "kept_values":
-        return (
+    if prediction.system.readout is not None:
+        return "kept_values", (
             "Agents keep values from step to step, so the standard errors over all paths of the graphs depend on more "
             "than the log and are not known."
         )
-    if reason == "short_run":
-        return "The run is too short for intervals of the errors over all paths of the graphs."
-    return (
+    if not means.long_enough:
+        return "short_run", "The run is too short for intervals of the errors over all paths of the graphs."
+    if not means.few_sojourns:
+        return None
+    return "few_sojourns", (
         f"This run has few switches (some graph is left {number_text(means.switches, 3)} times on "
         "average), so the errors over all paths of the graphs depend on a few random lengths: they are far from "
         "normal, and their intervals are too wide."
@@ -186,7 +175,7 @@ class Member:
             "missing": count.missing,
             "missing_modes": count.missing_modes,
             "verdict": self.verdict,
-            "system_error": self.system_error.to_json(),
+            "system_error": self.system_error,
         }
 
 
@@ -198,10 +187,6 @@ class Pool:
     chi2: float | None = None
     dof: int | None = None
     p: float | None = None
-
-    def to_json(self) -> list[dict[str, Any]]:
-        """The rows."""
-        return [member.to_json() for member in self.members]
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -302,8 +287,8 @@ class Comparison:
         ]
         rows += [("...", "", "", "", "")] * (len(self.node_errors) > SHOWN_AGENTS)
         table = markdown_table(("mean-square error", "measured", "± (95 %)", "predicted", "z"), rows)
-        blame = "".join(f"- {with_names(cause.words, names)}\n" for cause in self.causes)
-        return f"**{self.verdict}**\n\n{table}" + (f"\n{blame}" if blame else "")
+        causes = "".join(f"- {with_names(cause.words, names)}\n" for cause in self.causes)
+        return f"**{self.verdict}**\n\n{table}" + (f"\n{causes}" if causes else "")
 
     @property
     def verdict(self) -> Verdict:
@@ -348,7 +333,13 @@ class Comparison:
 
     def to_json(self) -> dict[str, Any]:
         """The document of ``msg-analysis compare --json``; every number is finite or None."""
-        record, covariance, switching = self.trajectory.record, self.covariance, self.switching
+        record, until = self.trajectory.record, None
+        if record.until is not None:
+            until = {
+                "rule": str(record.until),
+                "planned_steps": record.planned_steps,
+                "ended_early": record.planned is not None,
+            }
         document = {
             "verdict": self.verdict,
             "unpredicted": self.unpredicted,
@@ -360,56 +351,40 @@ class Comparison:
             "leaders": (np.flatnonzero(record.experiment.leader_gains) + 1).tolist(),
             "seed": None if self.pool else record.experiment.run.seed,
             "level": self.level,
-            "until": _until(record),
+            "until": until,
             "completeness": asdict(self.trajectory.completeness) | {"stretch": self.trajectory.stretch},
             "steps": self.steps,
             "simulated_time": self.steps * record.experiment.step_length,
             "law": self._law,
-            "bags": self.pool.to_json() if self.pool else None,
+            "bags": self.pool and self.pool.members,
             "homogeneity": {key: getattr(self.pool, key, None) for key in ("chi2", "dof", "p")},
-            "system_error": self.system_error.to_json(),
-            "node_errors": [estimate.to_json() for estimate in self.node_errors],
-            "covariance": {
-                "measured": covariance.measured,
-                "predicted": covariance.predicted,
-                "chi2": covariance.chi2,
-                "dof": covariance.dof,
-                "p": covariance.p,
-                "note": covariance.note,
-                "z": covariance.z,
-            },
-            "innovations": asdict(self.innovations),
-            "switching": {
-                "counts": switching.counts if switching else None,
-                "expected": switching.expected if switching else None,
-                "p": switching.p if switching else None,
-            },
-            "loss": asdict(self.loss) if self.loss else dict.fromkeys(("lost", "expected", "p")),
+            "system_error": self.system_error,
+            "node_errors": self.node_errors,
+            "covariance": self.covariance,
+            "innovations": self.innovations,
+            "switching": self.switching or dict.fromkeys(("counts", "expected", "p")),
+            "loss": self.loss or dict.fromkeys(("lost", "expected", "p")),
             "broadcast": {"p": self.p_broadcast},
-            "timing": self.timing.to_json() if self.timing else None,
-            "laws": self.laws.to_json() if self.laws else None,
-            "given_path": self.given.to_json() if self.given else None,
-            "order": self.order.to_json() if self.order else None,
-            "blame": [cause.to_json() for cause in self.causes],
+            "timing": self.timing,
+            "laws": self.laws,
+            "given_path": self.given,
+            "order": self.order,
+            "blame": self.causes,
             "continuous": {"system_error": self.continuous_error},
             "batch_means": {"interval": self.batch or (None, None)},
-            "tests": [test.to_json() for test in self.tests],
-            "any_time": self.any_time.to_json() if self.any_time else None,
-            "trust": self.trust.to_json() if self.trust else None,
+            "tests": self.tests,
+            "any_time": self.any_time,
+            "trust": self.trust,
         }
         return {key: _plain(value) for key, value in document.items()}
 
 
-def _until(record: RunRecord) -> dict[str, Any] | None:
-    """Of a run that was to end early."""
-    if record.until is None:
-        return None
-    early = record.planned is not None
-    return {"rule": str(record.until), "planned_steps": record.planned_steps, "ended_early": early}
-
-
 def _plain(value: Any) -> Any:
-    """JSON-able: arrays become lists, numbers that are not finite become None."""
+    """JSON-able: arrays become lists, objects dictionaries, and numbers that are not finite None."""
+    if hasattr(value, "to_json"):
+        value = value.to_json()
+    elif is_dataclass(value) and not isinstance(value, type):
+        value = {each.name: getattr(value, each.name) for each in fields(value)}
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, dict):

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
+from itertools import combinations
+from operator import attrgetter
 from typing import Self
 
 import numpy as np
@@ -22,16 +24,17 @@ from msg_analysis.inference.question import (
     Block,
     Diagnostic,
     Finding,
+    Largest,
     Law,
     Place,
     Question,
     RunningSums,
     Search,
-    Statistics,
-    Test,
-    one_test,
+    agent_words,
 )
-from msg_analysis.inference.statistics import binomial_interval, log_normal_tail
+from msg_analysis.inference.statistics import add_sums, binomial_interval, log_normal_tail
+
+MAX_NOISE_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
 
 
 class Whiteness(Question):
@@ -39,11 +42,7 @@ class Whiteness(Question):
 
     name = "residuals: whiteness"
     meaning = "the noise of successive steps, of replicas or of agents is correlated: random numbers are used twice"
-
-    @classmethod
-    def tests(cls, run: Statistics) -> list[Test]:
-        """Lags of 1 to 10 steps, and pairs of replicas."""
-        return one_test(cls.name, run.residuals.p_whiteness)
+    p_value = attrgetter("residuals.p_whiteness")
 
     def evidence(self, sums: RunningSums) -> FloatArray:
         """One row for each pair of agents."""
@@ -63,68 +62,45 @@ class Whiteness(Question):
 
     @classmethod
     def causes(cls, search: Search) -> list[Cause]:
-        """Correlations of pairs; where gains are wrong, these correlate the residuals, too."""
-        _, change = search.selected_gains
-        return [] if search.noise is None or change.any() else _correlations(search)
-
-
-MAX_NOISE_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
-
-
-def _correlations(search: Search) -> list[Cause]:
-    """Pairs of agents whose noise correlation differs from the expected one, by Fisher's z."""
-    sums, families, level = search.residuals, search.families, search.level
-    m = sums.still.shape[1]
-    agents = [i for i in range(m) if i not in search.excluded]
-    pairs = [(i, j) for place, i in enumerate(agents) for j in agents[:place]]
-    if not 0 < len(pairs) <= MAX_NOISE_PAIRS:
-        return []
-    samples = int(sums.samples.sum())
-    should = np.tensordot(sums.samples, sums.noises, axes=1)
-    scatter = sums.scatter.sum(axis=0)
-    found = []
-    for j, i in sorted((j, i) for i, j in pairs):
-        size, expected_size = scatter[i, i] * scatter[j, j], should[i, i] * should[j, j]
-        if size <= 0.0 or expected_size <= 0.0 or samples < candidates.MIN_SAMPLES:
-            continue
-        seen, expected = scatter[i, j] / math.sqrt(size), should[i, j] / math.sqrt(expected_size)
-        if 1.0 - expected**2 < 1e-6 or 1.0 - seen**2 < 1e-12:
-            continue
-        z = (math.atanh(seen) - math.atanh(expected)) * math.sqrt(samples - 3)
-        log_p = math.log(2.0 * len(pairs) * families) + float(log_normal_tail(abs(z)))
-        if log_p < math.log(level):
-            half = HALF_WIDTH_95 / math.sqrt(samples - 3)
-            interval = math.tanh(math.atanh(seen) - half), math.tanh(math.atanh(seen) + half)
-            words = (
-                f"the noise of agents {j + 1} and {i + 1} has correlation {numbers_text(seen, interval)}, "
-                f"not {expected:.3g}"
-            )
-            link = (j + 1, i + 1)
-            found.append(Cause("correlation", words, None, link, None, seen, interval, expected, math.exp(log_p)))
-    return found
+        """Pairs whose noise correlation differs from the expected one (Fisher's z); wrong gains correlate it, too."""
+        if search.noise is None or search.selected_gains[1].any():
+            return []
+        sums, families, level = search.residuals, search.families, search.level
+        agents = [i for i in range(sums.still.shape[1]) if i not in search.excluded]
+        pairs = list(combinations(agents, 2))
+        if not 0 < len(pairs) <= MAX_NOISE_PAIRS:
+            return []
+        samples = int(sums.samples.sum())
+        should = np.tensordot(sums.samples, sums.noises, axes=1)
+        scatter = sums.scatter.sum(axis=0)
+        found = []
+        for j, i in pairs:
+            size, expected_size = scatter[i, i] * scatter[j, j], should[i, i] * should[j, j]
+            if size <= 0.0 or expected_size <= 0.0 or samples < candidates.MIN_SAMPLES:
+                continue
+            seen, expected = scatter[i, j] / math.sqrt(size), should[i, j] / math.sqrt(expected_size)
+            if 1.0 - expected**2 < 1e-6 or 1.0 - seen**2 < 1e-12:
+                continue
+            z = (math.atanh(seen) - math.atanh(expected)) * math.sqrt(samples - 3)
+            log_p = math.log(2.0 * len(pairs) * families) + float(log_normal_tail(abs(z)))
+            if log_p < math.log(level):
+                half = HALF_WIDTH_95 / math.sqrt(samples - 3)
+                interval = math.tanh(math.atanh(seen) - half), math.tanh(math.atanh(seen) + half)
+                words = (
+                    f"the noise of agents {j + 1} and {i + 1} has correlation {numbers_text(seen, interval)}, "
+                    f"not {expected:.3g}"
+                )
+                link = (j + 1, i + 1)
+                found.append(Cause("correlation", words, None, link, None, seen, interval, expected, math.exp(log_p)))
+        return found
 
 
 LAGS = 100
 MIN_SAMPLES = 100  # fewest products for the normal law of their sum
 
 
-@dataclass(frozen=True, slots=True)
-class Lag:
-    """The clearest dependence on earlier numbers."""
-
-    log_p: float  # of all lags and columns together
-    column: int
-    steps: int
-    coefficient: float
-    standard_error: float
-
-
 class LagSums:
-    """Regression of N(0, 1) numbers on those of the same column 1 to 100 steps before; expected coefficient 0.
-
-    Given the past, the sum of the products is a martingale whose variance is the sum of the squares of the earlier
-    numbers.
-    """
+    """Regression of N(0, 1) numbers on those of the same column 1 to 100 steps before; expected coefficient 0."""
 
     def __init__(self, columns: int, samples: int) -> None:
         self._tail = np.empty((0, columns, samples))
@@ -132,10 +108,8 @@ class LagSums:
         self.score, self.information, self.products = np.zeros(shape), np.zeros(shape), np.zeros(LAGS, np.int64)
 
     def add(self, numbers: FloatArray, analyses: Analyses) -> tuple[FloatArray, FloatArray]:
-        """Add the products of numbers (b, columns, samples) with the earlier ones.
-
-        (T, 100, columns) each: ``score`` and ``information`` after each analysis.
-        """
+        """Add numbers (b, columns, samples): (T, 100, columns) ``score`` and ``information`` after each analysis."""
+        # Given the past, the sum of the products is a martingale, whose variance is the sum of the earlier squares.
         joined = np.concatenate([self._tail, numbers])
         old, lags = len(self._tail), np.arange(1, LAGS + 1)
         # (T, lags): between the analyses, the numbers that have one so many steps before them, in ``joined``.
@@ -152,38 +126,34 @@ class LagSums:
 
     def merge(self, other: Self) -> None:
         """No lag goes over from one run to another."""
-        self.score += other.score
-        self.information += other.information
-        self.products += other.products
+        add_sums(self, other, "score", "information", "products")
 
-    def pooled(self) -> LagSums:
-        """Of all columns together, where these are independent of each other."""
-        whole = LagSums(1, 0)
-        whole.score, whole.information = (each.sum(axis=1, keepdims=True) for each in (self.score, self.information))
-        whole.products = self.products
-        return whole
-
-    def clearest(self) -> Lag | None:
-        """Of all lags and columns (Bonferroni); None where there are too few numbers."""
+    def clearest(self, *, pooled: bool = False) -> Finding | None:
+        """Of all lags and columns (as agents; Bonferroni), or of the columns together; None with too few numbers."""
         lags = np.flatnonzero(self.products >= MIN_SAMPLES)
-        # Of numbers that all are 0 there is no information, and nothing to see.
-        score, information = self.score[lags], np.maximum(self.information[lags], np.finfo(float).tiny)
+        score, information = self.score[lags], self.information[lags]
         if not score.size:
             return None
+        if pooled:
+            score, information = score.sum(axis=1, keepdims=True), information.sum(axis=1, keepdims=True)
+        # Of numbers that all are 0 there is no information, and nothing to see.
+        information = np.maximum(information, np.finfo(float).tiny)
         z = score / np.sqrt(information)
         row, column = np.unravel_index(int(np.argmax(np.abs(z))), z.shape)
         log_p = math.log(2.0 * z.size) + float(log_normal_tail(abs(z[row, column])))
-        coefficient = float(score[row, column] / information[row, column])
-        return Lag(
-            log_p, int(column), int(lags[row]) + 1, coefficient, 1.0 / math.sqrt(float(information[row, column]))
+        known = float(information[row, column])
+        return Finding(
+            log_p,
+            agent=None if pooled else int(column),
+            span=(int(lags[row]) + 1, int(lags[row]) + 1),
+            estimate=float(score[row, column] / known),
+            standard_error=1.0 / math.sqrt(known),
+            expected=0.0,
         )
 
 
 def _products(joined: FloatArray, old: int, analyses: Analyses) -> FloatArray:
-    """(T, LAGS, columns): sums of numbers between the analyses times those 1 to 100 steps before.
-
-    ``joined`` (old + b, columns, samples): the numbers, after ``old`` earlier ones.
-    """
+    """(T, LAGS, columns): sums of numbers (b, columns, samples), behind ``old`` earlier ones, times those before."""
     found, columns = np.empty((analyses.count, LAGS, joined.shape[1])), joined.transpose(1, 2, 0)
     # By Fourier transforms so long that no two products overlap; stretches of about the same length together.
     classes = np.frexp(analyses.lengths + LAGS)[1]
@@ -207,73 +177,54 @@ def lag_evidence(score: FloatArray, information: FloatArray) -> FloatArray:
 
 
 class LongLags(Diagnostic):
-    """Regression of every residual on that of the same agent 1 to 100 steps before.
-
-    The test takes the clearest lag: of an agent, or of all together where they are independent, with half of the
-    level each.
-    """
+    """Regression of every residual on that of the same agent 1 to 100 steps before: the clearest lag."""
 
     name = "residuals: lags to 100"
     meaning = "the noise of a step depends on that of up to 100 steps before"
+    kind = "lag"
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)
-        self._agents, self._together = np.flatnonzero(law.noisy), bool(law.apart and law.noisy.sum() > 1)
-        self.sums = LagSums(len(self._agents), law.replicas)
+        self.lags = LagSums(len(self.agents), law.replicas)
 
     def add(self, block: Block) -> FloatArray:
         """Add the residuals of a block."""
-        return self._evidence(*self.sums.add(block.white[:, self._agents], block.analyses))
+        return self._evidence(*self.lags.add(block.white[:, self.agents], block.analyses))
 
     def merge(self, other: Self) -> None:
         """Add the sums of other runs."""
-        self.sums.merge(other.sums)
+        self.lags.merge(other.lags)
 
     def finding(self) -> Finding | None:
         """The clearest lag."""
-        each, whole = self.sums.clearest(), self.sums.pooled().clearest() if self._together else None
+        each, whole = self.lags.clearest(), self.lags.clearest(pooled=True) if self.together else None
         if each is None:
             return None
         best = min((lag for lag in (each, whole) if lag), key=lambda lag: lag.log_p)
-        return Finding(
-            min(0.0, best.log_p + math.log(1.0 + self._together)),
-            agent=None if best is whole else int(self._agents[best.column]),
-            span=(best.steps, best.steps),
-            estimate=best.coefficient,
-            standard_error=best.standard_error,
-            expected=0.0,
-        )
+        log_p = min(0.0, best.log_p + math.log(1.0 + self.together))  # half of the level each
+        return replace(best, agent=None if best.agent is None else self.agent(best.agent), log_p=log_p)
 
     def logarithms(self) -> FloatArray:
         """(100 (agents + 1), K): lags of each agent, and of all together."""
-        return self._evidence(self.sums.score, self.sums.information)
+        return self._evidence(self.lags.score, self.lags.information)
 
     def _evidence(self, score: FloatArray, information: FloatArray) -> FloatArray:
         """(..., 100 (agents + 1), K), from sums (..., LAGS, agents)."""
-        if self._together:
-            both = score, information
-            score, information = (np.append(each, each.sum(axis=-1, keepdims=True), axis=-1) for each in both)
-        found = lag_evidence(score, information)
+        found = lag_evidence(self.columns(score), self.columns(information))
         return found.reshape(*found.shape[:-3], -1, found.shape[-1])
 
     def about(self, row: int) -> str:
         """A lag of an agent, or of all."""
         column, lag = divmod(row, LAGS)
-        who = f"agent {self._agents[column] + 1}" if column < len(self._agents) else "all agents"
-        return f"noise of {who} and {lag + 1} steps before"
+        return f"noise of {agent_words(self.agent(column))} and {lag + 1} steps before"
 
     @classmethod
-    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+    def words(cls, found: Finding, names: Sequence[str]) -> str:
         """A correlation."""
         del names
         assert found.span is not None
-        value, interval = found.estimate or 0.0, found.interval
-        words = (
-            f"the noise of {found.whose} has correlation {numbers_text(value, interval)} with its own {found.span[0]} "
-            "steps before, not 0"
-        )
-        agent = None if found.agent is None else found.agent + 1
-        return Cause("lag", words, agent, None, None, value, interval, found.expected, p)
+        whose, steps = agent_words(found.agent), found.span[0]
+        return f"the noise of {whose} has correlation {found.numbers} with its own {steps} steps before, not 0"
 
 
 ROUNDINGS = 4.0  # of the largest state, in the computation of a state, at most
@@ -281,86 +232,76 @@ EPSILON = float(np.finfo(np.float64).eps)
 
 
 class ConstantState(Diagnostic):
-    """Steps in which no replica of an agent moves.
-
-    The density of a normal number is below 0.4 over its standard deviation, so the probability q of such a step is at
-    most that of hitting an interval of a few roundings, for every replica. The mean of 1 / q over the steps that stood
-    still, 0 for the others and 1 for those to come, is evidence; half of the whole always counts 1. Its inverse is the
-    p of the test (Markov).
-    """
+    """Steps in which no replica of an agent moves; the less probable, the more evidence, of which 1 / it is the p."""
 
     name = "residuals: constant state"
     meaning = "the state of an agent with noise does not change for some steps"
     subject = "agents whose state is constant"
+    kind = "frozen"
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)
-        self._agents = np.flatnonzero(law.noisy)
-        self._evidence = EventEvidence(law.planned * len(self._agents))
-        self._since = np.full(len(self._agents), -1)  # first step of what may go on, from 0; -1: moved
-        self._longest: tuple[int, int, Place] | None = None  # steps, agent, place
-        self._runs = 1
+        self._evidence = EventEvidence(law.planned * len(self.agents))
+        self._since = np.full(len(self.agents), -1)  # first step of what may go on, from 0; -1: moved
+        self._longest = Largest()  # steps of an agent
 
     def add(self, block: Block) -> FloatArray:
         """Add the steps of a block."""
         analyses = block.analyses
-        if not len(self._agents):
+        if not len(self.agents):
             return np.empty((analyses.count, 0, 1))
         before, after = block.reception.states, block.after
-        still: BoolArray = (after[:, self._agents] == before[:, self._agents]).all(axis=2)
+        still: BoolArray = (after[:, self.agents] == before[:, self.agents]).all(axis=2)
         at, which = np.nonzero(still)
+        # At most that of all replicas hitting an interval of a few roundings: a normal density is below 0.4 / sd.
         size = np.spacing(np.abs(before[at]).max(axis=1))  # (s, R)
-        chance = ROUNDINGS * (size / block.scale[at, self._agents[which]][:, None] + EPSILON)
-        seen, logarithms = analyses.lengths * len(self._agents), -np.log(np.minimum(chance, 1.0)).sum(axis=1)
-        for place in np.unique(which).tolist():
-            self._stretches(place, block.first, block.first + at[which == place])
-        moved = ~still[-1]
-        self._since[moved] = -1
+        chance = ROUNDINGS * (size / block.scale[at, self.agents[which]][:, None] + EPSILON)
+        seen, logarithms = analyses.lengths * len(self.agents), -np.log(np.minimum(chance, 1.0)).sum(axis=1)
+        for column in np.unique(which).tolist():
+            self._stretches(column, block.first, block.first + at[which == column])
+        self._since[~still[-1]] = -1
         return self._evidence.add(seen, logarithms, analyses.after(at))[:, None, None]
 
-    def _stretches(self, place: int, first: int, steps: IntArray) -> None:
+    def _stretches(self, column: int, first: int, steps: IntArray) -> None:
         """The longest stretch of an agent that did not move in ``steps`` from ``first`` on, ascending."""
         begins = steps[np.append(True, np.diff(steps) > 1)]
         ends = steps[np.append(np.diff(steps) > 1, True)]
-        if self._since[place] >= 0 and begins[0] == first:
-            begins[0] = self._since[place]
+        if self._since[column] >= 0 and begins[0] == first:
+            begins[0] = self._since[column]
         longest = int(np.argmax(ends - begins))
-        length = int(ends[longest] - begins[longest]) + 1
-        if self._longest is None or length > self._longest[0]:
-            found = Place(int(begins[longest]) + 1, int(ends[longest]) + 1)
-            self._longest = (length, int(self._agents[place]), found)
-        self._since[place] = begins[-1]
+        place = Place(int(begins[longest]) + 1, int(ends[longest]) + 1)
+        self._longest.take(place.last - place.first + 1.0, (self.agents[column],), place)
+        self._since[column] = begins[-1]
 
     def merge(self, other: Self) -> None:
-        """Nothing goes on from one run to another."""
+        """The longer stretch."""
         self._evidence.merge(other._evidence)
-        if other._longest and (self._longest is None or other._longest[0] > self._longest[0]):
-            length, agent, place = other._longest
-            self._longest = (length, agent, place.later(self._runs))
-        self._runs += other._runs
+        self._longest.merge(other._longest)
 
     def finding(self) -> Finding | None:
         """The longest stretch."""
-        if not len(self._agents):
+        if not len(self.agents):
             return None
-        log_p = min(0.0, -self._evidence.logarithm())
-        if self._longest is None:
+        log_p, longest = min(0.0, -float(self._evidence.logarithms()[0, 0])), self._longest
+        if not longest.of:
             return Finding(log_p)
-        length, agent, place = self._longest
-        return Finding(log_p, agent=agent, place=place, estimate=float(length), expected=0.0)
+        return Finding(log_p, agent=int(longest.of[0]), place=longest.place, estimate=longest.value, expected=0.0)
 
     def logarithms(self) -> FloatArray:
         """(1, 1)."""
-        return np.array([[self._evidence.logarithm()]]) if len(self._agents) else np.empty((0, 1))
+        return self._evidence.logarithms()
+
+    @classmethod
+    def words(cls, found: Finding, names: Sequence[str]) -> str:
+        """An agent in some steps."""
+        del names
+        assert found.place is not None
+        return f"{agent_words(found.agent)} did not move {found.place.words}, although it has noise"
 
     @classmethod
     def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
-        """An agent in some steps."""
-        assert found.place is not None
-        del names
-        words = f"{found.whose} did not move {found.place.words}, although it has noise"
-        agent = None if found.agent is None else found.agent + 1
-        return Cause("frozen", words, agent, None, None, None, None, found.expected, p, found.steps)
+        """Without the length, which is that of the steps."""
+        return replace(super().cause(found, names, p), estimate=None)
 
     @classmethod
     def causes(cls, search: Search) -> list[Cause]:

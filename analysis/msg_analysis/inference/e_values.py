@@ -3,10 +3,9 @@
 
 """E-values: evidence against a hypothesis that holds at any number of interim analyses.
 
-Evidence that holds at any time: likelihood ratios mixed over alternatives, in closed form, as logarithms.
-
-Each is a martingale of mean 1 while the null hypothesis holds, so it ever passes 1/level with probability at most
-``level`` (Ville's inequality). Sums over independent runs may be added up before.
+Likelihood ratios mixed over alternatives, in closed form, as logarithms. Each is a martingale of mean 1 while the null
+hypothesis holds, so it ever passes 1/level with probability at most ``level`` (Ville's inequality). Sums over
+independent runs may be added up before.
 """
 
 from __future__ import annotations
@@ -21,33 +20,14 @@ from scipy.special import betaln, gammaln
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Analyses:
     """Analyses at a block of b steps."""
 
-    ends: IntArray  # (T,) numbers of steps before each analysis, from 1, ascending; the last is b
-
-    @classmethod
-    def at_the_end(cls, steps: int) -> Analyses:
-        """Only one, after so many steps."""
-        return cls(np.array([steps]))
-
-    @property
-    def count(self) -> int:
-        """T."""
-        return len(self.ends)
-
-    @property
-    def begins(self) -> IntArray:
-        """(T,): first step between each analysis and the one before it."""
-        begins = np.zeros_like(self.ends)
-        begins[1:] = self.ends[:-1]
-        return begins
-
-    @property
-    def lengths(self) -> IntArray:
-        """(T,): steps between each analysis and the one before it."""
-        return self.ends - self.begins
+    def __init__(self, ends: IntArray) -> None:
+        self.ends = ends  # (T,) numbers of steps before each analysis, from 1, ascending; the last is b
+        self.count = len(ends)  # T
+        self.begins: IntArray = np.append(0, ends[:-1])  # (T,) first step between each analysis and the one before it
+        self.lengths = ends - self.begins  # (T,) steps between these
 
     def after(self, steps: IntArray) -> IntArray:
         """The analysis that comes next after each of these steps, from 0."""
@@ -76,38 +56,21 @@ PROPORTION_STRENGTHS = (2.0, 20.0, 200.0)  # successes that the alternatives are
 def variance_evidence(
     samples: FloatArray | IntArray, squares: FloatArray, constant: FloatArray | None = None
 ) -> FloatArray:
-    """Against variance 1 of independent normal samples: factors theta of the variance ~ inverse gamma(a, b), b = a c.
+    """(..., K) for each of ``VARIANCES``, against variance 1 of n (...) normal samples with sum of squares S (...).
 
-    log of b^a G(a + n/2) exp(S/2) / (G(a) (b + S/2)^(a + n/2)), the mixture of the likelihood ratios of theta.
-
-    Parameters
-    ----------
-    samples
-        (..., ) numbers n
-    squares
-        (..., ) sums of squares S
-    constant
-        (..., K) ``variance_constant(samples)``, where it is known: it takes most of the time
-
-    Returns
-    -------
-    FloatArray
-        (..., K) of each of ``VARIANCES``
+    log of b^a G(a + n/2) exp(S/2) / (G(a) (b + S/2)^(a + n/2)), the mixture of the likelihood ratios of factors theta
+    of the variance ~ inverse gamma(a, b), b = a c. ``constant``: of ``variance_constant``, which takes most of the
+    time.
     """
     half, s = np.asarray(samples, dtype=float) / 2.0, np.asarray(squares) / 2.0
-    known = _variance_constant(samples) if constant is None else _to_front(constant)
+    known = variance_constant(samples) if constant is None else constant
     strengths, near = (_first(each, max(half.ndim, s.ndim)) for each in (_STRENGTHS, _NEAR))
     # (a + n/2) log(b / (b + s)) instead of two large terms that cancel.
     return _to_back(known - (strengths + half) * np.log1p(s / near) + s)
 
 
 def variance_constant(samples: FloatArray | IntArray) -> FloatArray:
-    """(..., K): log of G(a + n/2) / (G(a) b^(n/2)), what ``variance_evidence`` has of the numbers n (..., ) alone."""
-    return _to_back(_variance_constant(samples))
-
-
-def _variance_constant(samples: FloatArray | IntArray) -> FloatArray:
-    """(K, ...)."""
+    """(K, ...): log of G(a + n/2) / (G(a) b^(n/2)), what ``variance_evidence`` has of the numbers n (..., ) alone."""
     half = np.asarray(samples, dtype=float) / 2.0
     strengths, near = (_first(each, half.ndim) for each in (_STRENGTHS, _NEAR))
     return np.asarray(gammaln(strengths + half) - gammaln(strengths) - half * np.log(near))
@@ -123,27 +86,11 @@ def _to_back(found: FloatArray) -> FloatArray:
     return found.transpose(*range(1, found.ndim), 0)
 
 
-def _to_front(given: FloatArray) -> FloatArray:
-    """(K, ...) of (..., K)."""
-    return given.transpose(-1, *range(given.ndim - 1))
-
-
 def coefficient_evidence(score: FloatArray, information: FloatArray) -> FloatArray:
-    """Against the coefficient 0 of a regressor of normal samples of known variance: coefficients ~ N(0, tau^2).
+    """(..., K) for each tau of ``SHARES``, against coefficient 0 of a regressor of normal samples of known variance.
 
-    log of (1 + tau^2 J)^(-1/2) exp(tau^2 U^2 / (2 (1 + tau^2 J))).
-
-    Parameters
-    ----------
-    score
-        (..., ) U, sum of regressor times sample over variance
-    information
-        (..., ) J, sum of squared regressor over variance
-
-    Returns
-    -------
-    FloatArray
-        (..., K) of each tau in ``SHARES``
+    log of (1 + tau^2 J)^(-1/2) exp(tau^2 U^2 / (2 (1 + tau^2 J))), the mixture over coefficients ~ N(0, tau^2); U (...)
+    is the sum of regressor times sample over variance, J (...) that of the squared regressor over variance.
     """
     u, j = np.asarray(score), np.asarray(information)
     tau2 = _first(np.array(SHARES) ** 2, max(u.ndim, j.ndim))
@@ -152,21 +99,10 @@ def coefficient_evidence(score: FloatArray, information: FloatArray) -> FloatArr
 
 
 def row_evidence(counts: FloatArray | IntArray, law: FloatArray) -> FloatArray:
-    """Against a row of a transition matrix: rows ~ Dirichlet(alpha P), for several alpha.
+    """(..., n, K) against each row of a transition matrix P (n, n), from ``counts`` (..., n, n) of transitions.
 
-    log of B(alpha P + c) / (B(alpha P) prod_h P_h^c_h); infinite after a transition that P excludes.
-
-    Parameters
-    ----------
-    counts
-        (..., n, n) transitions
-    law
-        (n, n) P
-
-    Returns
-    -------
-    FloatArray
-        (..., n, K) of each row; alpha is ``ROW_STRENGTHS`` over the probability of a change
+    log of B(alpha P + c) / (B(alpha P) prod_h P_h^c_h), the mixture over rows ~ Dirichlet(alpha P), alpha being
+    ``ROW_STRENGTHS`` over the probability of a change; infinite after a transition that P excludes.
     """
     n = len(law)
     leaving = 1.0 - np.diag(law)
@@ -187,21 +123,10 @@ def row_evidence(counts: FloatArray | IntArray, law: FloatArray) -> FloatArray:
 def proportion_evidence(
     successes: IntArray, trials: IntArray, probability: FloatArray | float, constant: FloatArray | None = None
 ) -> FloatArray:
-    """Against a known probability of independent successes: probabilities ~ beta of that mean.
+    """(..., K) for each of ``PROPORTION_STRENGTHS``, against a known probability p (...) of independent successes.
 
-    Parameters
-    ----------
-    successes, trials
-        (..., ) counts
-    probability
-        (..., ) between 0 and 1, both excluded
-    constant
-        (..., K) ``proportion_constant(probability)``, where it is known
-
-    Returns
-    -------
-    FloatArray
-        (..., K) log of the mixture for each of ``PROPORTION_STRENGTHS``
+    log of B(a + s, b + t - s) / (B(a, b) p^s (1 - p)^(t - s)) for s of t (...), the mixture over probabilities ~
+    beta(a, b) of mean p. ``constant``: ``proportion_constant(probability)``, where it is known.
     """
     p = np.asarray(probability, dtype=float)[..., None]
     hit, miss = np.asarray(successes)[..., None], (np.asarray(trials) - np.asarray(successes))[..., None]
@@ -269,10 +194,7 @@ class EndedWindows:
 
 
 class Windows:
-    """Sums over windows of a run of ``planned`` steps, as these go by: memory for one window of each length.
-
-    Windows of 2^l steps begin at every multiple of 2^(l-1) steps.
-    """
+    """Sums over windows of 2^l steps of a run of ``planned`` steps, which begin at every multiple of 2^(l-1) steps."""
 
     def __init__(self, planned: int, columns: int) -> None:
         self.levels = max(planned, 1).bit_length()
@@ -315,11 +237,7 @@ class Windows:
 
 
 class WindowEvidence:
-    """The mean of evidence over all windows of a run, lengths with equal weight; runs are multiplied.
-
-    A window counts 1 before it begins, 0 while it goes on and its evidence when it has ended: never more than the
-    martingale of which it is the end.
-    """
+    """The mean of evidence over all windows of a run, lengths with equal weight; runs are multiplied."""
 
     def __init__(self, windows: Windows, columns: int) -> None:
         self._windows = windows
@@ -347,27 +265,22 @@ class WindowEvidence:
 
     def _after(self, steps: IntArray, ended: FloatArray) -> FloatArray:
         """(..., K): after so many steps (...), from the logs (..., K) of the sum over the windows that ended."""
+        # A window counts 1 before it begins, 0 while it goes on and its evidence when it has ended: never more than the
+        # martingale of which it is the end.
         rest = (1.0 - self._windows.begun(steps) / self._windows.planned).mean(axis=-1)
         with np.errstate(divide="ignore"):
             return np.asarray(self._others + np.logaddexp(ended, np.log(rest)[..., None]))
 
 
 class EventEvidence:
-    """The mean of evidence over the ``planned`` events of a run, those to come with 1; runs are multiplied.
-
-    Half of the whole always counts 1: so events whose evidence is 0, as nearly all have, do not wear it out.
-    """
+    """The mean of evidence over the ``planned`` events of a run, those to come with 1; runs are multiplied."""
 
     def __init__(self, planned: int) -> None:
         self.planned = planned
         self._seen, self._ended, self._others = 0, -np.inf, 0.0
 
     def add(self, seen: IntArray, logarithms: FloatArray, analyses: IntArray) -> FloatArray:
-        """The evidence after each of T analyses, (T,).
-
-        ``seen`` (T,): events between each analysis and the one before it; ``logarithms`` (e,): those of the evidence
-        that is not 0, and the ``analyses`` (e,) that come next.
-        """
+        """(T,): after each analysis, of ``seen`` (T,) events between, with evidence (e,) before ``analyses`` (e,)."""
         ended = np.full(len(seen), -np.inf)
         np.logaddexp.at(ended, analyses, logarithms - math.log(self.planned))
         ended = np.logaddexp.accumulate(np.append(self._ended, ended))[1:]
@@ -377,15 +290,18 @@ class EventEvidence:
 
     def merge(self, other: EventEvidence) -> None:
         """With that of other runs."""
-        self._others += other.logarithm()
+        self._others += float(other.logarithms().sum())
 
-    def logarithm(self) -> float:
-        """Of the evidence so far."""
-        return float(self._after(np.array(self._seen), np.array(self._ended)))
+    def logarithms(self) -> FloatArray:
+        """(1, 1) of the evidence so far; (0, 1) where there is no event."""
+        if not self.planned:
+            return np.empty((0, 1))
+        return self._after(np.array([[self._seen]]), np.array([[self._ended]]))
 
     def _after(self, seen: IntArray, ended: FloatArray) -> FloatArray:
         """Of so many events, and the log of the sum over them."""
         rest = np.maximum(0.0, 1.0 - seen / self.planned)
         with np.errstate(divide="ignore"):
             mean = np.logaddexp(ended, np.log(rest))
+        # Half of the whole always counts 1: so events whose evidence is 0, as nearly all have, do not wear it out.
         return np.asarray(self._others + np.logaddexp(0.0, mean) - math.log(2.0))

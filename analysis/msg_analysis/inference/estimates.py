@@ -92,10 +92,7 @@ def estimates(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Esti
 
 
 def beside(measured: FloatArray, predicted: FloatArray, errors: FloatArray) -> tuple[Estimate, list[Estimate]]:
-    """Estimates of the system error and of the node errors from arrays (1 + nodes,), the system error first.
-
-    ``errors`` are standard errors. The p-values of the nodes are adjusted by Holm.
-    """
+    """Estimates of the system error and of the node errors (Holm), from arrays (1 + nodes,), the system error first."""
     found = [estimate(*numbers, predicted[0]) for numbers in zip(measured, predicted, errors, strict=True)]
     tested = [i for i, entry in enumerate(found) if i > 0 and entry.p is not None]
     adjusted = dict(zip(tested, holm(np.array([found[i].p for i in tested], dtype=float)), strict=True))
@@ -116,20 +113,7 @@ def estimate(measured: float, predicted: float, error: float, scale: float) -> E
 
 
 def covariance_test(means: TimeMeans, system: JumpSystem) -> CovarianceTest:
-    """Test of all second moments together: the quadratic form of measured - predicted is chi-square.
-
-    Parameters
-    ----------
-    means
-        of the run, or of several
-    system
-        the reduced system whose moments they are
-
-    Returns
-    -------
-    CovarianceTest
-        without ``chi2`` where not all moments are estimated together; without ``p`` where dof = 0
-    """
+    """Quadratic form of measured - predicted second moments; without ``chi2`` where they are not estimated together."""
     frame = system.frame
     measured = frame @ means.second_moments @ frame.T
     predicted = frame @ means.expected_moments @ frame.T
@@ -167,17 +151,6 @@ class Distinction:
     confidence: float  # 1 - p, adjusted for all pairs (Holm)
     predicted: bool | None  # whether the predicted order is the same; None if equal or unknown
 
-    def to_json(self) -> dict[str, Any]:
-        """The JSON document."""
-        return {
-            "better": self.better,
-            "worse": self.worse,
-            "difference": self.difference,
-            "standard_error": self.standard_error,
-            "confidence": self.confidence,
-            "predicted": self.predicted,
-        }
-
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
@@ -212,8 +185,8 @@ class Ranking:
             "pairs": self.pairs,
             "distinguished": len(self.distinctions),
             "ties": [list(pair) for pair in self.ties],
-            "contradictions": [pair.to_json() for pair in self.contradictions],
-            "distinctions": [pair.to_json() for pair in self.distinctions],
+            "contradictions": [asdict(pair) for pair in self.contradictions],
+            "distinctions": [asdict(pair) for pair in self.distinctions],
         }
 
 
@@ -228,17 +201,7 @@ def rank_agents(means: TimeMeans, level: float) -> Ranking | None:
 def rank_estimates(
     measured: FloatArray, covariance: FloatArray, predicted: FloatArray | None, level: float
 ) -> Ranking | None:
-    """Order estimates, and distinguish pairs of them by z-tests, adjusted by Holm.
-
-    None where there is no pair, no noise, or more than ``MAX_RANKED_PAIRS``.
-
-    Parameters
-    ----------
-    measured, covariance, predicted
-        (q,) estimates, their (q, q), and (q,) what they should be, or None
-    level
-        probability of any wrong distinction, at most
-    """
+    """Order estimates (q,), and distinguish pairs of them by z-tests (Holm); None without pairs or noise."""
     q = len(measured)
     first, second = np.triu_indices(q, 1)
     if not 0 < len(first) <= MAX_RANKED_PAIRS:
@@ -252,10 +215,15 @@ def rank_estimates(
     first, second, difference, error = first[usable], second[usable], difference[usable], np.sqrt(variance[usable])
     adjusted = holm(two_sided(difference / error))
     apart = np.flatnonzero(adjusted < level)
-    found = [
-        _distinction(*_sorted(first[a], second[a], difference[a]), abs(difference[a]), error[a], adjusted[a], predicted)
-        for a in apart[np.argsort(adjusted[apart], kind="stable")]
-    ]
+    found = []
+    for a in apart[np.argsort(adjusted[apart], kind="stable")].tolist():
+        better, worse = (first[a], second[a]) if difference[a] > 0.0 else (second[a], first[a])
+        agrees = None
+        if predicted is not None:
+            gap = float(predicted[worse] - predicted[better])
+            agrees = None if abs(gap) <= EQUAL * float(predicted.max()) else gap > 0.0
+        size, confidence = abs(float(difference[a])), 1.0 - float(adjusted[a])
+        found.append(Distinction(int(better) + 1, int(worse) + 1, size, float(error[a]), confidence, agrees))
     return Ranking(
         ranking=_ranking(measured),
         predicted_ranking=None if predicted is None else _ranking(predicted),
@@ -263,20 +231,6 @@ def rank_estimates(
         pairs=len(first),
         level=level,
     )
-
-
-def _sorted(first: int, second: int, difference: float) -> tuple[int, int]:
-    return (first, second) if difference > 0.0 else (second, first)
-
-
-def _distinction(
-    better: int, worse: int, difference: float, error: float, p: float, predicted: FloatArray | None
-) -> Distinction:
-    agrees: bool | None = None
-    if predicted is not None:
-        gap = float(predicted[worse] - predicted[better])
-        agrees = None if abs(gap) <= EQUAL * float(predicted.max()) else gap > 0.0
-    return Distinction(int(better) + 1, int(worse) + 1, float(difference), float(error), 1.0 - float(p), agrees)
 
 
 def _ranking(values: FloatArray) -> tuple[int, ...]:

@@ -52,10 +52,7 @@ class EventOrder:
         return cls(position, newest)
 
     def events(self, first: int, last: int) -> tuple[IntArray, IntArray]:
-        """Steps and agents (e,) of the events after sampling time first - 1 and up to last - 1, agent after agent.
-
-        ``first``: 0 for the beginning; ``last``: N + 2 for the end.
-        """
+        """Steps and agents (e,) of the events after sampling time first - 1 and up to last - 1 (0 and N + 2: all)."""
         m = self.newest.shape[1]
         begin = self.newest[first - 1] if first else np.zeros(m, dtype=np.int64)
         end = self.newest[last - 1] if last <= len(self.newest) else np.full(m, len(self.position))
@@ -68,11 +65,9 @@ def _zeros(rows: int, columns: int) -> IntArray:
 
 
 def order_events(observation: Observation, ties_at_once: int = TIES_AT_ONCE) -> EventOrder:
-    """Order the events of a run in real time by time; at equal times, a value comes before the steps that use it.
-
-    Equal times are common where the agents' clock moves in jumps, and when a late agent catches up.
-    """
-    timers = _timers(observation)
+    """Order the events of a run in real time by time; at equal times, a value comes before the steps that use it."""
+    # Equal times are common where the agents' clock moves in jumps, and when a late agent catches up.
+    timers = observation.timed
     newest = newest_steps(observation)
     contradiction, ties = _early_and_equal(observation, timers)
     turn, circular = _turns_of(timers, ties, ties_at_once)
@@ -80,7 +75,9 @@ def order_events(observation: Observation, ties_at_once: int = TIES_AT_ONCE) -> 
         contradiction = contradiction or "agents used new values of each other at the same time"
     order = EventOrder(_zeros(*timers.graphs.shape), newest, contradiction)
     placed = 0
-    for first, last in _blocks_of_periods(observation):
+    numbers = (4 + observation.step.most_neighbours) * observation.step.agents
+    ends = [last for _, last in observation.blocks(numbers, "order of the steps")]
+    for first, last in pairwise([0, *ends[:-1], observation.steps + 2]):  # so that all events are in one of the blocks
         steps, agents = order.events(first, last)
         chosen = np.lexsort((agents, steps, turn[steps + 1, agents], timers.made[steps + 1, agents]))
         order.position[steps[chosen], agents[chosen]] = np.arange(placed, placed + len(chosen))
@@ -88,13 +85,6 @@ def order_events(observation: Observation, ties_at_once: int = TIES_AT_ONCE) -> 
         for array in (order.position, order.newest, turn):
             release(array)
     return order
-
-
-def _blocks_of_periods(observation: Observation) -> Iterator[tuple[int, int]]:
-    """As for ``EventOrder.events``, so that all events are in one of the blocks."""
-    numbers = (4 + observation.step.most_neighbours) * observation.step.agents
-    ends = [last for _, last in observation.blocks(numbers, "order of the steps")]
-    return pairwise([0, *ends[:-1], observation.steps + 2])
 
 
 def _early_and_equal(observation: Observation, timers: Timers) -> tuple[str | None, IntArray]:
@@ -166,7 +156,7 @@ def _turns(source: IntArray, target: IntArray, count: int) -> tuple[IntArray, bo
 
 def newest_steps(observation: Observation) -> IntArray:
     """``EventOrder.newest`` of a run in real time."""
-    made, times = _timers(observation).made, sampling_times(observation)
+    made, times = observation.timed.made, sampling_times(observation)
     newest = _zeros(*made.shape)
     for i in range(made.shape[1]):
         found = np.searchsorted(np.maximum.accumulate(column(made, i)), times, side="right") - 1
@@ -200,32 +190,18 @@ def sampling_times(observation: Observation) -> IntArray:
     return StepClock(observation.step.dt).times(np.arange(observation.steps + 1))
 
 
-def _timers(observation: Observation) -> Timers:
-    assert observation.timers is not None
-    return observation.timers
-
-
 OWN = int(np.iinfo(np.int32).min)  # stands for a value that was never received; the agent's own value takes its place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PeriodTables:
-    """All that the maps of the periods depend on, of period K in the rows ends[K] to ends[K + 1]."""
+class PeriodTable:
+    """Rows of the periods, of period K those from ends[K] to ends[K + 1]."""
 
-    # Agent, graph, step - K of the noise that is shared, own step, steps of the values used, and whether a message is
-    # used once (0), for the first of several times (1) or again (2): steps from the newest ones at K - 1.
-    events: IntArray
-    event_ends: IntArray
-    extras: IntArray  # entry, step from the newest one (of a source of noise: from K) of what is stacked at K
-    extra_ends: IntArray
+    rows: IntArray
+    ends: IntArray
 
-    def of_events(self, number: int) -> IntArray:
-        """The events of a period, in their order."""
-        return self.events[self.event_ends[number] : self.event_ends[number + 1]]
-
-    def of_extras(self, number: int) -> IntArray:
-        """What is stacked after the newest states."""
-        return self.extras[self.extra_ends[number] : self.extra_ends[number + 1]]
+    def __getitem__(self, number: int) -> IntArray:
+        return self.rows[self.ends[number] : self.ends[number + 1]]
 
 
 class Entries:
@@ -241,10 +217,12 @@ class Entries:
         self.shared: BoolArray = np.asarray((step.noise_gain != 0.0).any(axis=0).sum(axis=0) > 1)
 
 
-def period_tables(observation: Observation, order: EventOrder) -> PeriodTables:
-    """The tables of a run in real time, made in blocks of steps, then in blocks of periods."""
-    assert observation.timers is not None
-    return _Maker(observation, observation.timers, order).tables()
+def period_tables(observation: Observation, order: EventOrder) -> tuple[PeriodTable, PeriodTable]:
+    """All that the maps of the periods of a run in real time depend on: events, in their order, and what is stacked."""
+    # Events: agent, graph, step - K of the noise that is shared, own step, steps of the values used, and whether a
+    # message is used once (0), for the first of several times (1) or again (2): steps from the newest ones at K - 1.
+    # What is stacked at K after the newest states: entry, step from the newest one (of a source of noise: from K).
+    return _Maker(observation, observation.timed, order).tables()
 
 
 class _Maker:
@@ -259,7 +237,7 @@ class _Maker:
         if observation.step.link:
             self._begun = self._first_uses()
 
-    def tables(self) -> PeriodTables:
+    def tables(self) -> tuple[PeriodTable, PeriodTable]:
         """Of all periods."""
         steps, most = self._observation.steps, self._step.most_neighbours
         lives, parts = self._lives()
@@ -273,7 +251,7 @@ class _Maker:
             release(lives)
             extras.append(found[:, 1:])
             extra_ends[first + 1 : last + 1] = np.bincount(found[:, 0] - first, minlength=last - first)
-        return PeriodTables(events.array(), np.cumsum(event_ends), extras.array(), np.cumsum(extra_ends))
+        return PeriodTable(events.array(), np.cumsum(event_ends)), PeriodTable(extras.array(), np.cumsum(extra_ends))
 
     def _blocks(self) -> Iterator[tuple[int, int]]:
         numbers = 4 * (4 + 2 * self._step.most_neighbours) * self._step.agents
@@ -308,7 +286,7 @@ class _Maker:
         return begun
 
     def _events(self, first: int, last: int) -> IntArray:
-        """Rows of the period and of ``PeriodTables.events``."""
+        """Rows of the period and of its events."""
         k, i = self._order.events(first, last)
         by = np.argsort(self._order.position[k, i])
         k, i = k[by], i[by]
@@ -373,7 +351,7 @@ class _Maker:
             yield np.column_stack([entry, np.arange(begin, end), first, last])
 
     def _stacked(self, lives: AnyArray, parts: list[tuple[int, int, slice]], first: int, last: int) -> IntArray:
-        """Rows of the sampling time and of ``PeriodTables.extras``, each once, sorted."""
+        """Rows of the sampling time and of what is stacked there, each once, sorted."""
         chosen = [lives[rows].astype(np.int64) for low, high, rows in parts if low < last and high >= first]
         entry, step, begin, end = np.concatenate([np.empty((0, 4), np.int64), *chosen]).T
         at, which = spread(np.maximum(begin, first), np.minimum(end, last - 1))

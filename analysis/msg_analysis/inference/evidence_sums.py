@@ -32,12 +32,7 @@ FARTHEST = 1e4
 
 
 class EvidenceSums:
-    """Sums for the evidence of all questions.
-
-    Given its past and, with reception noise and in real time, what was received, each is exact; the system error only
-    in lockstep without noise or loss of messages. With ``in_detail``, the diagnostics are asked, too, which take as
-    much time as all others together.
-    """
+    """Sums for the evidence of all questions; with ``in_detail``, of the diagnostics, too."""
 
     def __init__(self, prediction: Prediction, replicas: int, *, in_detail: bool = False) -> None:
         experiment, step = prediction.experiment, prediction.step
@@ -60,6 +55,7 @@ class EvidenceSums:
         first, second = np.triu_indices(m, 1)
         paired = usable[first] & usable[second] & (len(first) <= MOST_PAIRS) & (not correlated)
         independent_losses = step.burst is None and not real_time
+        # Given its past and what was received, each sum is exact; the system error only where nothing is added or lost.
         self.error = ErrorMartingale.of(prediction, replicas) if self.plain else None
         self._law = law = Law(
             step=step,
@@ -78,44 +74,23 @@ class EvidenceSums:
         self.questions = {kind.name: kind(law) for kind in asked}
         self.diagnostics = [each for each in self.questions.values() if isinstance(each, Diagnostic)]
         self.total = self._zeros(1)
-
-    @property
-    def numbers_per_analysis(self) -> int:
-        """Of temporary arrays, of one interim analysis."""
-        m, n = self._step.agents, self._step.modes
-        lags = 10 * LAGS * (m + 1) if self.diagnostics else 0
-        return 8 * m**2 + n**2 + lags
+        # Of temporary arrays: of one interim analysis, and of one step.
+        self.numbers_per_analysis = 8 * m**2 + step.modes**2 + (10 * LAGS * (m + 1) if self.diagnostics else 0)
+        numbers = (4 + step.most_neighbours) * m * replicas + m**2
+        error = self.error
+        self.numbers_per_step = max(numbers, error.numbers * (1 + len(error.rates))) if error else numbers
 
     def add(
-        self, observation: Observation, first: int, last: int, received: tuple[ReceivedValues, FloatArray] | None = None
-    ) -> None:
-        """Add the steps first..last-1 of a run, which follow those that were added before.
-
-        ``received``: what was received in them, and their residuals (b, m, R), where these are known.
-        """
-        self._add(observation, first, last, Analyses.at_the_end(last - first), received)
-
-    def analyse(
         self,
         observation: Observation,
         first: int,
         last: int,
-        analyses: Analyses,
         received: tuple[ReceivedValues, FloatArray] | None = None,
-    ) -> FloatArray:
-        """Add steps as ``add`` does: (T,) logs of the evidence against the whole law after each analysis."""
-        running, known = self._add(observation, first, last, analyses, received)
-        return self._log_evidence(running, self._families(running, known))
-
-    def _add(
-        self,
-        observation: Observation,
-        first: int,
-        last: int,
-        analyses: Analyses,
-        received: tuple[ReceivedValues, FloatArray] | None,
+        analyses: Analyses | None = None,
     ) -> tuple[RunningSums, dict[str, FloatArray]]:
-        """The sums and the evidence of the diagnostics after each analysis."""
+        """Add the next steps first..last-1: the sums and the evidence of the diagnostics after each analysis."""
+        # ``received`` in the steps, and their residuals (b, m, R), where these are known.
+        analyses = analyses or Analyses(np.array([last - first]))
         # One analysis needs no copies of what may be large.
         parts = self.total if analyses.count == 1 else self._zeros(analyses.count)
         found: dict[str, FloatArray] = {}
@@ -130,13 +105,12 @@ class EvidenceSums:
             found = {each.name: each.add(block) for each in self.diagnostics}
         graphs = observation.modes[first : last + 1]
         now, following = graphs[:-1], graphs[1:]
-        analysis = analyses.after(np.arange(len(now)))
-        self._add_transitions(parts, analysis, now, following)
+        self.add_transitions(now, following, parts, analyses.after(np.arange(len(now))))
         if observation.published is not None:
-            self._add_broadcast(parts, analyses, observation.published[first:last] - observation.states[first:last])
+            self.add_broadcast(observation.published[first:last] - observation.states[first:last], parts, analyses)
         if self.error is not None and len(now):
             a = np.ones((len(graphs), self.error.numbers))
-            a[:, :-1] = moments(observation, first, first + len(graphs), observation.states)
+            a[:, :-1] = moments(observation, first, first + len(graphs))
             steps = np.zeros((last - first, len(self.error.rates)))
             steps[: len(now)] = self.error.steps(now, following, a[:-1], a[1:])
             parts.error += analyses.sums(steps)
@@ -150,30 +124,27 @@ class EvidenceSums:
         rates = 0 if self.error is None else len(self.error.rates)
         return RunningSums.zeros(analyses, self._step.agents, self._step.modes, rates)
 
-    def add_transitions(self, graphs: IntArray, following: IntArray) -> None:
-        """Add steps of the switching: graphs (k,) and those of the next step (k,)."""
-        self._add_transitions(self.total, np.zeros_like(graphs), graphs, following)
-
-    def _add_transitions(self, parts: RunningSums, analysis: IntArray, graphs: IntArray, following: IntArray) -> None:
-        modes, shape = self._step.modes, parts.counts.shape
+    def add_transitions(
+        self, graphs: IntArray, following: IntArray, parts: RunningSums | None = None, analysis: IntArray | int = 0
+    ) -> None:
+        """Add steps of the switching: graphs (k,) and those of the next step (k,), before an ``analysis`` (k,)."""
+        counts, modes = (parts or self.total).counts, self._step.modes
         place = (analysis * modes + graphs) * modes + following
-        parts.counts += np.bincount(place, minlength=parts.counts.size).reshape(shape)
+        counts += np.bincount(place, minlength=counts.size).reshape(counts.shape)
 
-    def add_broadcast(self, added: FloatArray) -> None:
+    def add_broadcast(
+        self, added: FloatArray, parts: RunningSums | None = None, analyses: Analyses | None = None
+    ) -> None:
         """Add what was published minus the states (b, m, R)."""
-        self._add_broadcast(self.total, Analyses.at_the_end(len(added)), added)
-
-    def _add_broadcast(self, parts: RunningSums, analyses: Analyses, added: FloatArray) -> None:
         if self._noise.broadcast:
+            parts, analyses = parts or self.total, analyses or Analyses(np.array([len(added)]))
             parts.broadcast_samples += analyses.lengths * added.shape[2]
             parts.broadcast_squares += analyses.sums((added**2).sum(axis=2)) / self._noise.broadcast**2
 
     def add_received(self, reception: ReceivedValues, e: FloatArray, lost: BoolArray | None, largest: float) -> None:
-        """Add steps by what was received, in any order: their residuals (b, m, R), the lost messages (b, m, D), if any.
-
-        Of a step with an infinite ``link_variance``, the agent is left out. ``largest``: size of the largest state.
-        """
-        analyses = Analyses.at_the_end(len(e))
+        """Add steps, in any order: residuals (b, m, R), lost messages (b, m, D), and size of the ``largest`` state."""
+        # Of a step with an infinite ``link_variance``, the agent is left out.
+        analyses = Analyses(np.array([len(e)]))
         scale = self._scales(self.total, analyses, reception, e, largest)
         self._add_received(self.total, analyses, reception, e / scale[:, :, None], scale, lost)
 
@@ -342,6 +313,10 @@ class EvidenceSums:
         families = self.families() if families is None else families
         return float(self._log_evidence(self.total, {name: found[None] for name, found in families.items()})[0])
 
+    def log_evidence(self, sums: RunningSums, known: dict[str, FloatArray]) -> FloatArray:
+        """(T,): of the evidence after each analysis, of what ``add`` returns."""
+        return self._log_evidence(sums, self._families(sums, known))
+
     def _log_evidence(self, sums: RunningSums, families: dict[str, FloatArray]) -> FloatArray:
         """(T,): the weighted mean over the questions of the mean over their rows, after each analysis."""
         total = np.zeros(len(sums.impossible))
@@ -355,51 +330,34 @@ class EvidenceSums:
 LARGEST_LOGARITHM = 700.0  # evidence beyond is not shown as a number: floating point ends there
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class WatchedEvidence:
-    """Sums over a run, and the evidence after some of its steps; of several runs, only the sums."""
+    """Sums over a run, and the evidence after the numbers of ``steps`` (T,), of which the last is all."""
 
-    sums: EvidenceSums
-    dt: float
-    steps: IntArray | None  # (T,) ascending, the last is all steps
-    logarithms: FloatArray | None  # (T,) of the evidence after them
+    def __init__(self, observation: Observation, steps: IntArray) -> None:
+        self.sums = EvidenceSums(observation.prediction, observation.replicas, in_detail=True)
+        self.dt = observation.step.dt
+        self.steps: IntArray | None = steps  # None, as the logarithms (T,), of several runs
+        self.logarithms: FloatArray | None = np.empty(len(steps))
+        self._done = 0
+        self._most = max(1, BLOCK_NUMBERS // self.sums.numbers_per_analysis)  # analyses in one pass
 
     @classmethod
-    def of(cls, observation: Observation, analyses: IntArray) -> WatchedEvidence:
-        """Of a run, at the numbers of steps ``analyses`` (T,), ascending, the last of which is all steps."""
-        watch = Watch(observation, analyses)
-        for first, last in observation.blocks(watch.numbers_per_step, "evidence"):
-            watch.add(first, last)
-        return watch.result()
+    def of(cls, observation: Observation, steps: IntArray) -> WatchedEvidence:
+        """Of a run."""
+        watched = cls(observation, steps)
+        for first, last in observation.blocks(watched.sums.numbers_per_step, "evidence"):
+            watched.add(observation, first, last)
+        return watched
 
-    def merged(self, other: WatchedEvidence) -> WatchedEvidence:
-        """Of these and other runs of the same experiment; the sums of ``self`` are changed in place."""
-        self.sums.merge(other.sums)
-        return WatchedEvidence(self.sums, self.dt, None, None)
-
-
-class Watch:
-    """Adds the steps of a run in order, and takes the evidence after the numbers of steps ``analyses`` (T,)."""
-
-    def __init__(self, observation: Observation, analyses: IntArray) -> None:
-        self._observation, self._analyses = observation, analyses
-        self._sums = EvidenceSums(observation.prediction, observation.replicas, in_detail=True)
-        self._logarithms = np.empty(len(analyses))
-        self._done = 0
-        self._most = max(1, BLOCK_NUMBERS // self._sums.numbers_per_analysis)  # analyses in one pass
-
-    @property
-    def numbers_per_step(self) -> int:
-        """Of temporary arrays."""
-        step, error = self._observation.step, self._sums.error
-        numbers = (4 + step.most_neighbours) * self._observation.states[0].size + step.agents**2
-        return int(numbers if error is None else max(numbers, error.numbers * (1 + len(error.rates))))
-
-    def add(self, first: int, last: int, received: tuple[ReceivedValues, FloatArray] | None = None) -> None:
-        """Add the steps first..last-1; ``received`` as of ``EvidenceSums.add``."""
+    def add(
+        self, observation: Observation, first: int, last: int, received: tuple[ReceivedValues, FloatArray] | None = None
+    ) -> None:
+        """Add the next steps first..last-1; ``received`` as of ``EvidenceSums.add``."""
+        assert self.steps is not None
+        assert self.logarithms is not None
         begin = first
         while first < last:
-            ends = self._analyses[self._done : self._done + self._most]
+            ends = self.steps[self._done : self._done + self._most]
             ends = ends[ends <= last]
             done = self._done + len(ends)
             if len(ends) < self._most and (not len(ends) or ends[-1] < last):
@@ -409,21 +367,19 @@ class Watch:
                 received[0].part(first - begin, until - begin),
                 received[1][first - begin : until - begin],
             )
-            found = self._sums.analyse(self._observation, first, until, Analyses(ends - first), known)
-            self._logarithms[self._done : done] = found[: done - self._done]
+            found = self.sums.log_evidence(*self.sums.add(observation, first, until, known, Analyses(ends - first)))
+            self.logarithms[self._done : done] = found[: done - self._done]
             first, self._done = until, done
 
-    def result(self) -> WatchedEvidence:
-        """After all steps."""
-        return WatchedEvidence(self._sums, self._observation.step.dt, self._analyses, self._logarithms)
+    def merge(self, other: WatchedEvidence) -> None:
+        """Add other runs of the same experiment."""
+        self.sums.merge(other.sums)
+        self.steps = self.logarithms = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnyTimeEvidence:
-    """What may be said at any time.
-
-    While the run follows the law, the evidence ever passes ``threshold`` with probability at most 1 / threshold.
-    """
+    """What may be said at any time: a correct run ever passes ``threshold`` with probability 1 / threshold at most."""
 
     threshold: float
     log_evidence: float
@@ -460,27 +416,17 @@ def any_time_evidence(
     steps: int | None = None,
     planned: float | None = None,
 ) -> AnyTimeEvidence:
-    """The evidence of one run or several in words and numbers.
-
-    ``variance``: sum of Var(D_k) of the system error over so many ``steps``; ``planned``: the number of steps at which
-    its interval is to be narrowest, chosen before the run. ``families`` are those of the sums, where they are known.
-    """
+    """Evidence of runs in numbers; ``variance``: sum of Var(D_k) of the system error over so many ``steps``."""
+    # The interval is narrowest at so many ``planned`` steps, a number that is chosen before the run.
     threshold, sums = 1.0 / level, watched.sums
-    time, crossed = None, None
+    time, crossed, half_width = None, None, None
     if watched.steps is not None and watched.logarithms is not None:
         time = np.asarray(watched.steps * watched.dt, dtype=float)
         over = np.flatnonzero(watched.logarithms >= math.log(threshold))
         crossed = float(time[over[0]]) if len(over) else None
     families = sums.families() if families is None else families
-    half_width = None
     if variance and steps and planned and sums.error is not None:
         half_width = float(simultaneous_half_width(variance, sums.error.variance * planned)) / steps
-    return AnyTimeEvidence(
-        threshold=threshold,
-        log_evidence=sums.evidence(families),
-        crossed=crossed,
-        time=time,
-        log_curve=watched.logarithms,
-        questions=sorted(sums.strongest(families), key=lambda entry: -entry[1]),
-        half_width=half_width,
-    )
+    strongest = sorted(sums.strongest(families), key=lambda entry: -entry[1])
+    evidence = sums.evidence(families)
+    return AnyTimeEvidence(threshold, evidence, crossed, time, watched.logarithms, strongest, half_width)

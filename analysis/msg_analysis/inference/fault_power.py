@@ -18,9 +18,8 @@ from typing import Literal
 
 import numpy as np
 import scipy.linalg
+from scipy import special
 
-from msg_analysis.common.arrays import FloatArray
-from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.graphs import Switching
 from msg_analysis.inference.messages import CommonGain, Gains
@@ -28,7 +27,8 @@ from msg_analysis.inference.noise import Noise
 from msg_analysis.inference.question import Diagnostic
 from msg_analysis.inference.received_values import NO_NOISE
 from msg_analysis.inference.regression import MAX_REGRESSORS, regressors
-from msg_analysis.inference.statistics import chi2_quantile, needed_noncentrality, noncentral_chi2_tail
+from msg_analysis.inference.residuals import noise_directions
+from msg_analysis.inference.statistics import chi2_quantile
 from msg_analysis.model.step_model import StepModel
 from msg_analysis.theory.prediction import Prediction
 
@@ -81,23 +81,18 @@ class FaultPower:
     def power_of(self, test: StepInformation, steps: float) -> float:
         """The same of one of the tests."""
         x = chi2_quantile(self.level, test.dof)
-        return float(noncentral_chi2_tail(x, test.dof, steps * test.noncentrality))
+        return float(1.0 - special.chndtr(x, test.dof, steps * test.noncentrality))
 
     def steps(self, power: float = POWER) -> float:
         """Steps after which a test has this power; infinite: never."""
-        return min(
-            float(needed_noncentrality(chi2_quantile(self.level, test.dof), test.dof, power)) / test.noncentrality
-            if test.noncentrality > 0.0
-            else math.inf
-            for test in self.tests
-        )
+        needed = [special.chndtrinc(chi2_quantile(self.level, test.dof), test.dof, 1.0 - power) for test in self.tests]
+        each = zip(needed, self.tests, strict=True)
+        return min(float(n) / test.noncentrality if test.noncentrality > 0.0 else math.inf for n, test in each)
 
     def evidence_steps(self) -> float:
-        """Steps after which the evidence at any time is expected to pass: half of the runs stop before, about.
-
-        The mixed likelihood ratio of a coefficient with the noncentrality L is exp(L^2 / (2 (1 + L))) / sqrt(1 + L),
-        for a prior of the size of the fault.
-        """
+        """Steps after which the evidence at any time is expected to pass: half of the runs stop before, about."""
+        # The mixed likelihood ratio of a coefficient with the noncentrality L is exp(L^2 / (2 (1 + L))) / sqrt(1 + L),
+        # for a prior of the size of the fault.
         information = max(test.noncentrality for test in self.tests)
         if not information > 0.0 or math.isinf(self.log_price):
             return math.inf
@@ -112,19 +107,7 @@ class FaultPower:
 def fault_powers(
     prediction: Prediction, replicas: int, level: float, faults: Sequence[Fault] = FAULTS
 ) -> list[FaultPower]:
-    """Of the faults that the law can have: those without noise, links or switching are left out.
-
-    Parameters
-    ----------
-    prediction
-        of the experiment
-    replicas
-        of the run
-    level
-        probability of a false "disagrees", all tests together
-    faults
-        each is one row of the result
-    """
+    """One for each of the ``faults`` that the law can have, not those without noise, links or switching."""
     step, sums = prediction.step, EvidenceSums(prediction, replicas, in_detail=True)
     # While a run goes on, diagnostics are not asked.
     families = {name: logs.size for name, logs in sums.families().items()}
@@ -133,11 +116,12 @@ def fault_powers(
     share = level / sum(question.number_of_tests() for question in sums.questions.values())
     found = []
     for fault in faults:
-        informations = {
-            "noise": lambda fault=fault: _noise(step, fault.factor, replicas),
-            "gain": lambda fault=fault: _gain(prediction, fault.factor, replicas),
-            "switching": lambda fault=fault: _switching(step, fault.factor),
-        }[fault.kind]()
+        if fault.kind == "noise":
+            name, informations = Noise.name, _noise(step, fault.factor, replicas)
+        elif fault.kind == "gain":
+            name, informations = Gains.name, _gain(prediction, fault.factor, replicas)
+        else:
+            name, informations = Switching.name, _switching(step, fault.factor)
         if fault.agent is not None:
             place = fault.agent, fault.sender
             informations = {key: tests for key, tests in informations.items() if key == place}
@@ -146,7 +130,6 @@ def fault_powers(
         (agent, sender), tests = min(
             informations.items(), key=lambda entry: max(test.noncentrality for test in entry[1])
         )
-        name = {"noise": Noise.name, "gain": Gains.name, "switching": Switching.name}[fault.kind]
         price = math.log(questions[name] / (weights[name] * level)) if name in questions else math.inf
         found.append(FaultPower(fault, agent, sender, tests, share, price))
     return found
@@ -159,7 +142,7 @@ def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
     """Per agent with noise: the likelihood ratio of the covariance of the residuals."""
     same = bool((step.noise == step.noise[0]).all())
     found: _Informations = {}
-    bases = [_noisy(noise) for noise in step.noise]
+    bases = [noise_directions(noise)[0] for noise in step.noise]
     dof = sum(rank * (rank + 1) // 2 for rank in (len(base) for base in (bases[:1] if same else bases)))
     for agent in range(step.agents):
         divergence = 0.0
@@ -172,13 +155,6 @@ def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
         if divergence > 0.0:
             found[agent, None] = [StepInformation(Noise.name, dof, replicas * divergence)]
     return found
-
-
-def _noisy(noise: FloatArray) -> FloatArray:
-    """(r, m) whitener of the directions that have noise."""
-    values, vectors = np.linalg.eigh(noise)
-    keep = values > NO_NOISE * max(float(values[-1]), 0.0)
-    return np.asarray((vectors[:, keep] / np.sqrt(values[keep])).T)
 
 
 def _gain(prediction: Prediction, factor: float, replicas: int) -> _Informations:
@@ -223,20 +199,15 @@ def _switching(step: StepModel, factor: float) -> _Informations:
     if step.modes == 1:
         return {}
     law = step.transition
-    wrong = _faster(step.chain, step.dt, factor)
-    if wrong is None:
+    chain = step.chain
+    if chain.time == "continuous":
+        wrong = scipy.linalg.expm(factor * step.dt * chain.matrix)
+    else:
+        wrong = np.eye(chain.modes) + factor * (chain.matrix - np.eye(chain.modes))
+    if (wrong < 0.0).any():  # the probabilities of leaving would pass 1
         return {}
     with np.errstate(divide="ignore", invalid="ignore"):
         terms = np.where(wrong > 0.0, wrong * np.log(wrong / law), 0.0)
     divergence = 2.0 * float(step.stationary @ terms.sum(axis=1))
     dof = int((law > 0.0).sum()) - step.modes
     return {(None, None): [StepInformation(Switching.name, dof, divergence)]} if divergence > 0.0 else {}
-
-
-def _faster(chain: MarkovChain, dt: float, factor: float) -> FloatArray | None:
-    """(n, n) transition matrix with other rates; None where the probabilities of leaving would pass 1."""
-    if chain.time == "continuous":
-        return np.asarray(scipy.linalg.expm(factor * dt * chain.matrix))
-    leaving = factor * (chain.matrix - np.eye(chain.modes))
-    wrong = np.eye(chain.modes) + leaving
-    return None if (wrong < 0.0).any() else np.asarray(wrong)

@@ -80,8 +80,8 @@ class GivenPath:
         """The JSON document."""
         return {
             "expected": self.expected,
-            "system_error": self.system_error.to_json(),
-            "node_errors": [node.to_json() for node in self.node_errors],
+            "system_error": self.system_error,
+            "node_errors": self.node_errors,
             "variance_ratio": self.variance_ratio,
         }
 
@@ -91,15 +91,9 @@ def _variance(means: TimeMeans, combination: FloatArray) -> float:
 
 
 def means_given_path(
-    observation: Observation,
-    *,
-    most_work: float = MAX_WORK,
-    most_numbers: int = MAX_NUMBERS,
+    observation: Observation, *, most_work: float = MAX_WORK, most_numbers: int = MAX_NUMBERS
 ) -> TimeMeans | None:
-    """Time means of a run in lockstep, with expectation and standard errors given the path of the graphs.
-
-    None where it would take too long: more than ``most_work``, or too many kinds of steps for ``most_numbers``.
-    """
+    """Time means of a run in lockstep given the path of the graphs; None where that is more than ``most_work``."""
     system, steps = observation.prediction.system, observation.steps
     d = system.dimension
     counts: dict[Literal["joint", "nodes", "system"], int] = {  # of forms; made only where they are used
@@ -138,10 +132,7 @@ def _expected_sum(which: IntArray, matrices: FloatArray, noise: FloatArray, star
 
 
 def _backwards(
-    observation: Observation,
-    kinds: tuple[IntArray, FloatArray, FloatArray],
-    forms: FloatArray,
-    trace: FloatArray,
+    observation: Observation, kinds: tuple[IntArray, FloatArray, FloatArray], forms: FloatArray, trace: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Sum of packed y y^T (p,), sum of Cov(D | now) (q, q), and of every step the system error and its Var(D | now)."""
     which, matrices, noise = kinds
@@ -154,7 +145,7 @@ def _backwards(
     for first in reversed(range(0, steps, length)):
         last = min(first + length, steps)
         tell("errors given the path", steps - last, steps)
-        found = moments(observation, first, last, observation.states)
+        found = moments(observation, first, last)
         seen += found.sum(axis=0)
         series[first:last] = found @ (trace @ forms)
         last = min(last, steps - 1)  # the noise of the last step is in no error

@@ -8,16 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import attrgetter
 from typing import Self
 
 import numpy as np
 from scipy.special import xlogy
 
-from msg_analysis.common.arrays import FloatArray, IntArray
-from msg_analysis.experiment.markov_chain import stationary_law
-from msg_analysis.inference.candidates import Cause, find_rates, numbers_text
+from msg_analysis.common.arrays import AnyArray, FloatArray, IntArray
+from msg_analysis.experiment.markov_chain import MarkovChain, stationary_law
+from msg_analysis.inference.candidates import Cause, Rate, find_rates, numbers_text
 from msg_analysis.inference.e_values import (
-    Analyses,
     WindowEvidence,
     Windows,
     log_mean,
@@ -29,14 +29,13 @@ from msg_analysis.inference.question import (
     Block,
     Diagnostic,
     Finding,
+    Largest,
     Law,
     Place,
     Question,
     RunningSums,
     Search,
-    Statistics,
-    Test,
-    one_test,
+    SummedDiagnostic,
 )
 from msg_analysis.inference.statistics import log_chi2_tail
 
@@ -47,11 +46,7 @@ class Switching(Question):
     name = "switching"
     meaning = "the graphs do not switch with the rates or probabilities of the file"
     main = True
-
-    @classmethod
-    def tests(cls, run: Statistics) -> list[Test]:
-        """Of all transitions."""
-        return one_test(cls.name, run.switching.p) if run.switching else []
+    p_value = attrgetter("p_switching")
 
     def number_of_tests(self) -> int:
         """None with one graph."""
@@ -81,116 +76,91 @@ class Switching(Question):
 
     @classmethod
     def causes(cls, search: Search) -> list[Cause]:
-        """Rates that explain the counted transitions."""
-        return _rates(search)
+        """Jumps that the law excludes; else rates, or in discrete time probabilities, that explain the transitions."""
+        names, counts, experiment = search.names, search.transitions.counts, search.experiment
+        excluded = (counts > 0) & (experiment.chain.transition(experiment.step_length) == 0.0)
+        found = []
+        for g, h in np.argwhere(excluded).tolist():
+            number, pair = float(counts[g, h]), [names[g], names[h]]
+            words = f"the graph jumped {counts[g, h]} times from {pair[0]} to {pair[1]}, which the law excludes"
+            found.append(Cause("switching", words, graph=pair, estimate=number, expected=0.0, p=0.0))
+        if found:
+            return found
+        rates = find_rates(counts, experiment.chain, experiment.step_length, search.families, search.level)
+        return [_rate_cause(rate, experiment.chain, names) for rate in rates]
 
 
-def _rates(search: Search) -> list[Cause]:
-    """Switching rates, or in discrete time probabilities, that are wrong."""
-    names, counts = search.names, search.transitions.counts
-    transition = search.experiment.chain.transition(search.experiment.step_length)
-    found = []
-    for g, h in np.argwhere((counts > 0) & (transition == 0.0)).tolist():
-        words = f"the graph jumped {counts[g, h]} times from {names[g]} to {names[h]}, which the law excludes"
-        found.append(Cause("switching", words, None, None, [names[g], names[h]], float(counts[g, h]), None, 0.0, 0.0))
-    if found:
-        return found
-    what = "rate" if search.experiment.chain.time == "continuous" else "probability"
-    for rate in find_rates(
-        counts, search.experiment.chain, search.experiment.step_length, search.families, search.level
-    ):
-        low, high = rate.interval
-        if len(rate.jumps) == 1:
-            g, h = rate.jumps[0]
-            expected = float(search.experiment.chain.matrix[g, h])
-            estimate, interval = rate.factor * expected, (low * expected, high * expected)
-            words = (
-                f"the {what} of switching from {names[g]} to {names[h]} is {numbers_text(estimate, interval)}, "
-                f"not {expected:.3g}"
-            )
-            where: list[str] | None = [names[g], names[h]]
-        else:
-            expected, estimate, interval = 1.0, rate.factor, (low, high)
-            where = None if rate.origin is None else [names[rate.origin]]
-            whose = f"all {what}s" if where is None else f"the {what}s of switching away from {where[0]}"
-            whose = f"{whose} of switching" if where is None else whose
-            whose = whose.replace("probabilitys", "probabilities")
-            words = f"{whose} are {numbers_text(estimate, interval)} times what the file says"
-        found.append(Cause("switching", words, None, None, where, estimate, interval, expected, math.exp(rate.log_p)))
-    return found
+def _rate_cause(rate: Rate, chain: MarkovChain, names: Sequence[str]) -> Cause:
+    one, several = ("rate", "rates") if chain.time == "continuous" else ("probability", "probabilities")
+    (low, high), expected, where = rate.interval, 1.0, None
+    if len(rate.jumps) == 1:
+        (g, h), where = rate.jumps[0], [names[graph] for graph in rate.jumps[0]]
+        expected = float(chain.matrix[g, h])
+    elif rate.origin is not None:
+        where = [names[rate.origin]]
+    estimate, interval = rate.factor * expected, (low * expected, high * expected)
+    numbers = numbers_text(estimate, interval)
+    if where is None:
+        words = f"all {several} of switching are {numbers} times what the file says"
+    elif len(where) == 1:
+        words = f"the {several} of switching away from {where[0]} are {numbers} times what the file says"
+    else:
+        words = f"the {one} of switching from {where[0]} to {where[1]} is {numbers}, not {expected:.3g}"
+    return Cause("switching", words, None, None, where, estimate, interval, expected, math.exp(rate.log_p))
 
 
-PARTS = (
-    8  # of the ages of a holding time, each with the same share of the ends of holding times, as nearly as steps allow
-)
-JOINED = (1, 2, 4)  # parts that are one in the evidence: many parts cost evidence, few hide a departure
+PARTS = 8  # of the ages of a holding time, with as nearly as steps allow the same share of the ends of holding times
+JOINED = (1, 2, 4)  # parts that are one in the evidence: many parts cost evidence, few hide a deviation
 MIN_EXPECTED = 15.0  # fewest steps with, and fewest without, a switch in a part, for the chi-square law
 
 
-class HoldingTimes(Diagnostic):
+class HoldingTimes(SummedDiagnostic):
     """Switches counted by graph and by the age of the holding time, in parts.
 
-    Given the past, a step ends its holding time with the probability 1 - P_gg. So every part is a binomial question of
-    its own, and the product of their evidence is evidence. The test is the likelihood ratio of one probability for each
-    part against a common one, whatever that is (rates have their own test): chi-square with parts - 1 degrees of
-    freedom for each graph. Parts with few expected switches are joined.
+    Likelihood ratio of one probability for each part against a common one, whatever that is: rates have their own test.
     """
 
     name = "holding times"
     meaning = "the time for which a graph stays depends on how long it has stayed: the chain is not Markov"
+    kind = "sojourns"
     about_chain = True
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)
         self._transition = law.step.transition
         self._leaving = 1.0 - np.diag(self._transition)
-        n = law.step.modes
+        self._left = np.flatnonzero((self._leaving > 0.0) & (self._leaving < 1.0))  # graphs that are asked about
         self._edges = [_edges(float(p)) for p in self._leaving]  # ages at which the parts 1, 2, ... begin
-        self.steps, self.left = np.zeros((n, PARTS), np.int64), np.zeros((n, PARTS), np.int64)
-        self._known = proportion_constant(self._leaving[self._tested, None])  # (G, 1, K)
+        self.sums = list(np.zeros((2, law.step.modes, PARTS), np.int64))  # steps, and those that left their graph
+        self._known = proportion_constant(self._leaving[self._left, None])  # (G, 1, K)
         self._age = 0  # of the holding time at the step that comes next
 
-    def add(self, block: Block) -> FloatArray:
-        """Count the steps of a block."""
-        return self.count(block.graphs, block.analyses)
-
-    def count(self, graphs: IntArray, analyses: Analyses) -> FloatArray:
-        """Count the steps to the second, third, ... of these graphs; the first one was the last of those before."""
-        shape = analyses.count, *self.steps.shape
-        steps, left = self._parts(graphs, analyses) if len(graphs) > 1 else np.zeros((2, *shape), np.int64)
-        steps, left = self.steps + steps.cumsum(axis=0), self.left + left.cumsum(axis=0)
-        self.steps, self.left = steps[-1], left[-1]
-        return self._evidence(steps, left)
-
-    def _parts(self, graphs: IntArray, analyses: Analyses) -> IntArray:
-        """(2, T, n, PARTS): steps, and those that left their graph, between the analyses."""
+    def between(self, block: Block) -> list[AnyArray]:
+        """Steps to the second, third, ... of the graphs of a block, and those that left theirs, (T, n, PARTS) each."""
+        graphs, analyses = block.graphs, block.analyses
         now, left = graphs[:-1], graphs[1:] != graphs[:-1]
+        shape = analyses.count, len(self._edges), PARTS
+        if not len(now):
+            return list(np.zeros((2, *shape), np.int64))
         index = np.arange(len(now))
         begin = np.maximum.accumulate(np.where(np.append(True, left[:-1]), index, 0))
         age = index - begin + np.where(begin == 0, self._age, 0)
         self._age = 0 if left[-1] else int(age[-1]) + 1
-        shape = analyses.count, *self.steps.shape
         place = (analyses.after(index) * shape[1] + now) * PARTS
         for graph in np.unique(now).tolist():
             at = now == graph
             place[at] += np.searchsorted(self._edges[graph], age[at], side="right")
-        counts = [np.bincount(which, minlength=math.prod(shape)).reshape(shape) for which in (place, place[left])]
-        return np.array(counts)
-
-    def merge(self, other: Self) -> None:
-        """No holding time goes on from one run to another."""
-        self.steps += other.steps
-        self.left += other.left
+        return [np.bincount(which, minlength=math.prod(shape)).reshape(shape) for which in (place, place[left])]
 
     def finding(self) -> Finding | None:
         """The graph and the part whose switches are furthest from the share that is usual in the graph."""
-        total = float(self.steps.sum())
-        visits = total * stationary_law(self._transition)
+        all_steps, all_left = self.sums
+        visits = float(all_steps.sum()) * stationary_law(self._transition)
         statistic, dof, clearest, found = 0.0, 0, -1.0, Finding(0.0)
         for graph, p in enumerate(self._leaving.tolist()):
             groups = _joined(visits[graph], p, self._edges[graph])
-            steps = np.add.reduceat(self.steps[graph], groups).astype(float)
-            left = np.add.reduceat(self.left[graph], groups).astype(float)
+            steps = np.add.reduceat(all_steps[graph], groups).astype(float)
+            left = np.add.reduceat(all_left[graph], groups).astype(float)
             if len(groups) < 2 or not 0 < left.sum() < steps.sum():
                 continue
             statistic += 2.0 * (_log_likelihood(left, steps) - _log_likelihood(left.sum(), steps.sum()))
@@ -211,48 +181,36 @@ class HoldingTimes(Diagnostic):
                 )
         return replace(found, log_p=log_chi2_tail(statistic, dof)) if dof else None
 
-    def logarithms(self) -> FloatArray:
-        """(G + 1, K): of each graph that is left, and of all."""
-        return self._evidence(self.steps, self.left)
-
-    def _evidence(self, steps: IntArray, left: IntArray) -> FloatArray:
-        """(..., G + 1, K), from counts (..., n, PARTS)."""
-        rows = self._tested
-        if not len(rows):
-            return np.empty((*steps.shape[:-2], 0, 1))
-        steps, left = _in_parts(steps[..., rows, :]), _in_parts(left[..., rows, :])  # (..., G, 8 + 4 + 2)
-        each = proportion_evidence(left, steps, self._leaving[rows, None], self._known)
+    def of_sums(self, sums: Sequence[AnyArray]) -> FloatArray:
+        """(..., G + 1, K): of each graph that is left, and of all, from counts (..., n, PARTS)."""
+        if not len(self._left):
+            return np.empty((*sums[0].shape[:-2], 0, 1))
+        # Given the past, every part is a binomial question of its own, so the product of their evidence is evidence.
+        steps, left = (
+            np.concatenate([each.reshape(*each.shape[:-1], -1, joined).sum(axis=-1) for joined in JOINED], axis=-1)
+            for each in (counts[..., self._left, :] for counts in sums)
+        )  # (..., G, 8 + 4 + 2)
+        each = proportion_evidence(left, steps, self._leaving[self._left, None], self._known)
         ends = np.cumsum([PARTS // joined for joined in JOINED])
         parts = np.concatenate([group.sum(axis=-2) for group in np.split(each, ends[:-1], axis=-2)], axis=-1)
         return np.concatenate([parts, parts.sum(axis=-2, keepdims=True)], axis=-2)
 
     def about(self, row: int) -> str:
         """Holding times of a graph, or all."""
-        return f"holding times of {self.law.graphs[self._tested[row]]}" if row < len(self._tested) else "holding times"
-
-    @property
-    def _tested(self) -> IntArray:
-        return np.flatnonzero((self._leaving > 0.0) & (self._leaving < 1.0))
+        return f"holding times of {self.law.graphs[self._left[row]]}" if row < len(self._left) else "holding times"
 
     @classmethod
-    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+    def words(cls, found: Finding, names: Sequence[str]) -> str:
         """A probability of leaving a graph that depends on the time for which it has stayed."""
         assert found.span is not None
         assert found.graph is not None
         first, last = found.span
         part = f"from step {first:,} of it on" if last is None else f"in steps {first:,} to {last:,} of it"
         part = f"in step {first:,} of it" if first == last else part
-        graph, value = names[found.graph], found.estimate or 0.0
-        words = (
-            f"the probability of leaving graph {graph} depends on how long it has lasted: it is "
-            f"{numbers_text(value, found.interval)} {part}, not {found.expected:.3g}"
+        return (
+            f"the probability of leaving graph {names[found.graph]} depends on how long it has lasted: it is "
+            f"{found.numbers} {part}, not {found.expected:.3g}"
         )
-        return Cause("sojourns", words, None, None, graph, value, found.interval, found.expected, p)
-
-
-def _in_parts(counts: IntArray) -> IntArray:
-    """(..., 8 + 4 + 2): counts (..., 8) of the parts, and of each ``JOINED`` number of them."""
-    return np.concatenate([counts.reshape(*counts.shape[:-1], -1, each).sum(axis=-1) for each in JOINED], axis=-1)
 
 
 def _edges(leaving: float) -> IntArray:
@@ -289,15 +247,11 @@ MOST_GRAPHS = 20  # of a law for which this is tested
 
 
 class SwappedGraphs(Diagnostic):
-    """Likelihood ratios of two graphs whose names are swapped, in windows of 1, 2, 4, ... steps, for every pair.
-
-    The product over the steps of a window is evidence against the law, and so is the mean over all windows of a run and
-    over the pairs; its inverse is the p of the test (Markov). Only in lockstep where all agents receive the states
-    themselves and have noise, independent of each other.
-    """
+    """Likelihood ratios of two graphs whose names are swapped, in windows of 1, 2, 4, ... steps, for every pair."""
 
     name = "residuals: swapped graphs"
     meaning = "two graphs have each other's name in the log"
+    kind = "graph"
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)
@@ -307,12 +261,13 @@ class SwappedGraphs(Diagnostic):
         self._deviation = np.sqrt(np.einsum("gik,gik->gi", step.noise_gain, step.noise_gain))  # (n, m)
         self._windows = Windows(law.planned, len(self._pairs))
         self._evidence = WindowEvidence(self._windows, len(self._pairs))
-        self._best, self._pair, self._place, self._runs = -np.inf, 0, Place(0, 0), 1
+        self._best = Largest(-np.inf, (0, 0))
 
     def add(self, block: Block) -> FloatArray:
         """The windows that end in the block."""
         if not len(self._pairs):
             return np.empty((block.analyses.count, 0, 1))
+        # The product over the steps of a window is evidence, so is the mean over windows and pairs; 1 / it is the p.
         logged, modes = _log_density(block.white, block.scale), block.reception.modes
         density = np.empty((len(logged), self._step.modes))
         for graph, deviation in enumerate(self._deviation):
@@ -326,26 +281,23 @@ class SwappedGraphs(Diagnostic):
         evidence = self._evidence.add(ended, ended.sums, block.analyses)
         values = ended.sums - np.log(self._windows.planned[level])[:, None]
         at, pair = np.unravel_index(int(np.argmax(values)), values.shape)
-        if values[at, pair] > self._best:
-            start = int(ended.first[at]) + 1
-            self._best, self._pair = float(values[at, pair]), int(pair)
-            self._place = Place(start, start + (1 << int(level[at])) - 1)
+        start = int(ended.first[at]) + 1
+        place = Place(start, start + (1 << int(level[at])) - 1)
+        self._best.take(float(values[at, pair]), tuple(self._pairs[pair].tolist()), place)
         return evidence[:, :, None]
 
     def merge(self, other: Self) -> None:
-        """No window goes over from one run to another."""
+        """The window with more evidence."""
         self._evidence.merge(other._evidence)
-        if other._best > self._best:
-            self._best, self._pair, self._place = other._best, other._pair, other._place.later(self._runs)
-        self._runs += other._runs
+        self._best.merge(other._best)
 
     def finding(self) -> Finding | None:
         """The window and the pair with the most evidence."""
         if not len(self._pairs) or not self._windows.steps:
             return None
-        graph, other = self._pairs[self._pair].tolist()
+        graph, other = map(int, self._best.of)
         log_p = -float(log_mean(self._evidence.logarithms()))
-        return Finding(min(0.0, log_p), graph=graph, other=other, place=self._place)
+        return Finding(min(0.0, log_p), graph=graph, other=other, place=self._best.place)
 
     def logarithms(self) -> FloatArray:
         """(pairs, 1)."""
@@ -357,12 +309,11 @@ class SwappedGraphs(Diagnostic):
         return f"names of the graphs {first} and {second} swapped"
 
     @classmethod
-    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+    def words(cls, found: Finding, names: Sequence[str]) -> str:
         """Two names."""
-        pair = [names[graph] for graph in (found.graph, found.other) if graph is not None]
-        words = f"the log has the names of the graphs {' and '.join(pair)} swapped"
-        words = f"{words} {found.place.words}" if found.place else words
-        return Cause("graph", words, None, None, pair, p=p, steps=found.steps)
+        pair = " and ".join(names[graph] for graph in (found.graph, found.other) if graph is not None)
+        words = f"the log has the names of the graphs {pair} swapped"
+        return f"{words} {found.place.words}" if found.place else words
 
 
 def _log_density(white: FloatArray, deviation: FloatArray) -> FloatArray:

@@ -7,27 +7,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Self
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
-from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.arrays import AnyArray, FloatArray
 from msg_analysis.common.text import percent
-from msg_analysis.inference.candidates import Cause, Selected, numbers_text
-from msg_analysis.inference.counts import LossTally
+from msg_analysis.inference.candidates import Cause, Selected, numbers_text, share_text
 from msg_analysis.inference.e_values import coefficient_evidence, proportion_evidence, variance_evidence
-from msg_analysis.inference.question import (
-    Block,
-    Diagnostic,
-    Finding,
-    Law,
-    Question,
-    RunningSums,
-    Search,
-    Statistics,
-    Test,
-    one_test,
-)
+from msg_analysis.inference.question import Block, Finding, Law, Question, RunningSums, Search, SummedDiagnostic
 from msg_analysis.inference.statistics import binomial_interval, log_normal_tail
 
 
@@ -37,11 +26,8 @@ class Losses(Question):
     name = "loss"
     meaning = "messages are lost more or less often, or in other sequences, than the file says"
     main = True
-
-    @classmethod
-    def tests(cls, run: Statistics) -> list[Test]:
-        """Of all links."""
-        return one_test(cls.name, run.loss.p) if run.loss else []
+    p_value = attrgetter("p_loss")
+    parameters = "loss"
 
     def number_of_tests(self) -> int:
         """None where no message is lost."""
@@ -58,15 +44,30 @@ class Losses(Question):
         return f"losses from agent {other} to agent {agent}"
 
     @classmethod
-    def classes(cls, search: Search) -> int:
-        """Links, receivers, senders, all."""
-        return len(search.losses.classes) if search.losses else 0
-
-    @classmethod
-    def causes(cls, search: Search) -> list[Cause]:
-        """Probabilities that explain the counted losses."""
-        tally = search.loss_tally
-        return [_loss_words(one, tally) for one in search.select(search.losses)] if tally else []
+    def cause_of(cls, one: Selected, search: Search) -> Cause:
+        """A probability that explains the counted losses, of a link, a receiver, a sender or all."""
+        part, what, tally = one.part, one.what, search.loss
+        assert tally is not None
+        receiver, sender = tally.pairs.T
+        chosen = np.ones(len(receiver), dtype=np.bool_)
+        agent, link, whose = None, None, "all messages"
+        if part == "link":
+            chosen = (sender == what[0]) & (receiver == what[1])
+            link, whose = (what[0] + 1, what[1] + 1), f"the messages from agent {what[0] + 1} to agent {what[1] + 1}"
+        elif part in ("receiver", "sender"):
+            chosen = (receiver if part == "receiver" else sender) == what
+            agent, whose = what + 1, f"the messages {'to' if part == 'receiver' else 'of'} agent {what + 1}"
+        lost, messages = int(tally.lost[chosen].sum()), int(tally.messages[chosen].sum())
+        weights = tally.messages[chosen] / messages
+        expected = float(weights @ tally.probability[chosen])
+        # In bursts, so many messages say as much as fewer independent ones.
+        alike = float(weights @ tally.inflation[chosen])
+        share, interval = lost / messages, binomial_interval(round(lost / alike), round(messages / alike))
+        words = f"{share_text(share, interval)} of {whose} are lost, not {percent(expected)}"
+        again = tally.after_losses(chosen)
+        if again:
+            words += f"; after a lost one, {percent(again[0])} are, not {percent(again[1])}"
+        return Cause("loss", words, agent, link, None, share, interval, expected, math.exp(one.log_p))
 
 
 class Broadcast(Question):
@@ -74,11 +75,8 @@ class Broadcast(Question):
 
     name = "broadcast"
     meaning = "the noise in published values is larger, smaller, or correlated otherwise than in the file"
-
-    @classmethod
-    def tests(cls, run: Statistics) -> list[Test]:
-        """Of the covariance of all agents' noise."""
-        return one_test(cls.name, run.p_broadcast)
+    p_value = attrgetter("p_broadcast")
+    parameters = "broadcast"
 
     def number_of_tests(self) -> int:
         """None without this noise."""
@@ -96,83 +94,47 @@ class Broadcast(Question):
         return f"broadcast noise of agent {row + 1}"
 
     @classmethod
-    def classes(cls, search: Search) -> int:
-        """Agents, all."""
-        return len(search.broadcast.classes) if search.broadcast else 0
-
-    @classmethod
-    def causes(cls, search: Search) -> list[Cause]:
-        """Variances that explain the squares of the noise."""
-        return [_broadcast_words(one) for one in search.select(search.broadcast)]
-
-
-def _loss_words(one: Selected, tally: LossTally) -> Cause:
-    part, what = one.part, one.what
-    receiver, sender = tally.pairs.T
-    chosen = np.ones(len(receiver), dtype=np.bool_)
-    agent, link, whose = None, None, "all messages"
-    if part == "link":
-        chosen = (sender == what[0]) & (receiver == what[1])
-        link, whose = (what[0] + 1, what[1] + 1), f"the messages from agent {what[0] + 1} to agent {what[1] + 1}"
-    elif part in ("receiver", "sender"):
-        chosen = (receiver if part == "receiver" else sender) == what
-        agent, whose = what + 1, f"the messages {'to' if part == 'receiver' else 'of'} agent {what + 1}"
-    lost, messages = int(tally.lost[chosen].sum()), int(tally.messages[chosen].sum())
-    weights = tally.messages[chosen] / messages
-    expected = float(weights @ tally.probability[chosen])
-    # In bursts, so many messages say as much as fewer independent ones.
-    alike = float(weights @ tally.inflation[chosen])
-    share, interval = lost / messages, binomial_interval(round(lost / alike), round(messages / alike))
-    words = (
-        f"{percent(share)} ({100 * interval[0]:.3g} to {100 * interval[1]:.3g} %) of {whose} are lost, "
-        f"not {percent(expected)}"
-    )
-    again = tally.after_losses(chosen)
-    if again:
-        words += f"; after a lost one, {percent(again[0])} are, not {percent(again[1])}"
-    return Cause("loss", words, agent, link, None, share, interval, expected, math.exp(one.log_p))
-
-
-def _broadcast_words(one: Selected) -> Cause:
-    part, what = one.part, one.what
-    factor, interval = math.exp(one.estimate), (math.exp(one.interval[0]), math.exp(one.interval[1]))
-    agent = what + 1 if part == "agent" else None
-    whose = "all agents publish" if agent is None else f"agent {agent} publishes"
-    words = f"the variance of the noise in what {whose} is {numbers_text(factor, interval)} times what the file says"
-    return Cause("broadcast", words, agent, None, None, factor, interval, 1.0, math.exp(one.log_p))
+    def cause_of(cls, one: Selected, search: Search) -> Cause:
+        """A variance that explains the squares of the noise."""
+        del search
+        factor, interval = one.factor
+        agent = one.what + 1 if one.part == "agent" else None
+        whose = "all agents publish" if agent is None else f"agent {agent} publishes"
+        words = (
+            f"the variance of the noise in what {whose} is {numbers_text(factor, interval)} times what the file says"
+        )
+        return Cause("broadcast", words, agent, None, None, factor, interval, 1.0, math.exp(one.log_p))
 
 
 MIN_SAMPLES = 100  # fewest steps of all replicas for the normal law of a score
 
 
-class StaleValues(Diagnostic):
-    """Regression of the residuals on weight * (neighbour's previous value - the one that was used).
-
-    The coefficient is the share of stale values, expected 0. The test takes the clearest link, or all links together
-    where agents are independent, with half of the level each and the number of coefficients as a factor (Bonferroni).
-    """
+class StaleValues(SummedDiagnostic):
+    """Regression of residuals on weight * (neighbour's previous value - the used one): the share of stale values."""
 
     name = "residuals: stale values"
     meaning = "agents use values that are one step older than the log says"
+    kind = "stale"
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)
         m = law.step.agents
-        self._links, self._together = law.links, law.apart and len(law.links) > 1
+        self._links, self.together = law.links, law.apart and len(law.links) > 1
         self._used = np.zeros((m, m), np.bool_)
         self._used[law.links[:, 0], law.links[:, 1]] = True
-        self.score, self.information, self.samples = np.zeros((m, m)), np.zeros((m, m)), 0
+        # Score and information of every link, and samples of each.
+        self.sums = [np.zeros((m, m)), np.zeros((m, m)), np.zeros((), np.int64)]
 
-    def add(self, block: Block) -> FloatArray:
+    def between(self, block: Block) -> list[AnyArray]:
         """Scores and information of all links."""
         received, analyses = block.reception, block.analyses
         steps, agents, neighbours = received.used.shape
-        if not len(self._links):
-            return np.empty((analyses.count, 0, 1))
         shape = analyses.count, agents, agents
         score, information = np.zeros((2, *shape))
+        samples = analyses.lengths * block.white.shape[2]
+        if not len(self._links):
+            return [score, information, samples]
         analysis = analyses.after(np.arange(steps))
-        self.samples += steps * block.white.shape[2]
         receivers = np.broadcast_to(np.arange(agents), (steps, agents))
         for d in range(neighbours):
             senders, used = received.senders[:, :, d], received.used[:, :, d]
@@ -184,50 +146,30 @@ class StaleValues(Diagnostic):
             place = np.ravel_multi_index((analysis[at], who, sender), shape)
             for total, values in ((score, part * block.white[at, who]), (information, part**2)):
                 total += np.bincount(place, values.sum(axis=1), minlength=total.size).reshape(shape)
-        score, information = self.score + score.cumsum(axis=0), self.information + information.cumsum(axis=0)
-        self.score, self.information = score[-1], information[-1]
-        return self._evidence(score, information)
-
-    def merge(self, other: Self) -> None:
-        """Sums over steps."""
-        self.score += other.score
-        self.information += other.information
-        self.samples += other.samples
+        return [score, information, samples]
 
     def finding(self) -> Finding | None:
         """The clearest link, or all."""
-        score, information = (each[self._links[:, 0], self._links[:, 1]] for each in (self.score, self.information))
-        if self.samples < MIN_SAMPLES or not (information > 0.0).any():
+        score, information = (each[self._links[:, 0], self._links[:, 1]] for each in self.sums[:2])
+        if self.sums[2] < MIN_SAMPLES or not (information > 0.0).any():
             return None
         z = score / np.sqrt(np.where(information > 0.0, information, np.inf))
         row = int(np.argmax(np.abs(z)))
-        groups = 2.0 if self._together else 1.0
+        groups = 2.0 if self.together else 1.0
         log_p = math.log(2.0 * len(z) * groups) + float(log_normal_tail(abs(z[row])))
         receiver, sender = self._links[row].tolist()
-        best = (log_p, receiver, sender, float(score[row]), float(information[row]))
-        if self._together:
-            s, j = float(score.sum()), float(information.sum())
-            log_p = math.log(2.0 * groups) + float(log_normal_tail(abs(s) / math.sqrt(j)))
-            best = min(best, (log_p, None, None, s, j), key=lambda candidate: candidate[0])
-        log_p, agent, sender, s, j = best
-        return Finding(
-            min(0.0, log_p),
-            agent=agent,
-            sender=sender,
-            estimate=s / j,
-            standard_error=1.0 / math.sqrt(j),
-            expected=0.0,
-        )
+        s, j = float(score[row]), float(information[row])
+        if self.together:
+            all_s, all_j = float(score.sum()), float(information.sum())
+            p_of_all = math.log(2.0 * groups) + float(log_normal_tail(abs(all_s) / math.sqrt(all_j)))
+            if p_of_all < log_p:
+                log_p, receiver, sender, s, j = p_of_all, None, None, all_s, all_j
+        error = 1.0 / math.sqrt(j)
+        return Finding(min(0.0, log_p), receiver, sender, estimate=s / j, standard_error=error, expected=0.0)
 
-    def logarithms(self) -> FloatArray:
-        """(links + 1, K): of each link, and of all together."""
-        return self._evidence(self.score, self.information)
-
-    def _evidence(self, *sums: FloatArray) -> FloatArray:
-        """(..., links + 1, K), from score and information (..., m, m)."""
-        rows = [each[..., self._links[:, 0], self._links[:, 1]] for each in sums]
-        if self._together:
-            rows = [np.concatenate([each, each.sum(axis=-1, keepdims=True)], axis=-1) for each in rows]
+    def of_sums(self, sums: Sequence[AnyArray]) -> FloatArray:
+        """(..., links + 1, K): of each link, and of all together."""
+        rows = (self.columns(each[..., self._links[:, 0], self._links[:, 1]]) for each in sums[:2])
         return coefficient_evidence(*rows)
 
     def about(self, row: int) -> str:
@@ -238,16 +180,14 @@ class StaleValues(Diagnostic):
         return f"stale values from agent {sender} to agent {receiver}"
 
     @classmethod
-    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+    def words(cls, found: Finding, names: Sequence[str]) -> str:
         """The share of the values of a link, or of all."""
         del names
-        agent, sender = found.agent, found.sender
-        link = None if sender is None or agent is None else (sender + 1, agent + 1)
-        which = f"the values of agent {link[0]} that agent {link[1]} uses" if link else "the values that agents use"
-        value, (low, high) = found.estimate or 0.0, found.interval
-        share = f"{percent(value)} ({100 * low:.3g} to {100 * high:.3g} %)"
-        words = f"{share} of {which} are one step older than the log says"
-        return Cause("stale", words, None, link, None, value, found.interval, found.expected, p)
+        which = "the values that agents use"
+        if found.agent is not None and found.sender is not None:
+            which = f"the values of agent {found.sender + 1} that agent {found.agent + 1} uses"
+        share = share_text(found.estimate or 0.0, found.interval or (0.0, 0.0))
+        return f"{share} of {which} are one step older than the log says"
 
 
 class Gains(Question):
@@ -256,11 +196,8 @@ class Gains(Question):
     name = "residuals: gains"
     meaning = "a gain, a reference or an offset is not that of the file, or received values are not used as they should"
     main = True
-
-    @classmethod
-    def tests(cls, run: Statistics) -> list[Test]:
-        """Of all coefficients together."""
-        return one_test(cls.name, run.residuals.p_gain)
+    p_value = attrgetter("residuals.p_gain")
+    parameters = "gains"
 
     def evidence(self, sums: RunningSums) -> FloatArray:
         """One row for each link and each leader."""
@@ -273,14 +210,35 @@ class Gains(Question):
         return f"gain of leader {agent}" if agent == other else f"gain of the link from agent {other} to agent {agent}"
 
     @classmethod
-    def classes(cls, search: Search) -> int:
-        """Links, edges, receivers, senders, graphs, leaders, offsets, the reference."""
-        return len(search.gains.classes) if search.gains else 0
-
-    @classmethod
-    def causes(cls, search: Search) -> list[Cause]:
-        """The changes of gains that explain the residuals."""
-        return [_gain_words(one, search) for one in search.selected_gains[0]]
+    def cause_of(cls, one: Selected, search: Search) -> Cause:
+        """A change of gains that explains the residuals."""
+        part, what, experiment = one.part, one.what, search.experiment
+        (low, high), p = one.interval, math.exp(one.log_p)
+        if part == "reference":
+            at = experiment.reference
+            value, interval = at + one.estimate, (at + low, at + high)
+            words = f"the leaders are pulled to {numbers_text(value, interval)}, not to the reference {at:g}"
+            return Cause("reference", words, None, None, None, value, interval, at, p)
+        if part == "offset":
+            dt = experiment.step_length
+            value, interval = one.estimate / dt, (low / dt, high / dt)
+            words = f"agent {what + 1} has an additional drift of {numbers_text(value, interval)} per unit of time"
+            return Cause("offset", words, what + 1, None, None, value, interval, 0.0, p)
+        if part in ("all", "sender") and -1.2 < one.estimate < 0.0:
+            value, interval = -one.estimate, (max(-high, 0.0), -low)
+            agent = None if part == "all" else what + 1
+            whose = "all messages" if agent is None else f"the messages of agent {agent}"
+            words = (
+                f"{share_text(value, interval)} of {whose} have no effect: they are ignored, or all gains on them are "
+                "too small by this share"
+            )
+            return Cause("ignored", words, agent, None, None, value, interval, 0.0, p)
+        factor, interval = 1.0 + one.estimate, (1.0 + low, 1.0 + high)
+        whose, agent, link, graph = _whose_gain(part, what)
+        name = None if graph is None else search.names[graph]
+        where = "" if name is None else f" in graph {name}"
+        words = f"{whose}{where} is {numbers_text(factor, interval)} times what the file says"
+        return Cause("gain", words, agent, link, name, factor, interval, 1.0, p)
 
 
 class CommonGain(Question):
@@ -289,47 +247,13 @@ class CommonGain(Question):
     name = "residuals: common gain"
     meaning = "all gains are too small or too large by one factor, or messages have no effect"
     subject = "all gains"
-
-    @classmethod
-    def tests(cls, run: Statistics) -> list[Test]:
-        """Of one direction of the regression."""
-        return one_test(cls.name, run.residuals.p_common_gain)
+    p_value = attrgetter("residuals.p_common_gain")
 
     def evidence(self, sums: RunningSums) -> FloatArray:
         """One row, where the agents' residuals are independent."""
         if not self.law.apart:
             return super().evidence(sums)
         return coefficient_evidence(sums.common_score, sums.common_information)[:, None]
-
-
-def _gain_words(one: Selected, search: Search) -> Cause:
-    part, what = one.part, one.what
-    names, p = search.names, math.exp(one.log_p)
-    low, high = one.interval
-    if part == "reference":
-        at = search.experiment.reference
-        numbers = numbers_text(at + one.estimate, (at + low, at + high))
-        words = f"the leaders are pulled to {numbers}, not to the reference {at:g}"
-        return Cause("reference", words, None, None, None, at + one.estimate, (at + low, at + high), at, p)
-    if part == "offset":
-        value, interval = (
-            one.estimate / search.experiment.step_length,
-            (low / search.experiment.step_length, high / search.experiment.step_length),
-        )
-        words = f"agent {what + 1} has an additional drift of {numbers_text(value, interval)} per unit of time"
-        return Cause("offset", words, what + 1, None, None, value, interval, 0.0, p)
-    factor, interval = 1.0 + one.estimate, (1.0 + low, 1.0 + high)
-    if part in ("all", "sender") and -1.2 < one.estimate < 0.0:
-        share, around = -one.estimate, (max(-high, 0.0), -low)
-        whose = "all messages" if part == "all" else f"the messages of agent {what + 1}"
-        shown = f"{percent(share)} ({100 * around[0]:.3g} to {100 * around[1]:.3g} %)"
-        words = f"{shown} of {whose} have no effect: they are ignored, or all gains on them are too small by this share"
-        return Cause("ignored", words, None if part == "all" else what + 1, None, None, share, around, 0.0, p)
-    whose, agent, link, graph = _whose_gain(part, what)
-    name = None if graph is None else names[graph]
-    where = "" if name is None else f" in graph {name}"
-    words = f"{whose}{where} is {numbers_text(factor, interval)} times what the file says"
-    return Cause("gain", words, agent, link, name, factor, interval, 1.0, p)
 
 
 def _whose_gain(part: str, what: Any) -> tuple[str, int | None, tuple[int, int] | None, int | None]:
@@ -341,14 +265,11 @@ def _whose_gain(part: str, what: Any) -> tuple[str, int | None, tuple[int, int] 
         pair, graph = what
         first, second = sorted(pair)
         return f"the gain of edge {first + 1}-{second + 1} in both directions", None, (first + 1, second + 1), graph
-    if part == "receiver in graph":
-        return f"agent {what[0] + 1}'s gain on all that it receives", what[0] + 1, None, what[1]
-    if part == "receiver":
-        return f"agent {what + 1}'s gain on all that it receives", what + 1, None, None
-    if part == "leader":
-        return f"agent {what + 1}'s gain as a leader", what + 1, None, None
-    if part == "sender":
-        return f"the gain of all others on agent {what + 1}", what + 1, None, None
-    if part == "graph":
-        return "every gain", None, None, what
-    return ("the gain of the leaders" if part == "leaders" else "every gain"), None, None, None
+    if part in ("graph", "leaders", "all"):
+        return "the gain of the leaders" if part == "leaders" else "every gain", None, None, what
+    agent, graph = what if part == "receiver in graph" else (what, None)
+    whose = {
+        "leader": f"agent {agent + 1}'s gain as a leader",
+        "sender": f"the gain of all others on agent {agent + 1}",
+    }
+    return whose.get(part, f"agent {agent + 1}'s gain on all that it receives"), agent + 1, None, graph

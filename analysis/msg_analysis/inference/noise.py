@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Self
+from operator import attrgetter
+from typing import Any, Self
 
 import numpy as np
 
-from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.inference.candidates import Cause, Selected, numbers_text
 from msg_analysis.inference.dependence import LagSums, lag_evidence
 from msg_analysis.inference.e_values import (
@@ -28,14 +29,14 @@ from msg_analysis.inference.question import (
     Block,
     Diagnostic,
     Finding,
+    Largest,
     Law,
     Place,
     Question,
     RunningSums,
     Search,
-    Statistics,
-    Test,
-    one_test,
+    SummedDiagnostic,
+    agent_words,
 )
 from msg_analysis.inference.statistics import log_chi2_below, log_chi2_tail, log_normal_tail, normal_score
 
@@ -46,11 +47,8 @@ class Noise(Question):
     name = "residuals: covariance"
     meaning = "the noise of some agents is larger, smaller, or correlated otherwise than in the file"
     main = True
-
-    @classmethod
-    def tests(cls, run: Statistics) -> list[Test]:
-        """Of the whole covariance."""
-        return one_test(cls.name, run.residuals.p_covariance)
+    p_value = attrgetter("residuals.p_covariance")
+    parameters = "noise"
 
     def evidence(self, sums: RunningSums) -> FloatArray:
         """One row for each agent whose noise is known to be independent over time."""
@@ -62,161 +60,115 @@ class Noise(Question):
         return f"noise of agent {np.flatnonzero(self.law.noisy)[row] + 1}"
 
     @classmethod
-    def classes(cls, search: Search) -> int:
-        """Agents, graphs, agents in graphs, all."""
-        return len(search.any_noise.classes) if search.any_noise else 0
-
-    @classmethod
-    def causes(cls, search: Search) -> list[Cause]:
-        """Variances that explain the squares of the residuals."""
-        return [_noise_words(one, search.names) for one in search.select(search.noise)]
-
-
-def _noise_words(one: Selected, names: Sequence[str]) -> Cause:
-    part, what = one.part, one.what
-    agent = {"agent": what, "agent in graph": what[0] if part == "agent in graph" else None}.get(part)
-    graph = {"graph": what, "agent in graph": what[1] if part == "agent in graph" else None}.get(part)
-    name = None if graph is None else names[graph]
-    whose = "the noise variance of all agents" if agent is None else f"agent {agent + 1}'s noise variance"
-    where = "" if name is None else f" in graph {name}"
-    factor, interval = math.exp(one.estimate), (math.exp(one.interval[0]), math.exp(one.interval[1]))
-    words = f"{whose}{where} is {numbers_text(factor, interval)} times what the file says"
-    number = None if agent is None else agent + 1
-    return Cause("noise", words, number, None, name, factor, interval, 1.0, math.exp(one.log_p))
+    def cause_of(cls, one: Selected, search: Search) -> Cause:
+        """A variance that explains the squares of the residuals."""
+        agent, graph = one.what if one.part == "agent in graph" else (None, None)
+        agent = one.what if one.part == "agent" else agent
+        graph = one.what if one.part == "graph" else graph
+        name = None if graph is None else search.names[graph]
+        whose = "the noise variance of all agents" if agent is None else f"agent {agent + 1}'s noise variance"
+        where = "" if name is None else f" in graph {name}"
+        factor, interval = one.factor
+        words = f"{whose}{where} is {numbers_text(factor, interval)} times what the file says"
+        number = None if agent is None else agent + 1
+        return Cause("noise", words, number, None, name, factor, interval, 1.0, math.exp(one.log_p))
 
 
-def _noise_cause(found: Finding, names: Sequence[str], p: float) -> Cause:
-    """A noise variance in one graph, or in some steps."""
-    agent, graph = None if found.agent is None else found.agent + 1, None if found.graph is None else names[found.graph]
-    when = found.place.words if found.place else f"in graph {graph}"
-    value, interval = found.estimate or 0.0, found.interval
-    words = f"the noise variance of {found.whose} is {numbers_text(value, interval)} times what the file says {when}"
-    return Cause("noise", words, agent, None, graph, value, interval, found.expected, p, found.steps)
-
-
-class NoiseByGraph(Diagnostic):
-    """Squares of standardised residuals by graph and agent, and of all agents together where these are independent.
-
-    Each sum is chi-square; the test is two-sided, with the number of sums as a factor (Bonferroni).
-    """
+class NoiseByGraph(SummedDiagnostic):
+    """Squares of standardised residuals, chi-square, by graph and agent, and of all agents together."""
 
     name = "residuals: noise by graph"
     meaning = "the size of the noise is wrong under some graph"
+    kind = "noise"
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)
-        n, m = law.step.modes, law.step.agents
-        self._agents, self._together = np.flatnonzero(law.noisy), law.apart and law.noisy.sum() > 1
-        self._graphs = n
-        self.samples, self.squares = np.zeros((n, m), np.int64), np.zeros((n, m))
+        shape = law.step.modes, law.step.agents
+        self.sums = [np.zeros(shape, np.int64), np.zeros(shape)]  # samples, squares
 
-    def add(self, block: Block) -> FloatArray:
+    def between(self, block: Block) -> list[AnyArray]:
         """Every agent by the graph that it used."""
         size, analyses = (block.white**2).sum(axis=2), block.analyses
-        there = [block.reception.graphs == graph for graph in range(self._graphs)]
+        there = [block.reception.graphs == graph for graph in range(self.law.step.modes)]
         samples = np.stack([analyses.counts(each) for each in there], axis=1) * block.white.shape[2]  # (T, n, m)
-        squares = np.stack([analyses.sums(size * each) for each in there], axis=1)
-        samples, squares = self.samples + samples.cumsum(axis=0), self.squares + squares.cumsum(axis=0)
-        self.samples, self.squares = samples[-1], squares[-1]
-        return self._evidence(samples, squares)
-
-    def merge(self, other: Self) -> None:
-        """Sums of independent numbers."""
-        self.samples += other.samples
-        self.squares += other.squares
+        return [samples, np.stack([analyses.sums(size * each) for each in there], axis=1)]
 
     def finding(self) -> Finding | None:
         """The graph and the agent, or all agents, whose variance is furthest from that of the law."""
-        samples, squares = self._rows(self.samples.astype(float)), self._rows(self.squares)
+        samples, squares = (self._cells(each) for each in self.sums)
         cells = [
             (min(log_chi2_tail(s, n), log_chi2_below(s, n)), row)
             for row, (n, s) in enumerate(zip(samples.tolist(), squares.tolist(), strict=True))
             if n
         ]
-        if not cells or self._graphs < 2:
+        if not cells or self.law.step.modes < 2:
             return None
         log_p, row = min(cells)
-        graph, agent = self._cell(row)
+        graph, agent = self._place(row)
         ratio = float(squares[row] / samples[row])
-        return Finding(
-            min(0.0, log_p + math.log(2.0 * len(cells))),
-            agent=agent,
-            graph=graph,
-            estimate=ratio,
-            standard_error=ratio * math.sqrt(2.0 / samples[row]),
-            expected=1.0,
-        )
+        log_p = min(0.0, log_p + math.log(2.0 * len(cells)))
+        return _variance_finding(log_p, ratio, samples[row], agent, graph=graph)
 
-    def logarithms(self) -> FloatArray:
-        """(cells, K)."""
-        return self._evidence(self.samples, self.squares)
-
-    def _evidence(self, samples: IntArray, squares: FloatArray) -> FloatArray:
+    def of_sums(self, sums: Sequence[AnyArray]) -> FloatArray:
         """(..., cells, K), from sums (..., n, m)."""
-        if self._graphs < 2:
-            return np.empty((*samples.shape[:-2], 0, 1))
-        return variance_evidence(self._rows(samples.astype(float)), self._rows(squares))
+        if self.law.step.modes < 2:
+            return np.empty((*sums[0].shape[:-2], 0, 1))
+        return variance_evidence(*(self._cells(each) for each in sums))
 
     def about(self, row: int) -> str:
         """Noise of an agent, or of all, in a graph."""
-        graph, agent = self._cell(row)
-        return f"noise of {'all agents' if agent is None else f'agent {agent + 1}'} in graph {self.law.graphs[graph]}"
+        graph, agent = self._place(row)
+        return f"noise of {agent_words(agent)} in graph {self.law.graphs[graph]}"
 
-    def _rows(self, sums: FloatArray) -> FloatArray:
+    def _cells(self, sums: AnyArray) -> FloatArray:
         """(..., cells): sums (..., n, m) of every cell, graph by graph the agents, then all of them."""
-        each = sums[..., self._agents]
-        if self._together:
-            each = np.concatenate([each, each.sum(axis=-1, keepdims=True)], axis=-1)
+        each = self.columns(sums[..., self.agents].astype(float))
         return each.reshape(*each.shape[:-2], -1)
 
-    def _cell(self, row: int) -> tuple[int, int | None]:
+    def _place(self, cell: int) -> tuple[int, int | None]:
         """Graph and agent of a cell."""
-        graph, place = divmod(row, len(self._agents) + bool(self._together))
-        return graph, int(self._agents[place]) if place < len(self._agents) else None
+        graph, column = divmod(cell, len(self.agents) + self.together)
+        return graph, self.agent(column)
 
     @classmethod
-    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
-        """A variance in one graph."""
-        return _noise_cause(found, names, p)
+    def words(cls, found: Finding, names: Sequence[str]) -> str:
+        """A variance in one graph, or in some steps."""
+        when = found.place.words if found.place else f"in graph {names[found.graph or 0]}"
+        whose = agent_words(found.agent)
+        return f"the noise variance of {whose} is {found.numbers} times what the file says {when}"
+
+
+def _variance_finding(log_p: float, ratio: float, numbers: float, agent: int | None, **place: Any) -> Finding:
+    """A sum of squares over its expectation, of so many numbers."""
+    error = ratio * math.sqrt(2.0 / numbers)
+    return Finding(log_p, agent, estimate=ratio, standard_error=error, expected=1.0, **place)
 
 
 SHARE = 0.1  # of the logarithm of the p-value
+LEVELS = 63  # lengths of windows, of any run
 
 
 class NoiseOverTime(Diagnostic):
-    """Squares of standardised residuals in windows of 1, 2, 4, ... steps, by agent and of all where independent.
-
-    The sum over a window is chi-square. The law of the largest and the smallest is bounded by the union over windows:
-    every length has the same share of the level, and within it every window and agent (weighted Bonferroni).
-
-    A variance that swings faster than windows can show, or that depends on itself, is found by the correlation of the
-    sums of single steps with those 1 to 100 steps before (McLeod and Li 1983), on normal scores, Phi^-1 of their
-    chi-square distribution function, which are exactly N(0, 1). Windows and lags have half of the level each.
-    """
+    """Squares of standardised residuals in windows of 1, 2, 4, ... steps, and their correlation with earlier ones."""
 
     name = "residuals: noise over time"
     meaning = "the size of the noise is wrong in a part of the run, or changes with time"
+    kind = "noise"
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)
-        self._agents, self._together = np.flatnonzero(law.noisy), law.apart and law.noisy.sum() > 1
-        columns = len(self._agents) + bool(self._together)
-        self._columns = columns
-        # Numbers in a window of one step.
-        self._numbers = np.full(columns, law.replicas)
-        if self._together:
-            self._numbers[-1] *= len(self._agents)
+        self._numbers = self.columns(np.full(len(self.agents), law.replicas))  # in a window of one step
+        self._columns = columns = len(self._numbers)
         self._windows = Windows(law.planned, columns)
         self._evidence = WindowEvidence(self._windows, columns)
         self._lags = LagSums(columns, 1)
-        levels = self._windows.levels
-        self._sizes = self._numbers << np.arange(levels)[:, None]  # (levels, columns) numbers in a window
-        self._known = variance_constant(self._sizes)  # (levels, columns, K)
-        self._counts = np.zeros(levels, np.int64)  # windows of runs that were merged
+        self._sizes = self._numbers << np.arange(self._windows.levels)[:, None]  # (levels, columns) numbers in a window
+        self._known = variance_constant(self._sizes)  # (K, levels, columns)
+        self._counts = np.zeros(LEVELS, np.int64)  # windows of runs that were merged
         self._runs = 1
-        # Largest and smallest sum of each length and column, the first step, and the run.
-        shape = (2, levels, columns)
-        self._extreme = np.stack([np.full((levels, columns), -np.inf), np.full((levels, columns), np.inf)])
+        # Largest sum, and largest of minus the sums, of each length and column, the first step, and the run.
+        shape = (2, LEVELS, columns)
+        self._extreme = np.full(shape, -np.inf)
         self._first, self._run = np.zeros(shape, np.int64), np.ones(shape, np.int64)
 
     def add(self, block: Block) -> FloatArray:
@@ -224,13 +176,13 @@ class NoiseOverTime(Diagnostic):
         analyses = block.analyses
         if not self._columns:
             return np.empty((analyses.count, 0, 1))
-        squares = (block.white[:, self._agents] ** 2).sum(axis=2)
-        if self._together:
-            squares = np.column_stack([squares, squares.sum(axis=1)])
+        squares = self.columns((block.white[:, self.agents] ** 2).sum(axis=2))
+        # Of a variance that depends on itself (McLeod and Li 1983), on normal scores, which are exactly N(0, 1).
         lags = lag_evidence(*self._lags.add(normal_score(squares, self._numbers)[:, :, None], analyses))
         ended = self._windows.add(squares)
         self._keep(ended)
-        numbers, constant = (np.repeat(each[ended.levels], ended.counts, axis=0) for each in (self._sizes, self._known))
+        levels = ended.level
+        numbers, constant = self._sizes[levels], self._known[:, levels]
         mixed = log_mean(variance_evidence(numbers, ended.sums, constant), axis=-1)
         windows = self._evidence.add(ended, mixed, analyses)
         return np.concatenate([windows, _mean_over_lags(lags)], axis=1)[:, :, None]
@@ -238,105 +190,60 @@ class NoiseOverTime(Diagnostic):
     def _keep(self, ended: EndedWindows) -> None:
         """Keep the most extreme windows, of this run."""
         ends = ended.begins + ended.counts
-        for side, extreme in enumerate((np.maximum, np.minimum)):
-            found = extreme.reduceat(ended.sums, ended.begins, axis=0)  # (L, columns)
-            old = self._extreme[side, ended.levels]
-            more = (found > old if side == 0 else found < old) | np.isnan(found)
-            for row, column in np.argwhere(more).tolist():
-                sums = ended.sums[ended.begins[row] : ends[row], column]
-                at = int(sums.argmax() if side == 0 else sums.argmin())
+        for side, sums in enumerate((ended.sums, -ended.sums)):
+            found = np.maximum.reduceat(sums, ended.begins, axis=0)  # (L, columns)
+            for row, column in np.argwhere(_more(found, self._extreme[side, ended.levels])).tolist():
+                at = ended.begins[row] + int(sums[ended.begins[row] : ends[row], column].argmax())
                 place = side, int(ended.levels[row]), column
-                self._extreme[place], self._first[place] = sums[at], ended.first[ended.begins[row] + at]
-                self._run[place] = 1
-
-    def _take(self, side: int, level: int, sums: FloatArray, first: IntArray, run: IntArray) -> None:
-        """Keep what is more extreme."""
-        old = self._extreme[side, level]
-        more = sums > old if side == 0 else sums < old
-        more |= np.isnan(sums)
-        self._extreme[side, level] = np.where(more, sums, old)
-        self._first[side, level] = np.where(more, first, self._first[side, level])
-        self._run[side, level] = np.where(more, run, self._run[side, level])
+                self._extreme[place], self._first[place], self._run[place] = sums[at, column], ended.first[at], 1
 
     def merge(self, other: Self) -> None:
-        """No window goes over from one run to another."""
-        levels = max(len(self._counts), len(other._counts))
-        for each in (self, other):
-            each._extend(levels)
-        for side in range(2):
-            for level in range(levels):
-                place = other._first[side, level], other._run[side, level] + self._runs
-                self._take(side, level, other._extreme[side, level], *place)
-        self._counts += other._counts + other._seen(levels)
+        """The more extreme windows."""
+        more = _more(other._extreme, self._extreme)
+        np.copyto(self._extreme, other._extreme, where=more)
+        np.copyto(self._first, other._first, where=more)
+        np.copyto(self._run, other._run + self._runs, where=more)
+        self._counts += other._seen()
         self._runs += other._runs
         self._evidence.merge(other._evidence)
         self._lags.merge(other._lags)
 
-    def _extend(self, levels: int) -> None:
-        """Room for the lengths of longer runs."""
-        more = levels - len(self._counts)
-        self._counts = np.append(self._counts, np.zeros(more, np.int64))
-        row = np.full((1, more, self._columns), np.inf)
-        self._extreme = np.concatenate([self._extreme, np.concatenate([-row, row])], axis=1)
-        widths = ((0, 0), (0, more), (0, 0))
-        self._first, self._run = np.pad(self._first, widths), np.pad(self._run, widths, constant_values=1)
-
-    def _seen(self, levels: int) -> IntArray:
+    def _seen(self) -> IntArray:
+        """(LEVELS,): windows that have ended, in all runs."""
         seen = self._windows.seen()
-        return np.append(seen, np.zeros(levels - len(seen), np.int64))
+        return np.asarray(self._counts + np.pad(seen, (0, LEVELS - len(seen))))
 
     def finding(self) -> Finding | None:
-        """The window or the lag, and the agent or all agents, whose noise is the least likely.
-
-        A window is named, since it says where, even if a lag is clearer, but not where it says next to nothing.
-        """
-        window, lag = self._window(), self._lag()
-        found = [one for one in (window, lag) if one]
+        """The window or the lag, and the agent or all agents, whose noise is the least likely."""
+        window, lag = self._window(), self._lags.clearest()
+        found = [window] if window else []
+        if lag:
+            found.append(replace(lag, agent=self.agent(lag.agent or 0)))
         if not found:
             return None
         best = min(found, key=lambda one: one.log_p)
+        # A window says where, even if a lag is clearer, but not one that says next to nothing.
         named = window if window and window.log_p <= SHARE * best.log_p else best
         return replace(named, log_p=min(0.0, best.log_p + math.log(len(found))))
 
-    def _agent(self, column: int) -> int | None:
-        return int(self._agents[column]) if column < len(self._agents) else None
-
-    def _lag(self) -> Finding | None:
-        lag = self._lags.clearest()
-        if lag is None:
-            return None
-        return Finding(
-            lag.log_p,
-            agent=self._agent(lag.column),
-            span=(lag.steps, lag.steps),
-            estimate=lag.coefficient,
-            standard_error=lag.standard_error,
-            expected=0.0,
-        )
-
     def _window(self) -> Finding | None:
-        counts = self._counts + self._seen(len(self._counts))
+        counts = self._seen()
         lengths = np.flatnonzero(counts).tolist()
         if not lengths or not self._columns:
             return None
         candidates = []
         for level in lengths:
+            # Every length has the same share of the level, and within it every window and agent (weighted Bonferroni).
             share = math.log(2.0 * len(lengths) * float(counts[level]) * self._columns)
             for column, numbers in enumerate((self._numbers << level).tolist()):
                 largest, smallest = self._extreme[:, level, column].tolist()
-                tails = log_chi2_tail(largest, numbers), log_chi2_below(smallest, numbers)
+                tails = log_chi2_tail(largest, numbers), log_chi2_below(-smallest, numbers)
                 candidates += [(tail + share, level, column, side) for side, tail in enumerate(tails)]
         log_p, level, column, side = min(candidates)
         first, numbers = int(self._first[side, level, column]) + 1, int(self._numbers[column] << level)
-        ratio = float(self._extreme[side, level, column] / numbers)
-        return Finding(
-            log_p,
-            agent=self._agent(column),
-            place=Place(first, first + (1 << level) - 1, int(self._run[side, level, column])),
-            estimate=ratio,
-            standard_error=ratio * math.sqrt(2.0 / numbers),
-            expected=1.0,
-        )
+        ratio = abs(float(self._extreme[side, level, column])) / numbers
+        place = Place(first, first + (1 << level) - 1, int(self._run[side, level, column]))
+        return _variance_finding(log_p, ratio, numbers, self.agent(column), place=place)
 
     def logarithms(self) -> FloatArray:
         """(2 (agents + 1), 1): windows, then lags, of each agent and of all together."""
@@ -346,22 +253,23 @@ class NoiseOverTime(Diagnostic):
     def about(self, row: int) -> str:
         """Noise of an agent, or of all, over time, and next to its own."""
         lags, column = divmod(row, self._columns)
-        agent = self._agent(column)
-        who = "all agents" if agent is None else f"agent {agent + 1}"
+        who = agent_words(self.agent(column))
         return f"size of the noise of {who} and of its own earlier noise" if lags else f"noise of {who} over time"
 
     @classmethod
-    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+    def words(cls, found: Finding, names: Sequence[str]) -> str:
         """A variance in some steps, or one that depends on its own past."""
         if found.span is None:
-            return _noise_cause(found, names, p)
-        value, interval = found.estimate or 0.0, found.interval
-        words = (
-            f"the size of the noise of {found.whose} has correlation {numbers_text(value, interval)} with its own "
+            return NoiseByGraph.words(found, names)
+        return (
+            f"the size of the noise of {agent_words(found.agent)} has correlation {found.numbers} with its own "
             f"{found.span[0]} steps before, not 0: its variance changes in time"
         )
-        agent = None if found.agent is None else found.agent + 1
-        return Cause("noise", words, agent, None, None, value, interval, found.expected, p)
+
+
+def _more(new: FloatArray, old: FloatArray) -> BoolArray:
+    """Where it is larger, or not a number."""
+    return np.asarray((new > old) | np.isnan(new))
 
 
 def _mean_over_lags(evidence: FloatArray) -> FloatArray:
@@ -373,27 +281,22 @@ LARGE = 4.0  # standard deviations; smaller residuals have the evidence 0
 
 
 class LargestResidual(Diagnostic):
-    """Every residual by itself, N(0, 1) after division by its standard deviation.
-
-    The test is that of the largest, with their number as a factor (Bonferroni). The evidence is the mean over all
-    residuals of a run of that of each one against a larger variance; those to come count 1. Half of the whole always
-    counts 1.
-    """
+    """Every residual by itself, N(0, 1) over its standard deviation; the test is that of the largest."""
 
     name = "residuals: largest"
     meaning = "a single step is much larger than the noise"
     subject = "largest residual"
+    kind = "outlier"
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)
-        self._agents = np.flatnonzero(law.noisy)
-        self._evidence = EventEvidence(law.planned * law.replicas * len(self._agents))
+        self._evidence = EventEvidence(law.planned * law.replicas * len(self.agents))
         self._samples = 0
-        self._largest, self._agent, self._place, self._runs = 0.0, 0, Place(0, 0), 1
+        self._largest = Largest(of=(0, 0.0))  # agent, and the residual with its sign
 
     def add(self, block: Block) -> FloatArray:
         """Add the residuals of a block."""
-        white, analyses = block.white[:, self._agents], block.analyses
+        white, analyses = block.white[:, self.agents], block.analyses
         if not white.size:
             return np.empty((analyses.count, 0, 1))
         self._samples += white.size
@@ -401,38 +304,33 @@ class LargestResidual(Diagnostic):
         large = sizes > LARGE
         logarithms = variance_evidence(np.ones(int(large.sum())), sizes[large] ** 2)[:, 0]
         seen, when = analyses.lengths * white[0].size, analyses.after(np.nonzero(large)[0])
-        at = int(np.argmax(sizes))
-        if not sizes.flat[at] <= abs(self._largest):  # also a NaN
-            step, place, _ = np.unravel_index(at, white.shape)
-            self._largest, self._agent = float(white.flat[at]), int(self._agents[place])
-            self._place = Place(block.first + int(step) + 1, block.first + int(step) + 1)
+        step, column, replica = np.unravel_index(int(np.argmax(sizes)), white.shape)
+        at, number = (step, column, replica), block.first + int(step) + 1
+        self._largest.take(float(sizes[at]), (self.agents[column], float(white[at])), Place(number, number))
         return self._evidence.add(seen, logarithms, when)[:, None, None]
 
     def merge(self, other: Self) -> None:
         """The larger one."""
         self._evidence.merge(other._evidence)
         self._samples += other._samples
-        if abs(other._largest) > abs(self._largest):
-            self._largest, self._agent, self._place = other._largest, other._agent, other._place.later(self._runs)
-        self._runs += other._runs
+        self._largest.merge(other._largest)
 
     def finding(self) -> Finding | None:
         """The largest."""
         if not self._samples:
             return None
-        log_p = math.log(2.0 * self._samples) + float(log_normal_tail(abs(self._largest)))
-        return Finding(min(0.0, log_p), agent=self._agent, place=self._place, estimate=self._largest, expected=0.0)
+        log_p = math.log(2.0 * self._samples) + float(log_normal_tail(self._largest.value))
+        agent, residual = self._largest.of
+        return Finding(min(0.0, log_p), int(agent), place=self._largest.place, estimate=residual, expected=0.0)
 
     def logarithms(self) -> FloatArray:
         """(1, 1)."""
-        return np.array([[self._evidence.logarithm()]]) if self._evidence.planned else np.empty((0, 1))
+        return self._evidence.logarithms()
 
     @classmethod
-    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+    def words(cls, found: Finding, names: Sequence[str]) -> str:
         """An agent in a step."""
-        assert found.place is not None
-        assert found.agent is not None
         del names
+        assert found.place is not None
         value = found.estimate or 0.0
-        words = f"{found.whose}'s noise is {value:.3g} standard deviations {found.place.words}"
-        return Cause("outlier", words, found.agent + 1, None, None, value, None, found.expected, p, found.steps)
+        return f"{agent_words(found.agent)}'s noise is {value:.3g} standard deviations {found.place.words}"

@@ -72,15 +72,10 @@ class Measurement:
 
 
 def transient_length(series: FloatArray) -> int:
-    """Steps at the start of a series without which its mean is more precise, by MSER-5 (White 1997).
+    """Steps at the start of a series (N,) without which its mean is more precise, by MSER-5 (White 1997).
 
     Of the means of 5 steps, the number left out minimises the variance of the mean of the others, as if these were
     independent. At most half are left out; 0 for series shorter than 20.
-
-    Parameters
-    ----------
-    series
-        (N,) in the order of time
     """
     count = len(series) // BATCH
     if count < 4:
@@ -92,9 +87,11 @@ def transient_length(series: FloatArray) -> int:
     return BATCH * int(np.argmin(scores[: count // 2 + 1]))
 
 
-def _blocks(first: int, end: int, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
+def _blocks(
+    first: int, end: int, numbers_per_step: int, what: str, most: int = BLOCK_NUMBERS
+) -> Iterator[tuple[int, int]]:
     """Blocks of the steps first..end-1; other arguments as of ``Observation.blocks``."""
-    length = max(1, BLOCK_NUMBERS // max(1, numbers_per_step))
+    length = max(1, most // max(1, numbers_per_step))
     for begin in range(first, end, length):
         tell(what, begin, end)
         yield begin, min(begin + length, end)
@@ -137,10 +134,7 @@ class Observation:
 
     @classmethod
     def of(cls, trajectory: Run, prediction: Prediction) -> Observation:
-        """Everything before the first gap.
-
-        InputError if the log of a run in real time does not say what the agents used.
-        """
+        """Everything before the first gap; InputError if a log in real time does not say what the agents used."""
         real_time = trajectory.record.experiment.run.pace == "realtime"
         steps = _known_steps(trajectory) if real_time else trajectory.prefix
         published, lost, used = trajectory.published, trajectory.lost, trajectory.used
@@ -172,6 +166,12 @@ class Observation:
     def steps(self) -> int:
         """N."""
         return len(self.modes)
+
+    @property
+    def timed(self) -> Timers:
+        """The timers, in real time."""
+        assert self.timers is not None
+        return self.timers
 
     @property
     def sure_messages(self) -> int:
@@ -209,14 +209,9 @@ class Observation:
         return replace(self, timers=Timers(graphs, used, made), used=None)
 
     def blocks(self, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
-        """(first, last + 1) of blocks of steps that keep temporary arrays of so many numbers per step small.
-
-        ``what``: what is done with them, for those who watch.
-        """
-        length = max(1, self.block_numbers // max(1, numbers_per_step))
-        for first in range(0, self.steps, length):
-            tell(what, first, self.steps)
-            yield first, min(first + length, self.steps)
+        """(first, last + 1) of blocks of steps with few temporary numbers; ``what`` is done, for those who watch."""
+        for block in _blocks(0, self.steps, numbers_per_step, what, self.block_numbers):
+            yield block
             self.release()
 
     def release(self) -> None:

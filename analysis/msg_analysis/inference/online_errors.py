@@ -3,46 +3,34 @@
 
 """Errors of a network next to their prediction while it runs: the numbers of a comparison, one step at a time.
 
-Measured are time means with the standard errors of ``errors.time_means``: of a complete run of up to ``EVERY_STEP``
-agents, both give the same. Only sums are kept. Per step, the system error takes O(m^2), and so do the node errors: with
-more agents, the standard errors of the nodes are estimated from some of the steps only. While the effect of a start
-that is not stationary lasts, the expectation is stepped along: O(n m^3). Incomplete steps are left out of both means.
+Only sums are kept; a step takes O(m^2), and while the effect of a start that is not stationary lasts, O(n m^3).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray, IntArray
+from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import number_text
 from msg_analysis.inference.estimates import Estimate, beside
 from msg_analysis.inference.observation import bounded
-from msg_analysis.inference.online_evidence import AnyTime, RunningEvidence, needs_log, supports
-from msg_analysis.inference.online_steps import Lateness, Recent, RecentSteps, StepCollector
+from msg_analysis.inference.online_evidence import AnyTime, ReceivedEvidence, RunningEvidence, needs_log, supports
+from msg_analysis.inference.online_steps import Lateness, LoggedStates, Recent, RecentSteps, StateLog, StepCollector
 from msg_analysis.inference.statistics import RunningBatches, simultaneous_half_width, steps_to_half_width
-from msg_analysis.inference.time_means import Value, forms_of, packed_moments, values_of
+from msg_analysis.inference.time_means import Value, forms_of, known_start, packed_moments, values_of
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.prediction import Prediction, predict
 
-if TYPE_CHECKING:
-    from msg_analysis.inference.online_evidence import ReceivedEvidence
-    from msg_analysis.inference.online_steps import LoggedStates, StateLog
-
-
 TUNING_STEPS = 500  # before the interval is given: their variances say how it is tuned
 
 
 class RunningInterval:
-    """Half-width of the 95 % interval of the system error that holds at all times at once.
-
-    By the martingale where there is a standard error; else by batch means of the measured errors, as in real time.
-    """
+    """Half-width of the 95 % interval of the system error that holds at all times at once."""
 
     def __init__(self, record: RunRecord, prediction: Prediction | None, variance: float | None) -> None:
         self._until, self._planned = record.until, record.planned_steps
@@ -97,13 +85,7 @@ class LiveReport:
 
 
 class LiveEstimate:
-    """The errors of a run next to their prediction, from the states as they arrive.
-
-    In real time agents are at different steps at the same moment, and the expected errors depend on their timing: then
-    there is no standard error, and the prediction is that of agents that are never late. ``nodes`` asks for standard
-    errors of the nodes, ``evidence`` for the evidence, which may need the messages. InputError where there is no
-    prediction (too large, unbounded).
-    """
+    """The errors of a run next to their prediction, from the states as they arrive; InputError without one."""
 
     def __init__(self, record: RunRecord, *, nodes: bool = True, evidence: bool = True) -> None:
         experiment = record.experiment
@@ -117,13 +99,12 @@ class LiveEstimate:
         self.log: StateLog | None = None  # None: the messages are not needed
         if evidence and prediction is not None and supports(prediction):
             if needs_log(experiment):
-                from msg_analysis.inference.online_evidence import ReceivedEvidence  # most runs need none of these
-                from msg_analysis.inference.online_steps import StateLog
-
                 self._received, self.log = ReceivedEvidence(prediction, experiment.run.replicas), StateLog(record)
             else:
                 self._plain = RunningEvidence(prediction, experiment.run.replicas)
         self.evidence = self._received or self._plain
+        # Whether what the agents publish is needed, too, because it is not their states.
+        self.needs_published = self.log is not None and self.log.truth
         self.steps = StepCollector(
             experiment.agents,
             len(experiment.graph_list),
@@ -145,11 +126,6 @@ class LiveEstimate:
             self._note = "fourth moments are infinite, so that errors have no standard errors: compare the bag"
         elif prediction is not None and not self._errors.nodes_tested:
             self._note = "too many agents for intervals of the agent errors"
-
-    @property
-    def needs_published(self) -> bool:
-        """Whether what the agents publish is needed, too, because it is not their states."""
-        return self.log is not None and self.log.truth
 
     def end_at(self, step: int) -> None:
         """The run ends at this step, or has ended there: what was done after it is not a part of it."""
@@ -215,7 +191,9 @@ class LiveEstimate:
 class RunningErrors:
     """Sums over steps that give errors and standard errors at any time; without a prediction, errors only."""
 
-    def __init__(self, record: RunRecord, prediction: Prediction | None, *, nodes: bool = True) -> None:
+    def __init__(
+        self, record: RunRecord, prediction: Prediction | None, *, nodes: bool = True, most_bytes: int = MOST_BYTES
+    ) -> None:
         experiment = record.experiment
         self._record, self._prediction = record, prediction
         self._agents, self._replicas = experiment.agents, experiment.run.replicas
@@ -229,7 +207,7 @@ class RunningErrors:
             self._expected = _Expected(prediction)
             heavy = prediction.fourth_moment.finite is not True
             if experiment.run.pace == "lockstep" and prediction.system.readout is None and not heavy:
-                self._variances = _ErrorVariances(prediction, self._replicas, nodes=nodes)
+                self._variances = _ErrorVariances(prediction, self._replicas, most_bytes if nodes else 0)
                 self.nodes_tested = self._variances.nodes
 
     def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> FloatArray:
@@ -277,14 +255,14 @@ class RunningErrors:
 
 
 class _ErrorVariances:
-    """Sums that give the variances of the time means, as in ``martingale.time_means``."""
+    """Sums that give the variances of the time means, as in ``time_means``."""
 
-    def __init__(self, prediction: Prediction, replicas: int, *, nodes: bool = True) -> None:
+    def __init__(self, prediction: Prediction, replicas: int, most_bytes: int) -> None:
         system = prediction.system
         p = packed_symmetric.size(system.dimension)
         agents = len(system.output)
         # Whether the node errors are tested, too, and not only the system error.
-        self.nodes = nodes and 8 * system.modes**2 * agents * (p + 1) <= MOST_BYTES
+        self.nodes = 8 * system.modes**2 * agents * (p + 1) <= most_bytes
         forms, _, trace = forms_of(system, "nodes" if self.nodes else "system")
         self._system, self._replicas = system, replicas
         self.needs_later = system.lossy  # whether the states after a step count, beside those before it
@@ -304,16 +282,15 @@ class _ErrorVariances:
 
     def add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
         """Arrays as in ``RunningErrors.add``, with deviations in place of states."""
-        for first in range(0, len(steps), self._length):
-            at = slice(first, first + self._length)
-            self._add(steps[at], modes[at], deviations[at], later[at])
-
-    def _add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
-        a = self._packed(deviations)
-        b = self._packed(later) if self.needs_later else a
-        sampled = steps % self._stride == 0
-        self._sampled += int(sampled.sum())
         self._count += len(steps)
+        for first in range(0, len(steps), self._length):
+            block = slice(first, first + self._length)
+            a = self._packed(deviations[block])
+            b = self._packed(later[block]) if self.needs_later else a
+            self._add(modes[block], a, b, steps[block] % self._stride == 0)
+
+    def _add(self, modes: IntArray, a: FloatArray, b: FloatArray, sampled: BoolArray) -> None:
+        self._sampled += int(sampled.sum())
         for mode in np.unique(modes).tolist():
             here = modes == mode
             self._totals[mode] += a[here].sum(axis=0)
@@ -331,15 +308,10 @@ class _ErrorVariances:
     def _sum_squares(self, mode: int, rows: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
         """(len(rows),): the part that is not linear in a, for some combinations of the forms."""
         value = self._values[mode]
-        total = np.zeros(len(rows))
         if isinstance(value, Value):
-            seen = a
-        else:
-            seen = b
-            total += ((value.increments(a, b) @ rows.T) ** 2).sum(axis=0)
-        for probability, surprise in zip(value.probability, value.surprises, strict=True):
-            total += probability * ((seen @ (rows @ surprise).T) ** 2).sum(axis=0)
-        return total
+            return np.asarray(value.jump_variances(rows, a).sum(axis=0))
+        increments = value.increments(a, b) @ rows.T
+        return np.asarray((increments**2 + value.jump_variances(rows, b)).sum(axis=0))
 
     def variances(self) -> FloatArray:
         """(1,) or (1 + m,): of the sums over all steps, of the system error and of the node errors."""
@@ -357,8 +329,7 @@ class _Expected:
 
     def __init__(self, prediction: Prediction) -> None:
         self._prediction = prediction
-        steady = prediction.steady
-        self._steady = np.diag(prediction.system.lifted(steady.sum(axis=0)))
+        self._steady = np.diag(prediction.system.lifted(prediction.steady.sum(axis=0)))
         self._away: FloatArray | None = None  # (n, d, d) from the steady state, of the next step
         self._law = np.empty(0)
         self._scale = 0.0
@@ -367,33 +338,21 @@ class _Expected:
 
     def add(self, steps: IntArray, record: RunRecord, first_mode: int | None) -> None:
         """Add steps; ``first_mode`` is g(0), which counts if it is known in the first call."""
-        if self._away is None:
-            self._begin(record, first_mode)
-        assert self._away is not None
         system, last = self._prediction.system, int(steps.max())
-        while len(self._series) <= last and not self._arrived():
+        if self._away is None:
+            steady = self._prediction.steady
+            initial, law = known_start(self._prediction, record.start, first_mode)
+            self._away, self._law = initial - steady, law - system.stationary
+            self._scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))
+        while len(self._series) <= last and (
+            np.abs(self._away).max(initial=0.0) > 1e-17 * self._scale or np.abs(self._law).max() > 1e-17
+        ):
             self._series.append(np.diag(system.lifted(self._away.sum(axis=0))))
             self._away, self._law = system.advance(self._away, self._law)
         self.total += len(steps) * self._steady
         early = steps[steps < len(self._series)]
         if len(early):
             self.total += np.sum([self._series[step] for step in early.tolist()], axis=0)
-
-    def _begin(self, record: RunRecord, first_mode: int | None) -> None:
-        step, system, steady = self._prediction.step, self._prediction.system, self._prediction.steady
-        law = system.of_modes(step.initial)
-        if record.experiment.run.start == "stationary":
-            initial = system.started_steady(steady, law)
-        else:
-            if first_mode is not None:
-                law = system.of_modes(np.eye(step.modes)[first_mode])
-            initial = system.started((record.start - step.reference).T, law)
-        self._away, self._law = initial - steady, law - system.stationary
-        self._scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))
-
-    def _arrived(self) -> bool:
-        assert self._away is not None
-        return bool(np.abs(self._away).max(initial=0.0) <= 1e-17 * self._scale and np.abs(self._law).max() <= 1e-17)
 
 
 LEAST_STEPS = 100  # before an interval counts

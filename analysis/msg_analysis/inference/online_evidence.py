@@ -3,12 +3,8 @@
 
 """Evidence against the law of a running network, and the interval of its system error that holds at all times at once.
 
-The sums of ``evidence_sums``, one stretch of whole steps after the other; O(1) per step. Which steps are
-left out, because they were not seen whole, must not depend on what happened in them.
-
-With reception noise, with delay and in real time, from what every agent received. The newest steps are stored until the
-values that were used in them are there. A value that is not there, because its step was not seen or is too old, leaves
-out the agent that used it in this step: that depends on times and losses only, never on states. Memory is bounded.
+Which steps are left out, because they were not seen whole, must not depend on what happened in them. A received value
+that is not there, because its step was not seen or is too old, leaves out the agent that used it.
 """
 
 from __future__ import annotations
@@ -69,14 +65,14 @@ def needs_log(experiment: Experiment) -> bool:
     return bool(noise.on_air or noise.delay or experiment.run.pace == "realtime")
 
 
-def supports(prediction: Prediction) -> bool:
+def supports(prediction: Prediction, most_bytes: int = MOST_BYTES) -> bool:
     """Whether there is evidence: of not too many agents."""
     step, system = prediction.step, prediction.system
     if needs_log(prediction.experiment):
         numbers = (8 + step.modes) * step.agents**2
     else:
         numbers = 16 * system.modes**2 * (packed_symmetric.size(system.dimension) + 1)
-    return 8 * numbers <= MOST_BYTES
+    return 8 * numbers <= most_bytes
 
 
 class EvidenceWatch:
@@ -86,13 +82,14 @@ class EvidenceWatch:
         if not supports(prediction):
             raise ValueError("too many agents for the evidence of this run")
         self.sums = EvidenceSums(prediction, replicas)
-        self.count = 0  # steps that have been added
+        self.count, self._end = 0, prediction.experiment.steps  # steps that have been added, and last one that counts
         self._crossed: int | None = None
+        # Of the martingale difference of the system error in a step, by which its interval is tuned.
+        self.variance = self.sums.error.variance if self.sums.error is not None else None
 
-    @property
-    def variance(self) -> float | None:
-        """Of the martingale difference of the system error in a step, by which its interval is tuned."""
-        return self.sums.error.variance if self.sums.error is not None else None
+    def end_at(self, step: int) -> None:
+        """The run ends at this step: what was done after it is not a part of it."""
+        self._end = min(step, self._end)
 
     def report(self, half_width: float | None) -> AnyTime:
         """The evidence now; ``half_width``: of the interval of the system error, which is passed on."""
@@ -116,17 +113,13 @@ class RunningEvidence(EvidenceWatch):
         if self.sums.error is None:
             raise ValueError("the states alone do not give the evidence of this run")
         self._prediction, self._replicas = prediction, replicas
-        step = prediction.step
-        numbers = (4 + step.most_neighbours) * step.agents * replicas
-        numbers = max(numbers + step.agents**2, self.sums.error.numbers * (1 + len(self.sums.error.rates)))
-        self._length = max(1, BLOCK_NUMBERS // numbers)
-        self._end = prediction.experiment.steps
+        self._length = max(1, BLOCK_NUMBERS // self.sums.numbers_per_step)
         # The newest step, which counts when the graph after it is known: its number, graph, states before it and after.
         self._kept: tuple[int, IntArray, FloatArray] | None = None
 
     def end_at(self, step: int) -> None:
-        """The run ends at this step: what was done after it is not a part of it, and the last step counts now."""
-        self._end = min(step, self._end)
+        """See ``EvidenceWatch``; the last step counts now."""
+        super().end_at(step)
         self._add_last()
 
     def add(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
@@ -194,14 +187,10 @@ class ReceivedEvidence(EvidenceWatch):
         self._published = np.zeros((kept, m, replicas)) if truth else self._states
         self._graphs = np.zeros((kept, m), dtype=np.int64)
         self._used = np.zeros((kept, m, step.most_neighbours), dtype=np.int64)
-        self._newest, self._end = -1, experiment.steps
+        self._newest = -1
         self._largest = 0.0
-        self._length = max(1, BLOCK_NUMBERS // ((4 + step.most_neighbours) * m * replicas + m * m))
+        self._length = max(1, BLOCK_NUMBERS // self.sums.numbers_per_step)
         self._path = NetworkPath()
-
-    def end_at(self, step: int) -> None:
-        """The run ends at this step: what was done after it is not a part of it."""
-        self._end = min(step, self._end)
 
     def add(self, logged: LoggedStates) -> None:
         """Add whole steps."""

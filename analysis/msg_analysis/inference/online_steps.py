@@ -49,10 +49,7 @@ class StateLog:
         self.impossible = 0
 
     def read(self, steps: IntArray, data: bytes, start: IntArray, size: IntArray, published: bytes) -> LoggedStates:
-        """Steps (b,), whose messages (b * m,), agent by agent, are in ``data``; without impossible ones.
-
-        ``published``: what was published of the states, in the same order; empty where that is the states.
-        """
+        """Steps (b,) whose messages (b m,), agent by agent, are ``data``; what was ``published``, if not the states."""
         b, m = len(steps), self._agents
         found, own = own_layout(data, start, size, np.arange(len(start)))
         assert own.all(), "checked when they came"
@@ -122,7 +119,7 @@ class RecentSteps:
 
 
 class Lateness:
-    """Real time: how long after they were due the agents made their newest steps, as in ``realtime.timing``."""
+    """Real time: how long after they were due the agents made their newest steps, as in ``timing``."""
 
     def __init__(self, experiment: Experiment) -> None:
         self._clocks = [StepClock(experiment.step_length, phase) for phase in phases(experiment).tolist()]
@@ -158,11 +155,7 @@ class _Row:
 
 
 class StepCollector:
-    """Collects the states of m agents, in any order, into whole steps.
-
-    In lockstep a step is ready only with its successor, which says which graph was used; else graphs are ignored.
-    ``logged``: keep the messages, too. ``truth``: a step is whole when what was published of its states is there, too.
-    """
+    """Collects the states of m agents, in any order, into whole steps; ``logged``: with their messages."""
 
     def __init__(
         self, agents: int, modes: int, last: int, *, lockstep: bool, logged: bool = False, truth: bool = False
@@ -186,11 +179,7 @@ class StepCollector:
     def add(
         self, agent: int, step: int, mode: int, payload: bytes, message: bytes = b"", *, published: bool = False
     ) -> None:
-        """Take x(step) of an agent (from 0) as little-endian float64, and where the log is kept its message.
-
-        ``mode`` is the graph of the step that led to it, from 1; 0 at step 0. ``published``: the payload is not the
-        state, but what was published of it.
-        """
+        """Take x(step) of an agent (from 0), or what was published of it, and the graph that led to it, from 1."""
         if published:
             agent += self._agents
         row = self._rows.get(step)
@@ -225,11 +214,8 @@ class StepCollector:
             self._complete(step, row)
 
     def take(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-        """Steps that have become ready since the last call: k (b,), graphs (b,), x(k) and x(k+1) (b, m, width).
-
-        Graphs are those of the step k -> k+1, from 0. Outside lockstep the graphs are 0, and x(k) takes the place of
-        x(k+1).
-        """
+        """Steps that have become ready: k (b,), their graphs from 0 (b,), x(k) and x(k+1) (b, m, width)."""
+        # Outside lockstep the graphs are 0, and x(k) takes the place of x(k+1).
         ready, self._ready = self._ready, []
         steps = np.array([entry[0] for entry in ready], dtype=np.int64)
         modes = np.array([entry[1] - 1 for entry in ready], dtype=np.int64)

@@ -4,11 +4,10 @@
 """The periods of a run in real time as linear maps between the states known at its sampling times.
 
 The state of the network at the sampling time K dt is a stack: the newest state of every agent; older ones that a later
-step still uses, because a message was slow, its reader late, or a newer one lost; in place of these, with reception
-noise, the values as they were published, or received if they arrive once and are used again; and, if process noise is
-correlated between agents, that of a step that some agents have made and others not yet. A period maps one stack to the
-next by a matrix and noise, which depend on the log alone. Without losses nearly all periods of a run are alike:
-matrices are computed once for each pattern.
+step still uses; in place of these, with reception noise, the values as they were published, or received if they arrive
+once and are used again; and, if process noise is correlated between agents, that of a step that some agents have made
+and others not yet. A period maps one stack to the next by a matrix and noise, which depend on the log alone: matrices
+are computed once for each pattern.
 """
 
 from __future__ import annotations
@@ -47,52 +46,40 @@ class _Law(NamedTuple):
 
 
 class Periods:
-    """The periods K = 1..N-1 of a run in real time, from sampling time K-1 to K.
-
-    A stack begins with the m newest states. ``order`` is that in which the states were made.
-    """
+    """The periods K = 1..N-1 of a run, from sampling time K-1 to K; a stack begins with the m newest states."""
 
     def __init__(self, observation: Observation, order: EventOrder) -> None:
         self._step = step = observation.step
         self._observation, self._newest = observation, order.newest
-        self._tables = period_tables(observation, order)
+        self._events, self._extras = period_tables(observation, order)
         self._numbers = Entries(step)
         self._shared = self._numbers.shared
         self._laws: dict[tuple[int, int], _Law] = {}  # by graph and agent
         self._cache: dict[bytes, Period] = {}
         self._cached, self._most_cached = 0, CACHED_BLOCKS * observation.block_numbers
-        self.steps = observation.steps
-        self.largest = step.agents + int(
-            np.diff(self._tables.extra_ends).max(initial=0)
-        )  # entries of the largest stack
-
-    @property
-    def agents(self) -> int:
-        """M."""
-        return self._step.agents
+        self.steps, self.agents = observation.steps, step.agents
+        self.largest = step.agents + int(np.diff(self._extras.ends).max(initial=0))  # entries of the largest stack
 
     def entries(self, number: int) -> int:
         """Entries of the stack at sampling time ``number``, from 0."""
-        return self._step.agents + len(self._tables.of_extras(number))
+        return self._step.agents + len(self._extras[number])
 
     def start(self, moment: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(S, S) each, of the stack at the start: without noise, from that of the states (m, m); of noise."""
         m = self._step.agents
-        entries = np.concatenate([np.arange(m), self._tables.of_extras(0)[:, 0]])
+        entries = np.concatenate([np.arange(m), self._extras[0][:, 0]])
         owners = self._numbers.owners[entries]
         noise = np.diag(np.where(entries >= 2 * m, self._step.broadcast**2, 0.0))
         return moment[np.ix_(owners, owners)], noise
 
     def stack(self, number: int, moment: FloatArray) -> FloatArray | None:
-        """(S, S): mean of z z^T over the replicas at sampling time ``number``, given what is logged.
-
-        What was received is not logged, but follows, but for its noise, from the rest: by regression, with the second
-        moment (S, S) of the law. None where the stack contains process noise.
-        """
+        """(S, S): mean of z z^T over replicas at sampling time ``number``, given the log; None with process noise."""
+        # What was received is not logged, but follows, but for its noise, from the rest: by regression, with the second
+        # ``moment`` (S, S) of the law.
         if self._shared.any():
             return None
         step, m, observation = self._step, self._step.agents, self._observation
-        extra = self._tables.of_extras(number)
+        extra = self._extras[number]
         entries = np.concatenate([np.arange(m), extra[:, 0]])
         steps = self._newest[number, self._numbers.owners[entries]]
         steps[m:] += extra[:, 1]
@@ -113,8 +100,8 @@ class Periods:
 
     def __getitem__(self, number: int) -> Period:
         """The period that ends at sampling time ``number`` (1..N-1)."""
-        events = self._tables.of_events(number)
-        before, after = self._tables.of_extras(number - 1), self._tables.of_extras(number)
+        events = self._events[number]
+        before, after = self._extras[number - 1], self._extras[number]
         key = b"|".join((events.tobytes(), before.tobytes(), after.tobytes()))
         if key not in self._cache:
             found = self._compile(events, before, after)
@@ -127,27 +114,24 @@ class Periods:
 
     def release(self) -> None:
         """Give the memory of a long run back to the system: after every block of periods."""
-        for array in (self._tables.events, self._tables.extras, self._newest):
+        for array in (self._events.rows, self._extras.rows, self._newest):
             release(array)
         self._observation.release()
 
     def _law(self, graph: int, agent: int) -> _Law:
-        found = self._laws.get((graph, agent))
-        if found is None:
-            found = self._laws[graph, agent] = self._new_law(graph, agent)
-        return found
-
-    def _new_law(self, graph: int, agent: int) -> _Law:
+        if (graph, agent) in self._laws:
+            return self._laws[graph, agent]
         tables, gain = neighbour_tables(self._step), self._step.noise_gain[graph, agent]
         senders = tables.senders[graph, agent, : tables.count[graph, agent]].tolist()
         weights = neighbour_weights(self._step)[graph, agent].tolist()
         shared = np.flatnonzero(self._shared & (gain != 0.0)).tolist()
-        return _Law(
+        self._laws[graph, agent] = found = _Law(
             float(self._step.nominal[graph, agent, agent]),
             list(zip(senders, weights, strict=False)),
             [(which, float(gain[which])) for which in shared],
             float((gain[~self._shared] ** 2).sum()),
         )
+        return found
 
     def _compile(self, events: IntArray, before: IntArray, after: IntArray) -> Period:
         """Event by event; values are kept as long as they are used."""
@@ -196,14 +180,11 @@ class Periods:
         return live.take(stacked)
 
 
-_Key = tuple[int, int]
+_Key = tuple[int, int]  # entry and step; sources of noise are numbers of variance 1, new where not known yet
 
 
 class _Live:
-    """Values as combinations of the stack at the beginning of a period, and the covariance of the noise added since.
-
-    Keys are (entry, step), see ``Periods``; noise sources are numbers of variance 1, new where not known yet.
-    """
+    """Values as combinations of the stack at the beginning of a period, and the covariance of the noise added since."""
 
     def __init__(self, stack: list[_Key], agents: int) -> None:
         self._agents, self._entries = agents, len(stack)

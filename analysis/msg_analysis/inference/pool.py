@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ import numpy as np
 
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison, Member, Pool, first_difference
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.observation import Observation
@@ -54,50 +54,39 @@ def compare(*runs: Run | str | Path, level: float = 0.01) -> Comparison:
     if not 0.0 < level <= 0.5:
         raise InputError(f"level: {level:g}: expected a probability above 0, at most 0.5")
     if len(runs) == 1:
-        return compare_run(_read(runs[0]), level=level)
+        return compare_run(runs[0] if isinstance(runs[0], Run) else read_bag(runs[0]), level=level)
     absent = [str(path) for path in runs if not isinstance(path, Run) and not Path(path).exists()]
     if absent:
         raise InputError(f"{', '.join(absent)}: not found: expected bags, {len(runs)} were given")
-    named = ((_name(run, place), _read(run)) for place, run in enumerate(runs, start=1))
+    named = (
+        (f"run {place}", run) if isinstance(run, Run) else (str(run), read_bag(run))
+        for place, run in enumerate(runs, start=1)
+    )
     return compare_pooled(named, level=level)
 
 
 def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> Comparison:
-    """Compare several runs of one experiment, (name, trajectory) each, with its prediction, to one verdict.
-
-    Sums are added up over the runs, so that every step counts the same. A further test of the family asks whether the
-    runs are alike (Cochran's Q). No trajectory is kept.
-
-    Parameters
-    ----------
-    runs
-        name for messages, and trajectory; they are read one after the other
-    level
-        probability of a false "disagrees", all tests together
-
-    Raises
-    ------
-    InputError
-        no run, different experiments, a run or seed that is there twice, or no prediction
-    """
+    """Compare several runs of one experiment, by name and read one after the other, with its prediction."""
     total: Evidence | None = None
     prediction: Prediction | None = None
     trajectory: Run | None = None
     members: list[Member] = []
     for name, run in runs:
         _require_another(members, name, run.record)
+        experiment = run.record.experiment
         if prediction is None:
-            _require_prediction(name, run.record.experiment)
-            prediction, trajectory = predict(run.record.experiment, run.record.step_model), _without_data(run)
-        prediction = prediction.for_run(run.record.experiment)
+            reason = experiment.unpredictable()
+            if reason:
+                raise InputError(f"{name}: {reason}, so there is nothing to pool: compare one bag at a time")
+            prediction, trajectory = predict(experiment, run.record.step_model), _without_data(run)
+        prediction = prediction.for_run(experiment)
         member, evidence = _examine(name, run, prediction, level)
         members.append(member)
         if evidence:
             total = total.merged(evidence) if total else evidence
     if prediction is None or trajectory is None:
         raise InputError("no bag: give at least one")
-    account = _sum([member.completeness for member in members])
-    trajectory = dataclasses.replace(trajectory, completeness=account)
+    trajectory = dataclasses.replace(trajectory, completeness=_sum([member.completeness for member in members]))
     pool = _pool(members) if total and total.decisive else Pool(tuple(members))
     if total is None:
         comparison = without_numbers(trajectory, level, prediction, 0)
@@ -117,12 +106,6 @@ def _examine(name: str, run: Run, prediction: Prediction, level: float) -> tuple
     tested = alone.given.system_error if alone.given else alone.system_error
     member = Member(name, run.record, evidence.steps, run.completeness, alone.system_error, tested, alone.verdict)
     return member, evidence
-
-
-def _require_prediction(name: str, experiment: Experiment) -> None:
-    reason = experiment.unpredictable()
-    if reason:
-        raise InputError(f"{name}: {reason}, so there is nothing to pool: compare one bag at a time")
 
 
 def _require_another(members: list[Member], name: str, record: RunRecord) -> None:
@@ -153,53 +136,27 @@ def _shown(value: Any) -> str:
 
 def _without_data(run: Run) -> Run:
     """Only the record and the completeness."""
-    return dataclasses.replace(
-        run,
-        states=run.states[:0],
-        modes=run.modes[:0],
-        agent_modes=None,
-        published=None,
-        lost=None,
-        used=None,
-        made=None,
-    )
+    logged: dict[str, Any] = dict.fromkeys(("agent_modes", "published", "lost", "used", "made"))
+    return dataclasses.replace(run, states=run.states[:0], modes=run.modes[:0], **logged)
 
 
 def _sum(counts: list[Completeness]) -> Completeness:
-    refused: dict[str, int] = {}
+    refused: Counter[str] = Counter()
     for count in counts:
-        for reason, number in count.refused.items():
-            refused[reason] = refused.get(reason, 0) + number
-    return Completeness(
-        expected=sum(count.expected for count in counts),
-        received=sum(count.received for count in counts),
-        missing=sum(count.missing for count in counts),
-        duplicates=sum(count.duplicates for count in counts),
-        out_of_order=sum(count.out_of_order for count in counts),
-        refused=refused,
-        missing_modes=sum(count.missing_modes for count in counts),
-    )
+        refused.update(count.refused)
+    names = "expected", "received", "missing", "duplicates", "out_of_order", "missing_modes"
+    total = {name: sum(getattr(count, name) for count in counts) for name in names}
+    return Completeness(**total, refused=dict(refused))
 
 
 def _pool(members: list[Member]) -> Pool:
     """Test whether measured - expected is the same in all runs: Cochran's Q."""
-    z, errors = [], []
-    for member in members:
-        error = member.tested
-        if error.z is not None and error.standard_error:
-            z.append(error.z)
-            errors.append(error.standard_error)
-    if len(z) < 2:
+    tested = [member.tested for member in members]
+    usable = [(error.z, error.standard_error) for error in tested if error.z is not None and error.standard_error]
+    if len(usable) < 2:
         return Pool(tuple(members))
-    deviation, precision = np.array(z) * np.array(errors), 1.0 / np.array(errors) ** 2
+    z, errors = np.array(usable).T
+    deviation, precision = z * errors, 1.0 / errors**2
     mean = float(precision @ deviation / precision.sum())
     chi2 = float(precision @ (deviation - mean) ** 2)
     return Pool(tuple(members), chi2, len(z) - 1, float(chi2_tail(chi2, len(z) - 1)))
-
-
-def _read(run: Run | str | Path) -> Run:
-    return run if isinstance(run, Run) else read_bag(run)
-
-
-def _name(run: Run | str | Path, place: int) -> str:
-    return f"run {place}" if isinstance(run, Run) else str(run)

@@ -1,32 +1,32 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a question about a run is: its test, its evidence at any time, and the causes that it finds.
-
-All questions are in the list of ``questions``; how to add one is in docs/statistics.md.
-"""
+"""What a question about a run is: its test, its evidence at any time, and the causes that it finds."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
-from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import candidates
-from msg_analysis.inference.candidates import Cause, Parameters, Selected, select
-from msg_analysis.inference.counts import LossTally, LossTest, SwitchingTest, Transitions
+from msg_analysis.inference.candidates import Cause, Parameters, Selected, numbers_text, select
 from msg_analysis.inference.e_values import Analyses
-from msg_analysis.inference.estimates import CovarianceTest, Estimate
+from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.received_values import ReceivedValues
-from msg_analysis.inference.residuals import BroadcastSums, ResidualSums, ResidualTests
+from msg_analysis.inference.residuals import ResidualTests
 from msg_analysis.model.step_model import StepModel
+
+if TYPE_CHECKING:
+    from msg_analysis.inference.verdict import Evidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +54,6 @@ class Place:
     last: int
     run: int = 1  # of several runs, from 1 in the order of the comparison
 
-    def later(self, runs: int) -> Place:
-        """The same place with so many runs before it."""
-        return Place(self.first, self.last, self.run + runs)
-
     @property
     def words(self) -> str:
         """Such as "from step 10 to 12"."""
@@ -65,6 +61,33 @@ class Place:
         if self.first == self.last:
             return f"in step {self.first:,}{of_run}"
         return f"from step {self.first:,} to {self.last:,}{of_run}"
+
+
+@dataclass(slots=True)
+class Largest:
+    """The largest value that was seen, what it is of, and where; runs are numbered in the order of merging."""
+
+    value: float = 0.0
+    of: tuple[float, ...] = ()
+    place: Place = Place(0, 0)
+    runs: int = 1
+
+    def take(self, value: float, of: tuple[float, ...], place: Place) -> None:
+        """Keep it if it is larger."""
+        if not value <= self.value:  # also a NaN
+            self.value, self.of, self.place = value, of, place
+
+    def merge(self, other: Largest) -> None:
+        """With that of other runs."""
+        if other.value > self.value:
+            place = replace(other.place, run=other.place.run + self.runs)
+            self.value, self.of, self.place = other.value, other.of, place
+        self.runs += other.runs
+
+
+def agent_words(agent: int | None) -> str:
+    """An agent, from 0, in words; None: all."""
+    return "all agents" if agent is None else f"agent {agent + 1}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,22 +106,15 @@ class Finding:
     expected: float | None = None
 
     @property
-    def interval(self) -> tuple[float, float]:
-        """95 %; (0, 0) without an estimate."""
-        low, high = Estimate(self.estimate or 0.0, standard_error=self.standard_error or 0.0).interval
-        assert low is not None
-        assert high is not None
-        return low, high
+    def interval(self) -> tuple[float, float] | None:
+        """95 %; None without a standard error."""
+        low, high = Estimate(self.estimate, standard_error=self.standard_error).interval
+        return None if low is None or high is None else (low, high)
 
     @property
-    def steps(self) -> tuple[int, int] | None:
-        """First and last step of the place."""
-        return (self.place.first, self.place.last) if self.place else None
-
-    @property
-    def whose(self) -> str:
-        """The agent in words."""
-        return "all agents" if self.agent is None else f"agent {self.agent + 1}"
+    def numbers(self) -> str:
+        """Estimate and interval in words."""
+        return numbers_text(self.estimate or 0.0, self.interval or (0.0, 0.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,45 +124,47 @@ class Statistics:
     system_error: Estimate | None = None  # as it is tested: given the path of the graphs where that is known
     node_errors: Sequence[Estimate] = ()
     corrected: str = ""  # what is added to the names of these tests where the errors are corrected for this path
-    covariance: CovarianceTest | None = None
+    p_covariance: float | None = None  # of all second moments
     residuals: ResidualTests = field(default_factory=ResidualTests)
-    switching: SwitchingTest | None = None
-    loss: LossTest | None = None
+    p_switching: float | None = None
+    p_loss: float | None = None
     p_broadcast: float | None = None
     findings: Mapping[str, Finding] = field(default_factory=dict)  # by name of the diagnostic
     p_alike: float | None = None  # of several runs
 
 
 class Search:
-    """The search for the causes of a disagreement: sums over runs, and what was found in them so far.
-
-    Consequences across groups are removed: agents whose states are constant are left out of the regression and of the
-    noise, and the part of the residuals that wrong gains explain is not counted as noise.
-    """
+    """The search for the causes of a disagreement: sums over runs, and what was found in them so far."""
 
     def __init__(
-        self,
-        experiment: Experiment,
-        residuals: ResidualSums,
-        transitions: Transitions,
-        loss: LossTally | None,
-        broadcast: BroadcastSums | None,
-        findings: Mapping[str, Finding],
-        level: float,
+        self, experiment: Experiment, evidence: Evidence, findings: Mapping[str, Finding], level: float
     ) -> None:
         self.experiment, self.names = experiment, [graph.name for graph in experiment.graph_list]
-        self.residuals, self.transitions, self.loss_tally = residuals, transitions, loss
+        self.residuals, self.transitions, self.loss = evidence.residuals, evidence.transitions, evidence.loss
         self.findings, self.level = findings, level
         self.families = 0  # classes of candidates, all questions together
+        residuals, loss, broadcast = evidence.residuals, evidence.loss, evidence.broadcast
         self.frozen = candidates.frozen(residuals)
+        # Agents whose states are constant are no evidence on gains and noise.
         self.excluded = [agent for agent, _, _ in self.frozen]
-        self.gains = candidates.gains(residuals, self.excluded)
-        self.losses = candidates.losses(loss) if loss else None
-        self.broadcast = candidates.variances(np.diag(broadcast.scatter), broadcast.samples) if broadcast else None
+        self.parameters: dict[str, Parameters | None] = {
+            "gains": candidates.gains(residuals, self.excluded),
+            "noise": candidates.noise(residuals, self.excluded, np.zeros(len(residuals.terms))),
+            "loss": candidates.losses(loss) if loss else None,
+            "broadcast": candidates.variances(np.diag(broadcast.scatter), broadcast.samples) if broadcast else None,
+        }
 
-    def select(self, group: Parameters | None) -> list[Selected]:
-        """The changes that explain the score of a group."""
-        return self._select(group)[0] if group else []
+    def classes(self, group: str) -> int:
+        """Classes of candidates of a group of parameters."""
+        found = self.parameters.get(group)
+        return len(found.classes) if found else 0
+
+    def selected(self, group: str) -> list[Selected]:
+        """The changes that explain the score of a group of parameters."""
+        if group == "gains":
+            return self.selected_gains[0]
+        found = self.noise if group == "noise" else self.parameters.get(group)
+        return self._select(found)[0] if found else []
 
     def _select(self, group: Parameters) -> tuple[list[Selected], FloatArray]:
         return select(group.score, group.information, group.classes, self.families, self.level)
@@ -154,12 +172,8 @@ class Search:
     @cached_property
     def selected_gains(self) -> tuple[list[Selected], FloatArray]:
         """What is found in the regression, and the total change of its coefficients."""
-        return self._select(self.gains) if self.gains else ([], np.zeros(len(self.residuals.terms)))
-
-    @cached_property
-    def any_noise(self) -> Parameters | None:
-        """The noise variances as if all gains were right."""
-        return candidates.noise(self.residuals, self.excluded, np.zeros(len(self.residuals.terms)))
+        group = self.parameters["gains"]
+        return self._select(group) if group else ([], np.zeros(len(self.residuals.terms)))
 
     @cached_property
     def noise(self) -> Parameters | None:
@@ -234,7 +248,7 @@ class Law:
     lossy: IntArray  # (l, 2) receivers and senders whose losses are
 
 
-class Question(ABC):
+class Question:
     """One question about a run, which one part of its law answers.
 
     The class reads the test and the causes from what is computed of a run; an object has the evidence of one run.
@@ -242,17 +256,22 @@ class Question(ABC):
 
     name: ClassVar[str]  # of the test in the verdict
     meaning: ClassVar[str]  # what is wrong where it is rejected
+    p_value: ClassVar[
+        attrgetter[float | None]
+    ]  # from ``Statistics``, of the test, where that is one without an estimate
     subject: ClassVar[str] = ""  # of its evidence, where that has one row and is not about the name
     main: ClassVar[bool] = False  # whether one part of the law answers it, see ``evidence_weights``
     about_chain: ClassVar[bool] = False  # whether it is about the graphs, not about the steps of the agents
+    parameters: ClassVar[str] = ""  # group of ``Search.parameters`` whose changes are its causes
 
     def __init__(self, law: Law) -> None:
         self.law = law
 
     @classmethod
-    @abstractmethod
     def tests(cls, run: Statistics) -> list[Test]:
         """Of a run, alone; none where there is nothing to test."""
+        p = cls.p_value(run)
+        return [] if p is None else [Test(cls.name, p)]
 
     def number_of_tests(self) -> int:
         """Number of tests in the family of a run with this law."""
@@ -270,19 +289,17 @@ class Question(ABC):
     @classmethod
     def classes(cls, search: Search) -> int:
         """Classes of candidate causes that ``causes`` has."""
-        del search
-        return 0
+        return search.classes(cls.parameters)
 
     @classmethod
     def causes(cls, search: Search) -> list[Cause]:
         """What is wrong."""
-        del search
-        return []
+        return [cls.cause_of(one, search) for one in search.selected(cls.parameters)]
 
-
-def one_test(name: str, p: float | None, estimate: Estimate | None = None) -> list[Test]:
-    """One test; none without a p-value."""
-    return [] if p is None else [Test(name, p, estimate=estimate)]
+    @classmethod
+    def cause_of(cls, one: Selected, search: Search) -> Cause:
+        """A change of the ``parameters`` in words."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,11 +315,25 @@ class Block:
     analyses: Analyses  # the interim analyses, T of them
 
 
-class Diagnostic(Question):
-    """A question with sums of its own over the steps, which finds where in the run something is wrong.
+class Diagnostic(Question, ABC):
+    """A question with sums of its own over the steps, which finds where in the run something is wrong."""
 
-    While a run goes on it is not asked: all together take as much time as all other questions.
-    """
+    # While a run goes on, none is asked: all together take as much time as all other questions.
+
+    kind: ClassVar[str]  # of its cause
+
+    def __init__(self, law: Law) -> None:
+        super().__init__(law)
+        self.agents = np.flatnonzero(law.noisy)
+        self.together = bool(law.apart and len(self.agents) > 1)  # whether all of them are asked about as one, too
+
+    def columns(self, values: AnyArray) -> AnyArray:
+        """(..., agents + 1): values (..., agents), and their sum where all are asked about together."""
+        return np.append(values, values.sum(axis=-1, keepdims=True), axis=-1) if self.together else values
+
+    def agent(self, column: int) -> int | None:
+        """Of one of the ``columns``; None: all."""
+        return int(self.agents[column]) if column < len(self.agents) else None
 
     @abstractmethod
     def add(self, block: Block) -> FloatArray:
@@ -310,7 +341,7 @@ class Diagnostic(Question):
 
     @abstractmethod
     def merge(self, other: Self) -> None:
-        """Add the sums of other runs of the same experiment, with other seeds."""
+        """Add the sums of other runs of the same experiment, with other seeds; nothing goes on from run to run."""
 
     @abstractmethod
     def finding(self) -> Finding | None:
@@ -322,8 +353,27 @@ class Diagnostic(Question):
 
     @classmethod
     @abstractmethod
+    def words(cls, found: Finding, names: Sequence[str]) -> str:
+        """The finding, with the names of the graphs."""
+
+    @classmethod
     def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
-        """The finding in words, with the names of the graphs and its adjusted p."""
+        """The finding, with the names of the graphs and its adjusted p."""
+        agent = None if found.agent is None else found.agent + 1
+        link = None if found.sender is None or agent is None else (found.sender + 1, agent)
+        graphs = [names[graph] for graph in (found.graph, found.other) if graph is not None]
+        return Cause(
+            kind=cls.kind,
+            words=cls.words(found, names),
+            agent=None if link else agent,
+            link=link,
+            graph=graphs[0] if len(graphs) == 1 else graphs or None,
+            estimate=found.estimate,
+            interval=found.interval,
+            expected=found.expected,
+            p=p,
+            steps=(found.place.first, found.place.last) if found.place else None,
+        )
 
     @classmethod
     def tests(cls, run: Statistics) -> list[Test]:
@@ -332,7 +382,7 @@ class Diagnostic(Question):
         if found is None:
             return []
         estimate = None if found.estimate is None else Estimate(found.estimate, found.expected, found.standard_error)
-        return one_test(cls.name, math.exp(found.log_p), estimate)
+        return [Test(cls.name, math.exp(found.log_p), estimate=estimate)]
 
     def number_of_tests(self) -> int:
         """None where there is nothing to test."""
@@ -347,3 +397,32 @@ class Diagnostic(Question):
     def classes(cls, search: Search) -> int:
         """One, where it is tested."""
         return int(cls.name in search.findings)
+
+
+class SummedDiagnostic(Diagnostic):
+    """A diagnostic whose evidence is a function of sums over the steps."""
+
+    sums: Sequence[AnyArray]
+
+    @abstractmethod
+    def between(self, block: Block) -> Sequence[AnyArray]:
+        """(T, ...) of each of the sums: over the steps between each analysis and the one before it."""
+
+    @abstractmethod
+    def of_sums(self, sums: Sequence[AnyArray]) -> FloatArray:
+        """(..., rows, alternatives) of the evidence of sums, each with axes in front."""
+
+    def add(self, block: Block) -> FloatArray:
+        """The evidence of the sums after each analysis."""
+        between = zip(self.sums, self.between(block), strict=True)
+        after = [before + each.cumsum(axis=0) for before, each in between]
+        self.sums = [each[-1] for each in after]
+        return self.of_sums(after)
+
+    def merge(self, other: Self) -> None:
+        """Sums over steps."""
+        self.sums = [mine + its for mine, its in zip(self.sums, other.sums, strict=True)]
+
+    def logarithms(self) -> FloatArray:
+        """Of the sums so far."""
+        return self.of_sums(self.sums)

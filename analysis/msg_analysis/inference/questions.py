@@ -1,10 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The list of all questions about a run: the verdict, the evidence at any time, the live view and the causes walk it.
-
-How to add one is in docs/statistics.md.
-"""
+"""The list of all questions about a run: the verdict, the evidence, the live view and the causes walk it."""
 
 from __future__ import annotations
 
@@ -76,11 +73,7 @@ def decide(run: Statistics, level: float, evidence: dict[str, float] | None = No
 
 
 def causes_of(search: Search, rejected: Sequence[str]) -> list[Cause]:
-    """What is wrong with runs that disagree: agents with a constant state first, then by p-value; never empty.
-
-    The level of the search bounds the probability of finding a cause where nothing is wrong. Where nothing is found,
-    one cause of kind "unknown" names the ``rejected`` tests.
-    """
+    """What is wrong with runs that disagree: agents with a constant state first, then by p-value; never empty."""
     # The classes of all questions count before anything is selected.
     search.families = sum(question.classes(search) for question in QUESTIONS)
     found = [cause for question in QUESTIONS for cause in question.causes(search)]
@@ -94,10 +87,8 @@ ABOUT_THE_CHAIN = ("switching", "sojourns")  # kinds of causes
 
 
 def _clearest(search: Search, others: Sequence[Cause], *, about_chain: bool) -> list[Cause]:
-    """The clearest finding of the diagnostics, where it is clearer than all ``others``, which concern the whole run.
-
-    One fault has many effects, so only one finding about the steps is a cause, and one about the graphs.
-    """
+    """The clearest finding of the diagnostics, where it is clearer than all ``others``, which concern the whole run."""
+    # One fault has many effects, so only one finding about the steps is a cause, and one about the graphs.
     findings = [
         (search.findings[question.name], question)
         for question in QUESTIONS

@@ -6,16 +6,10 @@
 Timing does not depend on the states. So given the log the states are linear in independent normal numbers, and replicas
 are independent. With z(K) the stack of ``pattern_events``,
 
-    z(K) = A_K z(K-1) + noise N_K,     M(K) = E[z z^T] = A_K M(K-1) A_K^T + N_K,     Y(K-1) = H + A_K^T Y(K) A_K.
+    z(K) = A_K z(K-1) + noise N_K,     M(K) = E[z z^T] = A_K M(K-1) A_K^T + N_K,     Y(K-1) = H + A_K^T Y(K) A_K,
 
-M gives the exact expectation of the time mean. For quadratic forms H the dual Y gives E[sum of what is still to come |
-z], with martingale increments D. The covariance of their sum is estimated by the sum of
-
-    Cov(D_a, D_b | z(K-1)) = tr( Y_a N Y_b (2 N + 4 A z z^T A^T) ) / R
-
-as in ``errors.given_path``; what z contains that is not logged, noise, is replaced by its expectation given the rest.
-In lockstep the same law, with all steps on time, is that of runs in which values are kept from step to step.
-M is computed forwards, Y backwards, in blocks: going backwards, the M of a block are computed again from its beginning.
+and means and covariances follow as in ``given_path``; what z contains that is not logged, noise, is replaced by its
+expectation given the rest. In lockstep, with all steps on time, it is the law of runs in which values are kept.
 """
 
 from __future__ import annotations
@@ -49,22 +43,8 @@ class PatternUnavailableError(Exception):
 
 
 def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
-    """Effect of a run's timing on its system error: expectation given the log over that with ideal timers, less 1.
-
-    Both are exact, for the same start and graphs of the network, so that hardly anything is left to chance.
-
-    Parameters
-    ----------
-    observation
-        of a run in real time
-    means
-        of ``pattern_means``
-
-    Returns
-    -------
-    float | None
-        None where the expected error is 0
-    """
+    """Effect of timing on the system error: expectation given the log over that with ideal timers, less 1."""
+    # Both are exact, for the same start and graphs of the network, so that hardly anything is left to chance.
     experiment = observation.prediction.experiment
     graphs, used, made = ideal_log(experiment, observation.step, observation.modes)
     ideal = replace(observation, timers=Timers(graphs[1:], used, made))
@@ -76,28 +56,9 @@ def timing_effect(observation: Observation, means: TimeMeans) -> float | None:
 
 
 def pattern_means(
-    observation: Observation,
-    order: EventOrder,
-    *,
-    most_work: float = MAX_WORK,
-    most_entries: int = MAX_ENTRIES,
+    observation: Observation, order: EventOrder, *, most_work: float = MAX_WORK, most_entries: int = MAX_ENTRIES
 ) -> TimeMeans:
-    """Time means of the sampled states, with expectation and standard errors given the log.
-
-    Parameters
-    ----------
-    observation
-        of a run in real time
-    order
-        of its events
-    most_work, most_entries
-        multiplications, and entries of a stack, at most
-
-    Raises
-    ------
-    PatternUnavailableError
-        contradictory times, too many values to be known at the same time, or a run that is too long
-    """
+    """Time means of the sampled states, with expectation and standard errors given the log."""
     if order.contradiction:
         raise PatternUnavailableError(order.contradiction)
     system, steps = observation.prediction.system, observation.steps
@@ -135,10 +96,7 @@ def pattern_means(
 
 
 def means_in_lockstep(observation: Observation) -> TimeMeans | None:
-    """Time means of a run in lockstep, given the path of the graphs and which values were received.
-
-    None where that would take too long.
-    """
+    """Time means of a run in lockstep given the graphs and the values received; None where that would take too long."""
     order = EventOrder.of_lockstep(observation.steps, observation.step.agents)
     try:
         return pattern_means(observation.as_timed(), order)
@@ -222,25 +180,21 @@ SUPPORT = {True: "supported", False: "not supported", None: "not decided"}
 
 
 @dataclass(frozen=True, slots=True)
-class Law:
+class CheckedLaw:
     """A law next to the log."""
 
     system_error: Estimate  # measured, and predicted by this law
     supported: bool | None  # whether the log supports it; None where that is not decided
     why: str
 
-    def to_json(self) -> dict[str, Any]:
-        """The JSON document."""
-        return {"system_error": self.system_error.to_json(), "supported": self.supported, "why": self.why}
-
 
 @dataclass(frozen=True, slots=True)
 class Laws:
     """The laws of a run in real time."""
 
-    pattern: Law  # given the values and graphs that the agents logged as used; exact for any timing
-    sequential: Law  # no step is late, every value is received at once
-    continuous: Law  # the paper's
+    pattern: CheckedLaw  # given the values and graphs that the agents logged as used; exact for any timing
+    sequential: CheckedLaw  # no step is late, every value is received at once
+    continuous: CheckedLaw  # the paper's
 
     @property
     def measured_against(self) -> Literal["pattern", "sequential"]:
@@ -257,21 +211,12 @@ class Laws:
 
     def to_json(self) -> dict[str, Any]:
         """The JSON document."""
-        return {
-            "pattern": self.pattern.to_json(),
-            "sequential": self.sequential.to_json(),
-            "continuous": self.continuous.to_json(),
-            "why": self.why,
-        }
+        laws = {"pattern": self.pattern, "sequential": self.sequential, "continuous": self.continuous}
+        return laws | {"why": self.why}
 
 
 def measure_laws(observation: Observation, order: EventOrder, timing: Timing, level: float) -> tuple[TimeMeans, Laws]:
-    """Compare a run in real time with each law; also the time means under the pattern law, else the sequential law.
-
-    The pattern law is supported unless the errors reject it at ``level``. The others are not supported if the errors
-    reject them, or if more deadlines were missed than ``MAX_MISSED``. They are supported if what they leave out is
-    known to change the system error by at most ``MAX_EFFECT``; otherwise the run is too short to decide.
-    """
+    """Compare a run in real time with each law; also the means under the pattern law, else the sequential law."""
     sequential = time_means(replace(observation, states=sampled(observation, order)))
     error, p = _least(observation, sequential)
     effect = None
@@ -281,7 +226,7 @@ def measure_laws(observation: Observation, order: EventOrder, timing: Timing, le
         effect = timing_effect(observation, means)
     except PatternUnavailableError as reason:
         means = sequential
-        pattern = Law(Estimate(error.measured), None, f"not available: {reason}")
+        pattern = CheckedLaw(Estimate(error.measured), None, f"not available: {reason}")
     late = timing.missed_share > MAX_MISSED
     # Where agents keep values from step to step, the sequential law has no standard error of its own.
     untested = p is None and observation.prediction.system.readout is not None and pattern.supported
@@ -289,15 +234,15 @@ def measure_laws(observation: Observation, order: EventOrder, timing: Timing, le
     return means, Laws(pattern, law, _continuous(observation, error, level, late))
 
 
-def _pattern(observation: Observation, means: TimeMeans, level: float) -> Law:
+def _pattern(observation: Observation, means: TimeMeans, level: float) -> CheckedLaw:
     error, p = _least(observation, means)
     if p is None:
-        return Law(error, None, "without noise the errors cannot be tested")
+        return CheckedLaw(error, None, "without noise the errors cannot be tested")
     logged = "the prediction for the values and graphs that the agents logged"
     if p >= level:
-        return Law(error, True, f"the errors agree with {logged}")
+        return CheckedLaw(error, True, f"the errors agree with {logged}")
     why = "this law holds for any timing, so an agent did not follow its law, or its log is wrong"
-    return Law(error, False, f"the errors differ from {logged} ({_tested(error, p)}); {why}")
+    return CheckedLaw(error, False, f"the errors differ from {logged} ({_tested(error, p)}); {why}")
 
 
 def _deviations(timing: Timing) -> list[str]:
@@ -314,7 +259,7 @@ def _deviations(timing: Timing) -> list[str]:
 
 def _sequential(
     error: Estimate, p: float | None, level: float, deviations: list[str], effect: float | None, late: bool
-) -> Law:
+) -> CheckedLaw:
     why = "assumes that every step is on time and every message arrives at once"
     if not deviations:
         why += ", as in this log"
@@ -322,46 +267,45 @@ def _sequential(
         first = ", ".join(deviations[:-1])
         why += ", but " + (f"{first} and " if first else "") + deviations[-1]
         if effect is not None:
-            why += f", which changes the system error by {_change(effect)}"
+            why += f", which changes the system error by {100 * effect:+.2g} %"
     if p is None:
-        return Law(error, None, why)
+        return CheckedLaw(error, None, why)
     if p < level:
-        return Law(error, False, f"{why}; the measured errors differ ({_tested(error, p)})")
+        return CheckedLaw(error, False, f"{why}; the measured errors differ ({_tested(error, p)})")
     if late:
-        return Law(error, False, why)
+        return CheckedLaw(error, False, why)
     if not deviations or (effect is not None and abs(effect) <= MAX_EFFECT):
-        return Law(error, True, why)
-    return Law(error, None, f"{why}; the run is too short to show a difference")
+        return CheckedLaw(error, True, why)
+    return CheckedLaw(error, None, f"{why}; the run is too short to show a difference")
 
 
-def _continuous(observation: Observation, sequential: Estimate, level: float, late: bool) -> Law:
+def _continuous(observation: Observation, sequential: Estimate, level: float, late: bool) -> CheckedLaw:
     """With the standard error of the sequential law, from which that of the continuous law would hardly differ."""
     law, experiment = observation.prediction.continuous_moments, observation.prediction.experiment
     if law is None:
-        return Law(Estimate(sequential.measured), None, "not available for this experiment")
-    predicted = law.system_error
+        return CheckedLaw(Estimate(sequential.measured), None, "not available for this experiment")
+    predicted, untested = law.system_error, Estimate(sequential.measured, law.system_error)
     if sequential.standard_error is None:
-        return Law(Estimate(sequential.measured, predicted), None, "its errors have no standard error here")
+        return CheckedLaw(untested, None, "its errors have no standard error here")
     if not sequential.standard_error or sequential.measured is None or not predicted:
-        return Law(Estimate(sequential.measured, predicted), None, "without noise the errors cannot be tested")
+        return CheckedLaw(untested, None, "without noise the errors cannot be tested")
     if experiment.run.start != "stationary":
-        why = "only its steady state is predicted, and the run did not start there"
-        return Law(Estimate(sequential.measured, predicted), None, why)
+        return CheckedLaw(untested, None, "only its steady state is predicted, and the run did not start there")
     z = (sequential.measured - predicted) / sequential.standard_error
     p = float(two_sided(z))
     error = Estimate(sequential.measured, predicted, sequential.standard_error, z, p)
     effect = observation.prediction.emulated.system_error / predicted - 1.0
     why = (
         f"ignores that the agents make steps of {observation.step.dt:g}, one after the other, which changes the "
-        f"system error by {_change(effect)}"
+        f"system error by {100 * effect:+.2g} %"
     )
     if p < level:
-        return Law(error, False, f"{why}; the measured system error differs ({_z(error)})")
+        return CheckedLaw(error, False, f"{why}; the measured system error differs ({_z(error)})")
     if late:
-        return Law(error, False, f"{why}, and that deadlines were missed")
+        return CheckedLaw(error, False, f"{why}, and that deadlines were missed")
     if abs(effect) <= MAX_EFFECT:
-        return Law(error, True, why)
-    return Law(error, None, f"{why}; the run is too short to show a difference")
+        return CheckedLaw(error, True, why)
+    return CheckedLaw(error, None, f"{why}; the run is too short to show a difference")
 
 
 def _least(observation: Observation, means: TimeMeans) -> tuple[Estimate, float | None]:
@@ -373,10 +317,6 @@ def _least(observation: Observation, means: TimeMeans) -> tuple[Estimate, float 
     tests = [error.p, *(node.p for node in nodes), covariance_test(means, system).p]
     tested = np.array([p for p in tests if p is not None], dtype=float)
     return error, float(holm(tested).min()) if len(tested) else None
-
-
-def _change(effect: float) -> str:
-    return f"{100 * effect:+.2g} %"
 
 
 def _tested(error: Estimate, p: float) -> str:

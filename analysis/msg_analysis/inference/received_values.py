@@ -3,29 +3,21 @@
 
 """What the agents received in the steps of a run, with noise or loss of messages, and in real time.
 
-The log gives, for every step, what each agent used: which values of its neighbours, and in real time their steps and
-the graph. Given that, the residuals are normal and independent, with an exactly known covariance: process noise, by
-the graph that each agent used, plus the link noise of the received messages. Broadcast noise, losses and delays are
-part of what was used; they are tested, or reported, separately.
-
-Link noise of messages that are used more than once: what earlier steps say about it.
-
-The noise of a link belongs to the message: used again, because a newer one was lost or late, it is the same. So the
-residuals e_i of an agent are no longer independent, but those of the Kalman filter are: the noises of its newest
-messages are a Gaussian vector, of which every step observes one combination, w^T noise + process noise.
+Given that, the residuals are normal and independent, with an exactly known covariance: process noise, by the graph that
+each agent used, plus the link noise of the received messages. The rest is part of what was used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.inference.observation import Observation
-from msg_analysis.inference.statistics import chi2_below, chi2_tail
+from msg_analysis.inference.statistics import add_sums
 from msg_analysis.model.reception import neighbour_tables
 from msg_analysis.model.step_model import StepModel, Wiring
 
@@ -98,23 +90,11 @@ class ReceivedValues:
 
     def part(self, first: int, last: int) -> ReceivedValues:
         """Of the steps first..last-1 of the block."""
-        cut = slice(first, last)
-        return replace(
-            self,
-            modes=self.modes[cut],
-            graphs=self.graphs[cut],
-            states=self.states[cut],
-            used=self.used[cut],
-            senders=self.senders[cut],
-            weights=self.weights[cut],
-            own=self.own[cut],
-            link_variance=self.link_variance[cut],
-        )
+        names = [each.name for each in fields(self) if each.name != "published"]
+        return replace(self, **{name: getattr(self, name)[first:last] for name in names})
 
     def received(self, at: IntArray, agents: IntArray, which: IntArray) -> FloatArray:
-        """(k, a, R): what ``agents`` (a,) used of their neighbours ``which`` (a,) in the steps ``at`` (k,) of the
-        block.
-        """
+        """(k, a, R): what ``agents`` (a,) used of neighbours ``which`` (a,) in the steps ``at`` (k,) of the block."""
         index = at[:, None], agents, which
         return np.asarray(self.published[self.used[index], self.senders[index]])
 
@@ -127,10 +107,7 @@ class ReceivedValues:
         return np.asarray(total)
 
     def patterns(self, order: IntArray | None = None) -> Iterator[tuple[IntArray, IntArray | None, IntArray]]:
-        """Groups of like steps of the block: graphs (m,) of the agents, their order (m,) or None, steps (a,).
-
-        ``order`` (b, m) has the agents of each step, first to last.
-        """
+        """Groups of like steps: graphs (m,) and order (m,) of the agents, by ``order`` (b, m), and steps (a,)."""
         if order is None and (self.graphs == self.modes[:, None]).all():
             for mode in np.unique(self.modes):
                 at = np.flatnonzero(self.modes == mode)
@@ -148,10 +125,7 @@ class ReceivedValues:
 
 
 def mode_links(step: Wiring, mode: int) -> tuple[IntArray, IntArray, IntArray]:
-    """Receiver, sender, and place among the receiver's neighbours, (links,) each, of all links of a graph.
-
-    Sorted by receiver and then by sender.
-    """
+    """Receiver, sender, and place among the receiver's neighbours, (links,) each, of a graph; sorted."""
     tables = neighbour_tables(step)
     receiver, which = np.nonzero(np.arange(step.most_neighbours) < tables.count[mode][:, None])
     return receiver, tables.senders[mode, receiver, which], which
@@ -172,19 +146,15 @@ def process_noise(step: StepModel, graphs: IntArray) -> FloatArray:
 
 
 class Equalizer:
-    """Transforms residuals of steps with different covariances to the covariance of a regular step.
-
-    With N the covariance of a step and M that of a step of the network's graph in which all messages arrived and all
-    agents knew the graph, M^1/2 N^-1/2 e has the covariance M. Where N and M differ in their number of noisy directions
-    (an agent without process noise received nothing), that is not possible: then only the total size of all residuals
-    can be tested. ``full`` are the M of all graphs, (n, m, m).
-    """
+    """Transforms residuals of steps with covariance N to that of a regular step, M (``full``): M^1/2 N^-1/2 e."""
 
     def __init__(self, step: StepModel, full: FloatArray) -> None:
         self._step = step
         self._roots = [_root(matrix, 0.5) for matrix in full]
         self._ranks = [rank for _, rank in self._roots]
-        self.possible = True  # for every step so far
+        # False after a step whose N and M differ in rank (an agent without process noise received nothing): then only
+        # the total size of all residuals can be tested.
+        self.possible = True
         # Sum of e^T N^+ e, its degrees of freedom, and the largest residual in directions without noise.
         self.chi2, self.dof, self.quiet = 0.0, 0, 0.0
 
@@ -213,14 +183,8 @@ class Equalizer:
 
     def merge(self, other: Equalizer) -> None:
         """Add the sums of another run of the same experiment, with another seed."""
-        self.possible &= other.possible
-        self.chi2, self.dof, self.quiet = self.chi2 + other.chi2, self.dof + other.dof, max(self.quiet, other.quiet)
-
-    def p_size(self) -> float | None:
-        """Two-sided p-value of the total size of all residuals; None without noise."""
-        if not self.dof:
-            return None
-        return float(min(1.0, 2.0 * min(chi2_tail(self.chi2, self.dof), chi2_below(self.chi2, self.dof))))
+        add_sums(self, other, "chi2", "dof")
+        self.possible, self.quiet = self.possible and other.possible, max(self.quiet, other.quiet)
 
 
 def _root(matrix: FloatArray, power: float) -> tuple[FloatArray, int]:
@@ -240,7 +204,9 @@ NEVER = -2
 class RepeatedNoise:
     """Frees the residuals, block after block, of what earlier ones say about the noise in them.
 
-    Exact where the process noise of the agents is independent.
+    The noise of a link belongs to the message: used again, because a newer one was lost or late, it is the same. The
+    noises of an agent's newest messages are a Gaussian vector, of which every step observes one combination, w^T noise
+    + process noise: a Kalman filter. Exact where the process noise of the agents is independent.
     """
 
     def __init__(self, observation: Observation) -> None:

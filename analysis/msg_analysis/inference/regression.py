@@ -47,11 +47,7 @@ class StateRegression:
         size = step.agents + 1
         self._scores = np.zeros((step.modes, step.agents, size))  # sum of e z^T
         self._inputs = np.zeros((step.modes, size, size))  # sum of z z^T
-
-    @property
-    def numbers_per_step(self) -> int:
-        """Size of the largest temporary array, per step; 0: not limiting."""
-        return 0
+        self.numbers_per_step = 0  # size of the largest temporary array, per step: not limiting
 
     def add(self, modes: IntArray, states: FloatArray, residuals: FloatArray) -> None:
         """Add a block of steps: graphs (b,) from 0, states x(k) and residuals (b, m, R)."""
@@ -84,48 +80,36 @@ class StateRegression:
         return total
 
 
-def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[Term]]:
-    """Regressors of the residuals: phi_a(k) = inputs[g, a] . z(k) for row rows[a].
+def terms_of(step: StepModel, weights: FloatArray, most: int) -> list[Term]:
+    """Regressors of the residuals, at most so many, with ``weights`` (n, m, m).
 
     One for every graph and difference x_j - x_i that row i uses, for every graph and leader (x_i - reference), and for
     every agent (1, which finds a wrong reference or offset). Where these are more than ``most``: the whole pull (W_g x
     - x)_i of a row instead of each of its terms; where that is still too many, without distinguishing graphs.
-
-    Parameters
-    ----------
-    step
-        step model of the run
-    most
-        largest number K
-
-    Returns
-    -------
-    tuple[IntArray, FloatArray, list[Term]]
-        rows (K,), inputs (n, K, m + 1), and the terms (K)
     """
     n, m = step.modes, step.agents
+    pull, links = weights.sum(axis=2) - 1.0, [mode_links(step, mode) for mode in range(n)]
+    leads = np.abs(pull) > WEIGHT_ROUNDING
     terms = [Term("constant", i) for i in range(m)]
-    sums = step.weights.sum(axis=2)
-    received = int(step.links.sum(where=~np.eye(m, dtype=np.bool_)))
-    if m + received + int((np.abs(1.0 - sums) > WEIGHT_ROUNDING).sum()) <= most:
-        for mode in range(n):
-            for i in range(m):
-                for j in step.neighbours(mode, i).tolist():
-                    terms.append(Term("link", i, mode, j, float(step.weights[mode, i, j])))
-                if abs(1.0 - sums[mode, i]) > WEIGHT_ROUNDING:
-                    terms.append(Term("lead", i, mode, None, float(sums[mode, i] - 1.0)))
-    elif m + n * m <= most:
-        terms += [Term("pull", i, mode) for mode in range(n) for i in range(m)]
-    else:
-        terms += [Term("pull", i) for i in range(m)]
-    unit = np.eye(m + 1)
-    pulls = np.zeros((n, m, m + 1))
-    pulls[:, :, :m] = step.weights - np.eye(m)
+    if m + sum(len(receiver) for receiver, _, _ in links) + int(leads.sum()) > most:
+        graphs = range(n) if n > 1 and m + n * m <= most else [None]
+        return terms + [Term("pull", i, graph) for graph in graphs for i in range(m)]
+    for mode, (receiver, sender, _) in enumerate(links):
+        pairs = zip(receiver.tolist(), sender.tolist(), strict=True)
+        terms += [Term("link", i, mode, j, float(weights[mode, i, j])) for i, j in pairs]
+        terms += [Term("lead", i, mode, None, float(pull[mode, i])) for i in np.flatnonzero(leads[mode]).tolist()]
+    return terms
+
+
+def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[Term]]:
+    """Of the states themselves: phi_a(k) = inputs[g, a] . z(k) for row rows[a]; (K,), (n, K, m + 1), ``terms_of``."""
+    n, m = step.modes, step.agents
+    terms, unit = terms_of(step, step.weights, most), np.eye(m + 1)
     inputs = np.zeros((n, len(terms), m + 1))
     for a, term in enumerate(terms):
         modes = slice(None) if term.graph is None else term.graph
         if term.kind == "pull":
-            inputs[modes, a] = pulls[modes, term.agent]
+            inputs[modes, a, :m] = step.weights[modes, term.agent] - unit[term.agent, :m]
         elif term.kind == "link":
             inputs[modes, a] = unit[term.sender] - unit[term.agent]
         else:
@@ -136,54 +120,28 @@ def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[T
 class ReceivedRegression:
     """Score test: residuals do not depend on what the agents received, with the weights it was used with.
 
-    As ``gain_regression.StateRegression``, but row i uses the differences y_j - x_i of the received values, y_j as
-    published, and the covariance of the residuals is that of each step. In real time the agents make a step one after
-    the other. With correlated noise, a value that is used may contain a part of the noise of the same step; so each
-    residual is first freed of what those made earlier in the step say about it (``position``, needed only then).
-
-    Parameters
-    ----------
-    observation
-        of a run with noise or loss of messages, or in real time
-    most
-        largest number of regressors K; beyond it, fewer kinds of them are tested
-    position
-        (N, m) order in which the states were made
+    As ``StateRegression``, but row i uses the differences y_j - x_i of the received values, y_j as published, and the
+    covariance of the residuals is that of each step. In real time the agents make a step one after the other, in the
+    order ``position`` (N, m). With correlated noise, a value that is used may contain a part of the noise of the same
+    step; so each residual is first freed of what those made earlier in the step say about it.
     """
 
     def __init__(self, observation: Observation, most: int, position: IntArray | None = None) -> None:
         self._step = step = observation.step
-        self._replicas = observation.replicas
         self._position = position
-        n, m = step.modes, step.agents
-        # Weight of a state's own deviation from the reference: the leaders' pull.
-        self._pull = step.nominal.sum(axis=2) - 1.0
-        leads = np.abs(self._pull) > 1e-12
-        self._links = [mode_links(step, mode) for mode in range(n)]
-        count = m + sum(len(receiver) for receiver, _, _ in self._links) + int(leads.sum())
-        self._each = count <= most
-        if not self._each:
-            count = n * m + m if n * m + m <= most else 2 * m
-        # Index of the regressor of a link, of a leader, or of the whole pull on an agent; by the agent's graph.
-        self._link_place = np.zeros((n, m, step.most_neighbours), dtype=np.int64)
-        self._lead_place = np.full((n, m), -1)
-        self._pull_place = np.zeros((n, m), dtype=np.int64)
-        place = m
-        for mode, (receiver, _, which) in enumerate(self._links):
-            self._pull_place[mode] = np.arange(m) + (m + mode * m if count == n * m + m else m)
-            self._link_place[mode, receiver, which] = np.arange(place, place + len(receiver))
-            place += len(receiver)
-            leaders = np.flatnonzero(leads[mode])
-            self._lead_place[mode, leaders] = np.arange(place, place + len(leaders))
-            place += len(leaders)
+        self._pull = step.nominal.sum(axis=2) - 1.0  # of the leaders: weight of the own deviation from the reference
+        self.terms = terms_of(step, step.nominal, most)  # (K)
+        self._each = self.terms[-1].kind != "pull"
+        # Place of the regressor by graph, receiver and sender; of a leader or a whole pull, by the agent twice.
+        self._place = np.full((step.modes, step.agents, step.agents), -1)
+        for place, term in enumerate(self.terms):
+            if term.kind != "constant":
+                graph, sender = slice(None) if term.graph is None else term.graph, term.sender
+                self._place[graph, term.agent, term.agent if sender is None else sender] = place
+        self.numbers_per_step = (2 + step.most_neighbours) * step.agents * observation.replicas
+        count = len(self.terms)
         self._score, self._covariance = np.zeros(count), np.zeros((count, count))
         self._gram = np.zeros((count, count))
-
-    @property
-    def numbers_per_step(self) -> int:
-        """Size of the largest temporary array, per step."""
-        m, d = self._step.agents, self._step.most_neighbours
-        return max((2 + d) * m * self._replicas, m * d)
 
     def statistic(self) -> tuple[FloatArray, FloatArray]:
         """Scores U (K,) and their covariance (K, K)."""
@@ -192,21 +150,6 @@ class ReceivedRegression:
     def gram(self) -> FloatArray | None:
         """See ``StateRegression.gram``; None where residuals are freed of earlier ones."""
         return None if self._position is not None else self._gram
-
-    @property
-    def terms(self) -> list[Term]:
-        """The regressors (K); the weights are the nominal ones."""
-        step = self._step
-        found = [Term("constant", i) for i in range(step.agents)]
-        if not self._each:
-            graphs = range(step.modes) if len(self._score) > 2 * step.agents else [None]
-            return found + [Term("pull", i, graph) for graph in graphs for i in range(step.agents)]
-        for mode, (receiver, sender, _) in enumerate(self._links):
-            links = zip(receiver.tolist(), sender.tolist(), strict=True)
-            found += [Term("link", i, mode, j, float(step.nominal[mode, i, j])) for i, j in links]
-            leaders = np.flatnonzero(self._lead_place[mode] >= 0).tolist()
-            found += [Term("lead", i, mode, None, float(self._pull[mode, i])) for i in leaders]
-        return found
 
     def add(self, reception: ReceivedValues, residuals: FloatArray, first: int = 0) -> None:
         """Add a block of steps, beginning with step ``first``, and their residuals (b, m, R)."""
@@ -233,31 +176,25 @@ class ReceivedRegression:
         self, reception: ReceivedValues, at: IntArray, graphs: IntArray
     ) -> tuple[IntArray, IntArray, FloatArray]:
         """Places (a,), rows (a,) and values (len(at), a, R): constants of all agents, then what their rows use."""
-        m = self._step.agents
+        m, tables = self._step.agents, neighbour_tables(self._step)
         agents = np.arange(m)
         x = reception.states[at]
         deviation = x - self._step.reference
-        ones = np.ones((len(at), m, x.shape[2]))
-        receivers, which = np.nonzero(np.arange(self._step.most_neighbours) < self._count(graphs)[:, None])
+        ones, own = np.ones((len(at), m, x.shape[2])), self._place[graphs, agents, agents]
+        receivers, which = np.nonzero(np.arange(self._step.most_neighbours) < tables.count[graphs, agents][:, None])
         differences = reception.received(at, receivers, which) - x[:, receivers]
         weights = reception.weights[at[:, None], receivers, which][:, :, None]
         if self._each:
-            leaders = np.flatnonzero(self._lead_place[graphs, agents] >= 0)
-            places = [agents, self._link_place[graphs[receivers], receivers, which], self._lead_place[graphs, agents]]
-            places[2] = places[2][leaders]
+            leaders, of_receivers = np.flatnonzero(own >= 0), graphs[receivers]
+            links = self._place[of_receivers, receivers, tables.senders[of_receivers, receivers, which]]
             rows = np.concatenate([agents, receivers, leaders])
             parts = [ones, differences * (weights != 0.0), deviation[:, leaders]]
-            return np.concatenate(places), rows, np.concatenate(parts, axis=1)
+            return np.concatenate([agents, links, own[leaders]]), rows, np.concatenate(parts, axis=1)
         pulled = self._pull[graphs, agents][:, None] * deviation
         for i in range(m):
             mine = receivers == i
             pulled[:, i] += (weights[:, mine] * differences[:, mine]).sum(axis=1)
-        places = [agents, self._pull_place[graphs, agents]]
-        return np.concatenate(places), np.tile(agents, 2), np.concatenate([ones, pulled], axis=1)
-
-    def _count(self, graphs: IntArray) -> IntArray:
-        """(m,): neighbours of the agents."""
-        return np.asarray(neighbour_tables(self._step).count[graphs, np.arange(self._step.agents)])
+        return np.concatenate([agents, own]), np.tile(agents, 2), np.concatenate([ones, pulled], axis=1)
 
 
 def _freed(e: FloatArray, process: FloatArray, agents: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -5,14 +5,14 @@
 
 Under the model the e(k) are independent N(0, N_g(k)), for any path of the graphs; so these tests are exact or nearly
 so, and find what the time means hardly show. With noise or loss of messages, and in real time, the same holds given the
-values that the agents received (see ``heard_values``), for any timing. See docs/statistics.md.
+values that the agents received (``received_values``), for any timing. See docs/statistics.md.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,12 +27,17 @@ from msg_analysis.inference.received_values import (
 )
 from msg_analysis.inference.regression import MAX_REGRESSORS, ReceivedRegression, StateRegression
 from msg_analysis.inference.statistics import (
+    add_sums,
+    chi2_below,
     chi2_tail,
     covariance_statistic,
     direction_p,
     quadratic_form,
 )
 from msg_analysis.model.step_model import StepModel
+
+if TYPE_CHECKING:
+    from msg_analysis.inference.evidence_sums import WatchedEvidence
 
 LAGS = 10
 QUIET_ROUNDING = 1e-9  # relative size of what counts as rounding in directions without noise
@@ -51,36 +56,14 @@ class ResidualTests:
     samples: int | None = None  # of each agent, replicas counted; samples * ratio is chi-square(samples)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Directions:
-    """Directions of the noise of one graph, N_g = (basis * variances) basis^T, largest variance first."""
-
-    whitener: FloatArray  # (r, m)
-    quiet: FloatArray  # (m, m - r) orthonormal basis of the directions without noise
-
-
-class Follower(Protocol):
-    """What else is computed from the residuals of a run, in the same pass."""
-
-    @property
-    def numbers_per_step(self) -> int:
-        """Of temporary arrays."""
-
-    def add(self, first: int, last: int, received: tuple[ReceivedValues, FloatArray] | None = None) -> None:
-        """The steps first..last-1, in order, with what was received and the residuals; None: not computed yet."""
-
-
 class ResidualSums:
-    """Sums over the residuals of runs of one experiment: enough for the tests and the search for causes.
-
-    In real time, ``position`` is that of ``event_order.EventOrder``, (N, m). ``follower`` is given every step, too.
-    """
+    """Sums over residuals of runs, for the tests and the search for causes; ``follower`` is given every step."""
 
     def __init__(
         self,
         observation: Observation,
         position: IntArray | None = None,
-        follower: Follower | None = None,
+        follower: WatchedEvidence | None = None,
         most_regressors: int = MAX_REGRESSORS,
     ) -> None:
         step, noise = observation.step, observation.prediction.experiment.noise
@@ -92,9 +75,9 @@ class ResidualSums:
         self.samples, self.scatter = np.zeros(n, np.int64), np.zeros((n, m, m))
         self.still = np.zeros((n, m), np.int64)  # steps in which no replica of an agent changed
         self.quiet = self.largest = 0.0  # largest |e| in directions without noise; largest |x|
-        self._directions = [_directions(matrix) for matrix in self.noises]
+        self._directions = [noise_directions(matrix) for matrix in self.noises]
         # Graphs may differ in the number of noisy directions; the strongest ones that all graphs have are iid N(0, I).
-        self._whiteness = Whiteness(min(len(d.whitener) for d in self._directions))
+        self._whiteness = WhitenessSums(min(len(whitener) for whitener, _ in self._directions))
         self._repeated = RepeatedNoise.of(observation)
         # False where residuals depend on each other in a way that is not followed here.
         self.independent = self._repeated is None or not _correlated(step)
@@ -110,8 +93,8 @@ class ResidualSums:
         if self.independent:
             self._add(observation, regression, follower)
         elif follower:
-            for first, last in observation.blocks(follower.numbers_per_step, "evidence"):
-                follower.add(first, last)
+            for first, last in observation.blocks(follower.sums.numbers_per_step, "evidence"):
+                follower.add(observation, first, last)
         self.terms = regression.terms
         self.score, self.covariance = regression.statistic()  # (K,), (K, K)
         self.gram = regression.gram()  # (K, K), see ``StateRegression.gram``; None where it is not available
@@ -123,15 +106,11 @@ class ResidualSums:
 
     def merge(self, other: ResidualSums) -> None:
         """Add the sums of another run of the same experiment, with another seed."""
-        self.samples += other.samples
-        self.scatter += other.scatter
-        self.still += other.still
+        add_sums(self, other, "samples", "scatter", "still", "score", "covariance")
         self.quiet, self.largest = max(self.quiet, other.quiet), max(self.largest, other.largest)
         self._whiteness.merge(other._whiteness)
         if self._equalizer and other._equalizer:
             self._equalizer.merge(other._equalizer)
-        self.score += other.score
-        self.covariance += other.covariance
         self.gram = None if self.gram is None or other.gram is None else self.gram + other.gram
 
     def tests(self) -> ResidualTests:
@@ -143,7 +122,8 @@ class ResidualSums:
         hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in self.noises))
         p_whiteness = self._whiteness.p_value()
         if self._equalizer and not self._equalizer.possible:
-            p_covariance, p_whiteness = self._equalizer.p_size(), None
+            chi2, dof, p_whiteness = self._equalizer.chi2, self._equalizer.dof, None  # two-sided, of the total size
+            p_covariance = min(1.0, 2.0 * float(min(chi2_tail(chi2, dof), chi2_below(chi2, dof)))) if dof else None
         else:
             p_covariance, ratios = self._covariance_p(), self._ratios()
         if self.quiet > max(QUIET_ROUNDING * self.largest, hidden):
@@ -171,20 +151,23 @@ class ResidualSums:
         return direction_p(weights, self.score, self.covariance)
 
     def _add(
-        self, observation: Observation, regression: StateRegression | ReceivedRegression, follower: Follower | None
+        self,
+        observation: Observation,
+        regression: StateRegression | ReceivedRegression,
+        follower: WatchedEvidence | None,
     ) -> None:
         """One pass over the run."""
         m = observation.step.agents
         numbers = max(observation.states[0].size, regression.numbers_per_step)
         if follower:
-            numbers = max(numbers, follower.numbers_per_step)
+            numbers = max(numbers, follower.sums.numbers_per_step)
         for first, last in observation.blocks(numbers, "residuals"):
             modes = observation.modes[first:last]
             if isinstance(regression, ReceivedRegression):
                 reception = ReceivedValues.of(observation, first, last)
                 e = residuals(observation, first, last, reception)
                 if follower:
-                    follower.add(first, last, (reception, e))
+                    follower.add(observation, first, last, (reception, e))
                 if self._repeated:
                     e, link_variance = self._repeated.free(e, reception)
                     reception = replace(reception, link_variance=link_variance)
@@ -195,13 +178,13 @@ class ResidualSums:
             else:
                 e = residuals(observation, first, last)
                 if follower:
-                    follower.add(first, last, (ReceivedValues.of(observation, first, last), e))
+                    follower.add(observation, first, last, (ReceivedValues.of(observation, first, last), e))
                 regression.add(modes, observation.states[first:last], e)
             states = observation.states[first : last + 1]
             self.largest = max(self.largest, float(np.abs(states[:-1]).max()))
             unmoved = (states[1:] == states[:-1]).all(axis=2)
             white = np.empty((last - first, self._whiteness.rank, observation.replicas))
-            for mode, direction in enumerate(self._directions):
+            for mode, (whitener, quiet) in enumerate(self._directions):
                 at = np.flatnonzero(modes == mode)
                 if not at.size:
                     continue
@@ -209,8 +192,8 @@ class ResidualSums:
                 self.samples[mode] += flat.shape[1]
                 self.scatter[mode] += flat @ flat.T
                 self.still[mode] += unmoved[at].sum(axis=0)
-                self.quiet = max(self.quiet, float(np.abs(direction.quiet.T @ flat).max(initial=0.0)))
-                white[at] = direction.whitener[: self._whiteness.rank] @ e[at]
+                self.quiet = max(self.quiet, float(np.abs(quiet.T @ flat).max(initial=0.0)))
+                white[at] = whitener[: self._whiteness.rank] @ e[at]
             self._whiteness.add(white)
 
     def _covariance_p(self) -> float | None:
@@ -219,7 +202,7 @@ class ResidualSums:
         groups = [list(modes)] if (self.noises == self.noises[0]).all() else [[g] for g in modes]
         statistic, dof = 0.0, 0.0
         for group in groups:
-            whitener = self._directions[group[0]].whitener
+            whitener, _ = self._directions[group[0]]
             samples = int(self.samples[group].sum())
             if len(whitener) and samples:
                 scatter = whitener @ self.scatter[group].sum(axis=0) @ whitener.T
@@ -229,10 +212,7 @@ class ResidualSums:
 
 
 def residuals(observation: Observation, first: int, last: int, reception: ReceivedValues | None = None) -> FloatArray:
-    """(last - first, m, R): residuals e(k) of the steps first..last-1, given what was received.
-
-    Without a ``reception`` of these steps, all agents received the states themselves.
-    """
+    """(last - first, m, R): residuals e(k) of steps first..last-1; without ``reception``, states were received."""
     step, now = observation.step, observation.states[first:last]
     after = observation.states[first + 1 : last + 1].copy()
     if reception is not None:
@@ -255,19 +235,16 @@ def _correlated(step: StepModel) -> bool:
     return bool((together - np.diag(np.diag(together))).any())
 
 
-def _directions(noise: FloatArray) -> _Directions:
+def noise_directions(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Whitener (r, m) of the directions with noise, the largest first; orthonormal basis (m, m - r) of the others."""
     values, vectors = np.linalg.eigh(noise)
     values, vectors = values[::-1], vectors[:, ::-1]
     rank = int((values > NO_NOISE * values[0]).sum()) if values[0] > 0.0 else 0
-    return _Directions((vectors[:, :rank] / np.sqrt(values[:rank])).T, vectors[:, rank:])
+    return (vectors[:, :rank] / np.sqrt(values[:rank])).T, vectors[:, rank:]
 
 
-class Whiteness:
-    """Portmanteau test of iid N(0, I) vectors of length r: lags 1..LAGS, and lag 0 between replicas.
-
-    The sum of squared sample correlations, each over its variance under the null hypothesis, is chi-square with LAGS
-    r^2 degrees of freedom, and r more where there are replicas.
-    """
+class WhitenessSums:
+    """Portmanteau test of iid N(0, I) vectors of length r: lags 1..LAGS, and lag 0 between replicas."""
 
     def __init__(self, rank: int) -> None:
         self.rank = rank
@@ -296,13 +273,9 @@ class Whiteness:
             self._counts[lag - 1] += len(late) * self._replicas
         self._tail = joined[-LAGS:]
 
-    def merge(self, other: Whiteness) -> None:
+    def merge(self, other: WhitenessSums) -> None:
         """Add the sums of another run with another seed; no lags are counted across runs."""
-        self._products += other._products
-        self._counts += other._counts
-        self._squares += other._squares
-        self._pairs += other._pairs
-        self._steps += other._steps
+        add_sums(self, other, "_products", "_counts", "_squares", "_pairs", "_steps")
 
     def p_value(self) -> float | None:
         """None without noise or with at most LAGS steps. Coordinates are scaled by their size, tested elsewhere."""
@@ -344,8 +317,7 @@ class BroadcastSums:
 
     def merge(self, other: BroadcastSums) -> None:
         """Add the sums of another run of the same experiment, with another seed."""
-        self.scatter += other.scatter
-        self.samples += other.samples
+        add_sums(self, other, "scatter", "samples")
 
     def p_value(self) -> float:
         """p-value of published - state being N(0, s^2 I), s = ``noise.broadcast``."""

@@ -90,20 +90,7 @@ class Precision:
 
 
 def precision_of(prediction: Prediction, sought: float) -> Precision:
-    """Precision of the runs of an experiment.
-
-    Parameters
-    ----------
-    prediction
-        of the experiment
-    sought
-        precision for the warm-up: the expected error is then within this share of the steady one
-
-    Raises
-    ------
-    InputError
-        fourth moments of the states do not exist, or the errors take too long to settle
-    """
+    """Precision of runs; ``sought``: share of the error that the start has after the warm-up."""
     experiment = prediction.experiment
     stationary = experiment.run.start == "stationary" and experiment.switching.initial == "stationary"
     error = prediction.emulated.system_error
@@ -175,36 +162,27 @@ class RunPlan:
             "notes": self._notes(),
         }
 
-    def _wall_time(self, steps: float) -> float | None:
-        return steps / self.rate if self.rate else None
+    def _length(self, steps: int | None) -> dict[str, float | None]:
+        if steps is None:
+            return dict.fromkeys(("steps", "duration", "wall_time"))
+        wall_time = steps / self.rate if self.rate else None
+        return {"steps": steps, "duration": steps * self.prediction.step.dt, "wall_time": wall_time}
 
-    def _run(self, steps: int, replicas: int) -> dict[str, Any]:
+    def _run(self, steps: int, replicas: int) -> dict[str, float | None]:
         error = self.precision.standard_error(steps, replicas)
         return {
             "replicas": replicas,
-            "steps": steps,
-            "duration": steps * self.prediction.step.dt,
-            "wall_time": self._wall_time(steps),
+            **self._length(steps),
             "standard_error": error,
             "half_width": HALF_WIDTH_95 * error,
             "any_time_half_width": ANY_TIME_95 * error if self.precision.any_time else None,
         }
 
-    def _lengths(self, replicas: int) -> dict[str, Any]:
-        steps = self.precision.steps(self.sought, replicas)
-        any_time = None
-        if self.precision.any_time:
-            any_time = self.precision.steps(self.sought, replicas, any_time=True)
-        dt = self.prediction.step.dt
-        return {
-            "replicas": replicas,
-            "steps": steps,
-            "duration": steps * dt,
-            "wall_time": self._wall_time(steps),
-            "any_time_steps": any_time,
-            "any_time_duration": None if any_time is None else any_time * dt,
-            "any_time_wall_time": None if any_time is None else self._wall_time(any_time),
-        }
+    def _lengths(self, replicas: int) -> dict[str, float | None]:
+        precision, sought = self.precision, self.sought
+        at_any_time = precision.steps(sought, replicas, any_time=True) if precision.any_time else None
+        any_time = {f"any_time_{key}": value for key, value in self._length(at_any_time).items()}
+        return {"replicas": replicas, **self._length(precision.steps(sought, replicas)), **any_time}
 
     def _budget(self) -> dict[str, Any] | None:
         if self.seconds is None or self.rate is None:
@@ -269,28 +247,7 @@ def plan(
     rate: float | None = None,
     level: float = 0.01,
 ) -> RunPlan:
-    """Plan runs of an experiment; nothing is simulated.
-
-    Parameters
-    ----------
-    prediction
-        of the experiment
-    precision
-        half-width of the 95 % interval of the system error that is sought, relative to the predicted error; above 0,
-        below 1
-    seconds
-        time budget [s]; None: none
-    rate
-        steps per second of a run in lockstep, such as ``msg-agents run`` prints; None: not known, or in real time,
-        where the clock says it
-    level
-        probability of a false "disagrees", all tests together
-
-    Raises
-    ------
-    InputError
-        an argument that is not valid, a system error of 0, or states without fourth moments
-    """
+    """Plan runs of an experiment, see ``Experiment.plan``; nothing is simulated."""
     run, dt = prediction.experiment.run, prediction.step.dt
     if not 0.0 < precision < 1.0:
         raise InputError(f"precision: {precision:g}: expected a share of the error above 0, below 1: for example 0.01")

@@ -3,10 +3,8 @@
 
 """Distributions, intervals and multiplicity: what all tests of a run use.
 
-Normal vectors with mean 0 and a known covariance, which may be singular; its rank is judged on the correlations.
-
-So the results do not depend on the units of the entries, and a direction in which a vector moves only by rounding,
-which depends on the processor, counts as one without variance.
+The rank of a covariance is judged on the correlations: so the results do not depend on the units of the entries, and a
+direction in which a vector moves only by rounding, which depends on the processor, counts as one without variance.
 """
 
 from __future__ import annotations
@@ -74,24 +72,10 @@ def chi2_quantile(tail: Any, dof: Any) -> Any:
     return special.chdtri(dof, tail)
 
 
-def noncentral_chi2_tail(x: Any, dof: Any, noncentrality: Any) -> Any:
-    """P(X > x) of a noncentral chi-square variable."""
-    return 1.0 - special.chndtr(x, dof, noncentrality)
-
-
-def needed_noncentrality(x: Any, dof: Any, tail: Any) -> Any:
-    """The noncentrality parameter with P(X > x) = ``tail``."""
-    return special.chndtrinc(x, dof, 1.0 - tail)
-
-
-def student_quantile(below: Any, dof: Any) -> Any:
-    """The t with P(T <= t) = ``below`` for a variable of Student's law with ``dof`` degrees of freedom."""
-    return special.stdtrit(dof, below)
-
-
-def gamma_tail(x: Any, shape: Any, scale: Any) -> Any:
-    """P(X > x) of a gamma variable."""
-    return special.gammaincc(shape, x / scale)
+def add_sums(one: Any, other: Any, *names: str) -> None:
+    """Add these attributes of another object to those of ``one``."""
+    for name in names:
+        setattr(one, name, getattr(one, name) + getattr(other, name))
 
 
 def binomial_interval(count: int, total: int) -> tuple[float, float]:
@@ -101,20 +85,7 @@ def binomial_interval(count: int, total: int) -> tuple[float, float]:
 
 
 def holm(p_values: FloatArray) -> FloatArray:
-    """Adjusted p-values: the probability that any true hypothesis has one below a level is at most that level.
-
-    This holds for any dependence between the tests (Holm 1979).
-
-    Parameters
-    ----------
-    p_values
-        (q,)
-
-    Returns
-    -------
-    FloatArray
-        (q,) in the order given
-    """
+    """(q,) adjusted (Holm 1979): the least one of a true hypothesis is below a level with at most this probability."""
     order = np.argsort(p_values)
     stepped = p_values[order] * np.arange(len(p_values), 0, -1)
     adjusted = np.empty_like(p_values)
@@ -127,15 +98,7 @@ ROUNDED_CORRELATION = 1e-10  # eigenvalue of a matrix of correlations
 
 
 def quadratic_form(vector: FloatArray, covariance: FloatArray) -> tuple[float, int]:
-    """v^T C^+ v, and the rank of C, its degrees of freedom.
-
-    Parameters
-    ----------
-    vector
-        (q,)
-    covariance
-        (q, q)
-    """
+    """v^T C^+ v of a vector (q,) with the covariance C (q, q), and the rank of C, its degrees of freedom."""
     inverse, correlations = _scaled(covariance)
     values, vectors = np.linalg.eigh(correlations)
     keep = values > ROUNDED_CORRELATION
@@ -144,17 +107,7 @@ def quadratic_form(vector: FloatArray, covariance: FloatArray) -> tuple[float, i
 
 
 def direction_p(direction: FloatArray, vector: FloatArray, covariance: FloatArray) -> float | None:
-    """Two-sided p-value of d^T v; None where its variance is nothing but rounding.
-
-    Parameters
-    ----------
-    direction
-        (q,)
-    vector
-        (q,)
-    covariance
-        (q, q)
-    """
+    """Two-sided p-value of d^T v, d and v (q,), C (q, q); None where its variance is nothing but rounding."""
     inverse, correlations = _scaled(covariance)
     scaled = np.divide(direction, inverse, out=np.zeros_like(direction), where=inverse > 0.0)
     variance = float(scaled @ correlations @ scaled)
@@ -164,18 +117,7 @@ def direction_p(direction: FloatArray, vector: FloatArray, covariance: FloatArra
 
 
 def pseudo_inverse(covariance: FloatArray) -> FloatArray:
-    """C^+, computed from the correlations.
-
-    Parameters
-    ----------
-    covariance
-        (q, q)
-
-    Returns
-    -------
-    FloatArray
-        (q, q)
-    """
+    """C^+ (q, q), computed from the correlations."""
     inverse, correlations = _scaled(covariance)
     scale = np.outer(inverse, inverse)
     return np.asarray(scale * np.linalg.pinv(correlations, rcond=ROUNDED_CORRELATION, hermitian=True))
@@ -190,18 +132,11 @@ def _scaled(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def covariance_statistic(scatter: FloatArray, samples: int) -> tuple[float, float]:
-    """Statistic and degrees of freedom of a chi-square test that ``samples`` independent vectors are N(0, I).
+    """Statistic and degrees of freedom of a chi-square test that ``samples`` independent vectors e are N(0, I).
 
-    Likelihood ratio with Bartlett's correction: Anderson, An Introduction to Multivariate Statistical Analysis, section
-    10.8. With fewer than 10 r samples: the exact chi-square test of the total size, two-sided, converted to 1 degree of
-    freedom. The statistic is infinite where the vectors do not span their space.
-
-    Parameters
-    ----------
-    scatter
-        (r, r) sum of e e^T
-    samples
-        number of vectors
+    From sum e e^T (r, r): likelihood ratio with Bartlett's correction (Anderson, An Introduction to Multivariate
+    Statistical Analysis, section 10.8); infinite where the vectors do not span their space. With fewer than 10 r
+    samples: the exact chi-square test of the total size, two-sided, converted to 1 degree of freedom.
     """
     rank = len(scatter)
     if samples < 10 * rank:
@@ -223,29 +158,17 @@ LEAST_LENGTH = 16  # values in each of them before they count
 
 
 def batch_interval(series: FloatArray, level: float = 0.95) -> tuple[float, float] | None:
-    """95 % (by default) interval for the mean of a correlated stationary series, from 20 batch means and Student's t.
+    """Interval for the mean of a correlated stationary series (N,), from 20 batch means and Student's t.
 
-    Its coverage is too low when the graphs switch slowly compared with a batch. It is reported next to the martingale
-    interval as a model-free check.
-
-    Parameters
-    ----------
-    series
-        (N,)
-    level
-        nominal coverage
-
-    Returns
-    -------
-    tuple[float, float] | None
-        (low, high), or None for a series shorter than two values per batch
+    A model-free check next to the martingale interval; its coverage is too low when the graphs switch slowly compared
+    with a batch. None for a series shorter than two values per batch.
     """
     length = len(series) // BATCHES
     if length < 2:
         return None
     # The remainder is dropped at the beginning, where the start may still have an effect.
     means = series[len(series) - length * BATCHES :].reshape(BATCHES, length).mean(axis=1)
-    half = student_quantile(0.5 + level / 2, BATCHES - 1) * means.std(ddof=1) / np.sqrt(BATCHES)
+    half = special.stdtrit(BATCHES - 1, 0.5 + level / 2) * means.std(ddof=1) / np.sqrt(BATCHES)
     return float(means.mean() - half), float(means.mean() + half)
 
 
@@ -282,25 +205,12 @@ class RunningBatches:
 
 
 def simultaneous_half_width(variance: FloatArray | float, target: float, level: float = 0.05) -> FloatArray:
-    """Bound that the sum of martingale differences ever passes with probability about ``level``.
+    """(...): bound that a sum of martingale differences ever passes with probability about ``level``.
 
-    The normal mixture sqrt((V + r) (log((V + r) / r) + 2 log(1 / level))): exact for normal differences, asymptotic for
-    others (Waudby-Smith, Arbour, Sinha, Kennedy and Ramdas, Annals of Statistics 52 (2024), "Time-uniform central limit
-    theory and asymptotic confidence sequences").
-
-    Parameters
-    ----------
-    variance
-        (..., ) sum V of the conditional variances so far
-    target
-        V at which the bound is nearly as low as it can be: chosen before the run
-    level
-        probability that it is ever passed
-
-    Returns
-    -------
-    FloatArray
-        (..., ) bound on the absolute value of the sum
+    The normal mixture sqrt((V + r) (log((V + r) / r) + 2 log(1 / level))), V (...) being the sum of the conditional
+    variances so far: exact for normal differences, asymptotic for others (Waudby-Smith, Arbour, Sinha, Kennedy and
+    Ramdas, Annals of Statistics 52 (2024)). It is nearly as low as it can be at V = ``target``, which is chosen before
+    the run.
     """
     wide = 2.0 * math.log(1.0 / level)
     r = max(target, np.finfo(float).tiny) / (wide + math.log(1.0 + wide))
@@ -309,21 +219,6 @@ def simultaneous_half_width(variance: FloatArray | float, target: float, level: 
 
 
 def steps_to_half_width(variance: float, half_width: float, level: float = 0.05) -> float:
-    """Steps after which the interval of a time mean that holds at all times at once is so narrow, if tuned for that.
-
-    Parameters
-    ----------
-    variance
-        conditional variance of the martingale difference of a step
-    half_width
-        of the interval of the time mean
-    level
-        probability that the interval ever misses
-
-    Returns
-    -------
-    float
-        number of steps; inf for a half-width of 0
-    """
+    """Steps after which the interval at all times, tuned for that, is so narrow; ``variance`` of a difference."""
     wide = float(simultaneous_half_width(1.0, 1.0, level))
     return (wide / half_width) ** 2 * variance if half_width > 0.0 else math.inf

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import ClassVar
 from weakref import WeakKeyDictionary
 
@@ -19,11 +20,16 @@ import numpy as np
 
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.inference.e_values import log_sum
-from msg_analysis.inference.question import Question, RunningSums, Statistics, Test, one_test
+from msg_analysis.inference.estimates import Estimate
+from msg_analysis.inference.question import Question, RunningSums, Statistics, Test
 from msg_analysis.inference.time_means import Value, forms_of, values_of
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.moments import MomentSolver, mode_potential
 from msg_analysis.theory.prediction import Prediction
+
+
+def _error_tests(name: str, error: Estimate | None) -> list[Test]:
+    return [] if error is None or error.p is None else [Test(name, error.p, estimate=error)]
 
 
 class SystemMeanError(Question):
@@ -35,7 +41,7 @@ class SystemMeanError(Question):
     @classmethod
     def tests(cls, run: Statistics) -> list[Test]:
         """Corrected for the run's sequence of graphs where that is known."""
-        return one_test(cls.name + run.corrected, run.system_error.p, run.system_error) if run.system_error else []
+        return _error_tests(cls.name + run.corrected, run.system_error)
 
     def evidence(self, sums: RunningSums) -> FloatArray:
         """Over all paths of the graphs; only in lockstep without noise, delay or loss of the messages."""
@@ -52,7 +58,7 @@ class AgentMeanErrors(Question):
     def tests(cls, run: Statistics) -> list[Test]:
         """One for each agent."""
         nodes = enumerate(run.node_errors, start=1)
-        return [test for i, node in nodes for test in one_test(f"{cls.name} {i}{run.corrected}", node.p, node)]
+        return [test for i, node in nodes for test in _error_tests(f"{cls.name} {i}{run.corrected}", node)]
 
     def number_of_tests(self) -> int:
         """One for each agent."""
@@ -64,11 +70,7 @@ class Covariance(Question):
 
     name = "covariance"
     meaning = "the errors of the agents, or how they vary together, differ from the prediction"
-
-    @classmethod
-    def tests(cls, run: Statistics) -> list[Test]:
-        """Of the quadratic form of all differences."""
-        return one_test(cls.name, run.covariance.p) if run.covariance else []
+    p_value = attrgetter("p_covariance")
 
 
 class RunsAlike(Question):
@@ -76,11 +78,7 @@ class RunsAlike(Question):
 
     name = "runs alike"
     meaning = "the runs differ from each other by more than chance: not all followed the same model"
-
-    @classmethod
-    def tests(cls, run: Statistics) -> list[Test]:
-        """Cochran's Q of their system errors."""
-        return one_test(cls.name, run.p_alike)
+    p_value = attrgetter("p_alike")
 
     def number_of_tests(self) -> int:
         """None of a single run."""
@@ -95,10 +93,7 @@ MOST_SHARE = 0.5  # of the rate beyond which the mean is infinite
 
 
 class ErrorMartingale:
-    """Steps of the logarithm of the martingale, for every rate (L,).
-
-    ValueError for a system with lost messages, whose next state is not normal given this one.
-    """
+    """Steps of the logarithm of the martingale, for every rate (L,); ValueError for a system with lost messages."""
 
     _known: ClassVar[WeakKeyDictionary[MomentSolver, dict[int, ErrorMartingale]]] = WeakKeyDictionary()
 

@@ -35,10 +35,7 @@ FEW_SWITCHES = 10.0  # expected, below which intervals over all paths cover too 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeMeans:
-    """Time means over the steps 0..N-1 of q linear functions of y y^T.
-
-    All entries of y y^T, packed (joint, q = p), the node errors (q = m), or the system error (q = 1).
-    """
+    """Time means over the steps 0..N-1 of q linear functions of y y^T: see ``forms_of``."""
 
     second_moments: FloatArray  # (f, f) time mean of y y^T, y the agents' coordinates in ``JumpSystem.frame``
     expected_moments: FloatArray  # (f, f) its exact expectation for the run's start and length
@@ -101,25 +98,35 @@ class TimeMeans:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Value:
-    """What the next step may do to the values f of q forms, given the graph g of this step.
+class _Jumps:
+    """What the next graph may do to the values f of q forms, given the graph g of this step."""
 
-    In the methods, a is (b, p + 1): packed moments and 1 of b steps, averaged over R replicas; a combination is (q,).
-    """
+    # In the methods, a is (b, p + 1): packed moments and 1 of b steps, averaged over R replicas; a combination is (q,).
 
     probability: FloatArray  # (n,) P_gj
-    surprises: FloatArray  # (n, q, p + 1), E[f(next) | next graph j] - E[f(next)] = surprises[j] @ a
-    forms: FloatArray  # (n, q, d, d) Y_j
-    weights: FloatArray  # (d, d) W_g
-    noise: FloatArray  # (d, d) N_g
+    surprises: FloatArray  # (n, q, p + 1), effect of the next graph j: surprises[j] @ a
 
     def jumps(self, a: FloatArray) -> FloatArray:
         """(q, q): the part of the sum over the steps of Cov(D_k | now) that is due to the next graph."""
-        total = np.zeros((self.forms.shape[1],) * 2)
+        total = np.zeros((self.surprises.shape[1],) * 2)
         for probability, surprise in zip(self.probability, self.surprises, strict=True):
             surprised = a @ surprise.T
             total += probability * (surprised.T @ surprised)
         return total
+
+    def jump_variances(self, combination: FloatArray, a: FloatArray) -> FloatArray:
+        """(b,): the part of Var(D_k | now) that is due to the next graph; of several combinations (r, q), (b, r)."""
+        parts = [(a @ (combination @ surprise).T) ** 2 for surprise in self.surprises]
+        return np.tensordot(self.probability, np.array(parts), axes=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Value(_Jumps):
+    """The values, where the next state is normal: E[f(next) | next graph j] - E[f(next)] = surprises[j] @ a."""
+
+    forms: FloatArray  # (n, q, d, d) Y_j
+    weights: FloatArray  # (d, d) W_g
+    noise: FloatArray  # (d, d) N_g
 
     def spread(self, total: FloatArray) -> FloatArray:
         """(q, q): the part that is due to the noise, with one replica; ``total`` (p + 1,) is the sum of a.
@@ -138,11 +145,6 @@ class Value:
         """(b,): Var(D_k | now) of one combination of the forms in every step."""
         return np.asarray(self.jump_variances(combination, a) + a @ self.spread_variance(combination) / replicas)
 
-    def jump_variances(self, combination: FloatArray, a: FloatArray) -> FloatArray:
-        """(b,): the part of ``variances`` that is due to the next graph."""
-        parts = [(a @ (combination @ surprise)) ** 2 for surprise in self.surprises]
-        return np.asarray(self.probability @ np.array(parts))
-
     def spread_variance(self, combination: FloatArray) -> FloatArray:
         """(p + 1,): coefficients on a of the part of ``variances`` that is due to the noise, with one replica."""
         linear = np.zeros(self.surprises.shape[2])
@@ -155,16 +157,14 @@ class Value:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SharedValue:
+class SharedValue(_Jumps):
     """As ``Value``, where replicas share lost messages, on which the noise of a step depends too.
 
     With F_k = E[f(y_k+1, g_k+1) | y_k+1, g_k], D_k = (F_k - E[f(next) | now]) + (f(next) - F_k). The variance of the
     second part, the jump's, given y_k+1 and g_k is known. The first part is squared: every step adds to it, so its
-    squares do add up to its variance. b is a of the next state, before the jump; both are (steps, p + 1).
+    squares do add up to its variance. b is a of the next state, before the jump: f(next) - F_k = surprises[j] @ b.
     """
 
-    probability: FloatArray  # (n,) P_gj
-    surprises: FloatArray  # (n, q, p + 1), f(next) - F_k = surprises[j] @ b for the next graph j
     reached: FloatArray  # (q, p + 1), F_k = reached @ b
     expected: FloatArray  # (q, p + 1), E[f(next)] = expected @ a
 
@@ -172,70 +172,45 @@ class SharedValue:
         """(steps, q): F_k - E[f(next)]."""
         return np.asarray(b @ self.reached.T - a @ self.expected.T)
 
-    def jumps(self, b: FloatArray) -> FloatArray:
-        """(q, q): sum over the steps of Cov(f(next) - F_k)."""
-        total = np.zeros((self.surprises.shape[1],) * 2)
-        for probability, surprise in zip(self.probability, self.surprises, strict=True):
-            surprised = b @ surprise.T
-            total += probability * (surprised.T @ surprised)
-        return total
 
-    def jump_variances(self, combination: FloatArray, b: FloatArray) -> FloatArray:
-        """(steps,): Var(f(next) - F_k) of one combination (q,) of the forms."""
-        parts = [(b @ (combination @ surprise)) ** 2 for surprise in self.surprises]
-        return np.asarray(self.probability @ np.array(parts))
+def known_start(prediction: Prediction, start: FloatArray, first: int | None) -> tuple[FloatArray, FloatArray]:
+    """Second moments at the start of a run, given x(0) (m, R) and g(0) if it is not stationary; law of the graphs."""
+    system, law = prediction.system, prediction.system.of_modes(prediction.step.initial)
+    if prediction.experiment.run.start == "stationary":
+        return system.started_steady(prediction.steady, law), law
+    if first is not None:  # the effect of one draw of g(0) on a transient is not an error
+        law = system.of_modes(np.eye(prediction.step.modes)[first])
+    return system.started((start - prediction.step.reference).T, law), law
 
 
 def expected_mean(observation: Observation) -> FloatArray:
-    """Exact mean of E[y y^T] over the steps of a run: steady, or transient from the known start.
-
-    A run that did not start from the stationary law is conditioned on the x(0) of its record and the first logged
-    graph: the effect of one draw of g(0) on a transient is not an error.
-
-    Parameters
-    ----------
-    observation
-        of a run in lockstep
-
-    Returns
-    -------
-    FloatArray
-        (f, f) in the frame of the agents
-    """
+    """(f, f): exact mean of E[y y^T] over the steps of a run: steady, or transient from the known start."""
     prediction = observation.prediction
-    step, system, steady = prediction.step, prediction.system, prediction.steady
-    if prediction.experiment.run.start == "stationary":
-        law = system.of_modes(step.initial)
-        initial = system.started_steady(steady, law)
-    else:
-        law = system.of_modes(np.eye(step.modes)[observation.modes[0]])
-        initial = system.started((observation.start - step.reference).T, law)
-    return system.framed(transient_mean(system, steady, initial, law, observation.steps))
+    initial, law = known_start(prediction, observation.start, int(observation.modes[0]))
+    mean = transient_mean(prediction.system, prediction.steady, initial, law, observation.steps)
+    return prediction.system.framed(mean)
 
 
 def time_means(observation: Observation) -> TimeMeans:
-    """Second moments of a run in lockstep and their standard errors, by the martingale method of this module.
-
-    Where agents keep values from step to step, f depends on more than is logged: then there are no standard errors.
-    Time and memory per step are those of p = d (d + 1) / 2 second moments.
-    """
+    """Second moments of a run in lockstep and their standard errors, by the martingale method of this module."""
     system, steps = observation.prediction.system, observation.steps
-    if system.readout is not None:
-        return _without_errors(observation)
-    p = packed_symmetric.size(system.dimension)
     forms, nodes, trace = forms_of(system, "nodes")
-
-    values = values_of(observation.prediction, forms)
-    totals = np.zeros((system.modes, p + 1))
+    p = packed_symmetric.size(system.frame.shape[1])
+    # Where agents keep values from step to step, f depends on more than is logged: then there are no standard errors.
+    values = [] if system.readout is not None else values_of(observation.prediction, forms)
+    totals = np.zeros((observation.step.modes, p + 1))
     covariance = np.zeros((len(forms), len(forms)))
-    series, variances = np.empty(steps), np.empty(steps)
+    series, variances = np.empty(steps), np.zeros(steps)
     for first, last in observation.blocks(max(p, observation.states[0].size), "errors"):
         a = np.ones((last + 1 - first, p + 1))
-        a[:, :p] = moments(observation, first, last + 1, observation.states)
+        a[:, :p] = moments(observation, first, last + 1)
         series[first:last] = a[:-1, :p] @ (trace @ forms)
-        for mode, value in enumerate(values):
+        for mode, total in enumerate(totals):
             at = np.flatnonzero(observation.modes[first:last] == mode)
-            totals[mode] += a[at].sum(axis=0)
+            total += a[at].sum(axis=0)
+            if not values:
+                continue
+            value = values[mode]
             if isinstance(value, Value):
                 covariance += value.jumps(a[at])
                 variances[first + at] = value.variances(trace, a[at], observation.replicas)
@@ -244,63 +219,26 @@ def time_means(observation: Observation) -> TimeMeans:
                 increments = value.increments(a[at], b)
                 covariance += increments.T @ increments + value.jumps(b)
                 variances[first + at] = (increments @ trace) ** 2 + value.jump_variances(trace, b)
-    for value, total in zip(values, totals, strict=True):
+    for value, total in zip(values, totals, strict=False):
         if isinstance(value, Value):
             covariance += value.spread(total) / observation.replicas
-    seen = totals.sum(axis=0)[:p] / steps
+    step = observation.step  # in its steady state:
+    leaving = steps * step.stationary * (1.0 - np.diag(step.transition))
+    switches = math.inf if step.modes == 1 else float(leaving.min())
     return TimeMeans.of(
         (forms, nodes, trace),
-        seen,
+        totals.sum(axis=0)[:p] / steps,
         expected_mean(observation),
         covariance / steps**2,
         (series, variances),
         joint=False,
-        switches=_expected_switches(observation),
+        switches=switches if values else 0.0,
         heavy=observation.prediction.fourth_moment.finite is not True,
     )
-
-
-def _without_errors(observation: Observation) -> TimeMeans:
-    """Time means and their expectation over all paths, without standard errors."""
-    system, steps = observation.prediction.system, observation.steps
-    forms, nodes, trace = forms_of(system, "nodes")
-    p = packed_symmetric.size(system.frame.shape[1])
-    seen, series = np.zeros(p), np.empty(steps)
-    for first, last in observation.blocks(max(p, observation.states[0].size), "errors"):
-        found = moments(observation, first, last, observation.states)
-        seen += found.sum(axis=0)
-        series[first:last] = found @ (trace @ forms)
-    return TimeMeans.of(
-        (forms, nodes, trace),
-        seen / steps,
-        expected_mean(observation),
-        np.zeros((len(forms), len(forms))),
-        (series, np.zeros(steps)),
-        joint=False,
-        switches=0.0,
-        heavy=observation.prediction.fourth_moment.finite is not True,
-    )
-
-
-def _expected_switches(observation: Observation) -> float:
-    """``TimeMeans.switches``: in the steady state."""
-    step = observation.step
-    if step.modes == 1:
-        return math.inf
-    leaving = step.stationary * (1.0 - np.diag(step.transition))
-    return float(observation.steps * leaving.min())
 
 
 def values_of(prediction: Prediction, forms: FloatArray) -> list[Value | SharedValue]:
-    """Values f of the Poisson equation, one object for each graph.
-
-    Parameters
-    ----------
-    prediction
-        of the experiment
-    forms
-        (q, p) on packed y y^T
-    """
+    """Values f of the Poisson equation of ``forms`` (q, p) on packed y y^T, one object for each graph."""
     system = prediction.system
     dual = prediction.solver.dual(packed_symmetric.unpack(forms, system.dimension))
     _, kappa = mode_potential(system, dual)
@@ -326,20 +264,9 @@ def values_of(prediction: Prediction, forms: FloatArray) -> list[Value | SharedV
 def forms_of(
     system: JumpSystem, kind: Literal["joint", "nodes", "system"]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Linear functions of packed y y^T to be estimated: all second moments, the node errors, or the system error.
+    """Functions (q, p) of packed y y^T, and as their combinations the node errors (m, q) and the system error (q,).
 
-    Parameters
-    ----------
-    system
-        reduced system of the run's steps
-    kind
-        what is estimated
-
-    Returns
-    -------
-    tuple[FloatArray, FloatArray, FloatArray]
-        the forms (q, p); the node errors as combinations of them (m, q), or (0, q) if only the system error is
-        estimated; the system error (q,), which is the sum of the node errors
+    All second moments ("joint"), the node errors, or only the system error, where the node errors are (0, q).
     """
     frame = system.frame
     per_node = packed_symmetric.pack(frame[:, :, None] * frame[:, None, :])
@@ -350,24 +277,19 @@ def forms_of(
     return per_node.sum(axis=0)[None], np.empty((0, 1)), np.ones(1)
 
 
-def moments(observation: Observation, first: int, last: int, states: FloatArray) -> FloatArray:
-    """(last - first, p): packed y y^T of the states first..last-1 of (N + 1, m, R), averaged over the replicas."""
-    deviations = states[first:last] - observation.step.reference
+def moments(observation: Observation, first: int, last: int) -> FloatArray:
+    """(last - first, p): packed y y^T of the states first..last-1, averaged over the replicas."""
+    deviations = observation.states[first:last] - observation.step.reference
     return packed_moments(deviations, observation.prediction.system, observation.largest)
 
 
 def packed_moments(deviations: FloatArray, system: JumpSystem, largest: float) -> FloatArray:
-    """(b, p): packed y y^T of deviations (b, m, R) from what the states should be, averaged over the replicas.
-
-    ``largest`` is the size of the largest state of the run.
-    """
+    """(b, p): packed y y^T of deviations (b, m, R), averaged over the replicas; ``largest`` state of the run."""
     y = without_rounding(deviations.transpose(0, 2, 1) @ system.frame, system, largest)
     return packed_symmetric.pack(y.transpose(0, 2, 1) @ y / deviations.shape[2])
 
 
 def without_rounding(y: FloatArray, system: JumpSystem, largest: float) -> FloatArray:
-    """Reduced coordinates y of any shape, without what rounding leaves of them where the system has no noise.
-
-    Where agents have the same noise, for example: they move together, and their disagreement is rounding.
-    """
+    """Reduced coordinates y without what rounding leaves of them where the system has no noise."""
+    # Agents with the same noise, for example, move together, and their disagreement is rounding.
     return y if system.noise.any() else np.where(np.abs(y) <= ROUNDING * largest, 0.0, y)

@@ -83,36 +83,24 @@ def _of_ranks(
 BINS = 60
 
 
-@dataclass(frozen=True, slots=True)
-class Quantiles:
-    """Quantiles of a measure; None where there was nothing to measure."""
-
-    p50: float | None
-    p95: float | None
-    p99: float | None
-    max: float | None
-
-    @classmethod
-    def of(cls, values: Pieces) -> Quantiles:
-        """Of all numbers."""
-        found = quantiles(values, (0.5, 0.95, 0.99, 1.0))
-        return cls(*found) if found else cls(None, None, None, None)
+def shown_quantiles(pieces: Pieces) -> dict[str, float | None]:
+    """Some of all numbers; None where there are none."""
+    names, shares = ("p50", "p95", "p99", "max"), (0.5, 0.95, 0.99, 1.0)
+    found = quantiles(pieces, shares)
+    return dict(zip(names, found, strict=True)) if found else dict.fromkeys(names)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Timing:
-    """Timing of a run in real time.
-
-    Times in ms are those of the agents' clock: simulated time over the speed of the run.
-    """
+    """Timing of a run in real time, in ms of the agents' clock: simulated time over the speed of the run."""
 
     period_ms: float  # nominal time between two steps of an agent
-    lateness_ms: Quantiles  # of a step after it was due
+    lateness_ms: dict[str, float | None]  # of a step after it was due
     steps: int  # of all agents
     missed: int  # steps made more than a period after they were due
-    jitter_ms: Quantiles  # |time between two successive steps of an agent - period|
-    staleness_ms: Quantiles  # age of the values at the time of use
-    staleness_steps: Quantiles  # step of the new state - step of the value; 0 or 1 with ideal timers
+    jitter_ms: dict[str, float | None]  # |time between two successive steps of an agent - period|
+    staleness_ms: dict[str, float | None]  # age of the values at the time of use
+    staleness_steps: dict[str, float | None]  # step of the new state - step of the value; 0 or 1 with ideal timers
     uses: int  # neighbours' values that steps needed, those never received or lost included
     ideal_uses: int  # uses of the value that ideal timers would have used, the own one for a lost one included
     never_heard: int  # uses in which nothing had been received yet of the neighbour
@@ -141,21 +129,16 @@ class Timing:
         (edges, counts), (age_edges, age_counts) = self.histogram, self.ages
         return {
             "period_ms": self.period_ms,
-            "lateness_ms": _document(self.lateness_ms),
+            "lateness_ms": self.lateness_ms,
             "deadlines": {"steps": self.steps, "missed": self.missed, "share": self.missed_share},
-            "jitter_ms": _document(self.jitter_ms),
-            "staleness_ms": _document(self.staleness_ms),
-            "staleness_steps": _document(self.staleness_steps),
+            "jitter_ms": self.jitter_ms,
+            "staleness_ms": self.staleness_ms,
+            "staleness_steps": self.staleness_steps,
             "ideal_uses": {"uses": self.uses, "ideal": self.ideal_uses, "share": self.ideal_share},
             "never_heard": self.never_heard,
-            "unheard": self.lost_messages.to_json(),
+            "unheard": self.lost_messages,
             "outdated_graph": {"steps": self.outdated_graphs, "share": self.outdated_share},
-            "histogram": {
-                "lateness_ms": edges.tolist(),
-                "steps": counts.tolist(),
-                "staleness_ms": age_edges.tolist(),
-                "uses": age_counts.tolist(),
-            },
+            "histogram": {"lateness_ms": edges, "steps": counts, "staleness_ms": age_edges, "uses": age_counts},
         }
 
 
@@ -169,12 +152,12 @@ def measure_timing(observation: Observation) -> Timing:
     steps, m = observation.steps, observation.step.agents
     return Timing(
         period_ms=log.period * log.milliseconds,
-        lateness_ms=Quantiles.of(log.pieces(log.lateness)),
+        lateness_ms=shown_quantiles(log.pieces(log.lateness)),
         steps=steps * m,
         missed=missed,
-        jitter_ms=Quantiles.of(log.pieces(log.jitter)),
-        staleness_ms=Quantiles.of(log.pieces(log.ages)),
-        staleness_steps=Quantiles.of(log.pieces(log.ages_in_steps)),
+        jitter_ms=shown_quantiles(log.pieces(log.jitter)),
+        staleness_ms=shown_quantiles(log.pieces(log.ages)),
+        staleness_steps=shown_quantiles(log.pieces(log.ages_in_steps)),
         uses=uses,
         ideal_uses=ideal_uses,
         never_heard=never_heard,
@@ -189,8 +172,7 @@ class _TimingLog:
     """What blocks of steps say about timing, times in ms of the agents' clock."""
 
     def __init__(self, observation: Observation) -> None:
-        assert observation.timers is not None
-        self._observation, self._timers, self._step = observation, observation.timers, observation.step
+        self._observation, self._timers, self._step = observation, observation.timed, observation.step
         experiment = observation.prediction.experiment
         self.milliseconds = 1e-6 / experiment.run.speed  # of the agents' clock, in a nanosecond of simulated time
         self.period = observation.step.dt * 1e9
@@ -274,10 +256,6 @@ def _histogram(values: Pieces) -> tuple[FloatArray, AnyArray]:
     return np.histogram_bin_edges(np.empty(0), BINS, ends), counts
 
 
-def _document(quantiles: Quantiles) -> dict[str, float | None]:
-    return {"p50": quantiles.p50, "p95": quantiles.p95, "p99": quantiles.p99, "max": quantiles.max}
-
-
 SHOWN_LINKS = 20
 LEAST_EXCESS = 0.01  # smallest difference of shares that is put into words: a busy machine has a few late messages
 
@@ -354,8 +332,7 @@ class LostMessages:
 
 def lost_messages(observation: Observation) -> LostMessages:
     """The messages of a run in real time, see ``LostMessages``; with a delay, so many steps later."""
-    timers, step = observation.timers, observation.step
-    assert timers is not None
+    timers, step = observation.timed, observation.step
     tables = neighbour_tables(step)
     links = np.argwhere(step.listens())
     messages, lost = np.zeros(len(links), np.int64), np.zeros(len(links), np.int64)

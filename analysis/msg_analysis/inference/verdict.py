@@ -9,15 +9,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.resources import blas_threads
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.comparison import Comparison, trusted
-from msg_analysis.inference.counts import LossTally, Transitions, loss_test, switching_test
+from msg_analysis.inference.counts import LossTally, Transitions, loss_test
 from msg_analysis.inference.e_values import log_mean
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates, rank_agents
 from msg_analysis.inference.event_order import order_events
-from msg_analysis.inference.evidence_sums import AnyTimeEvidence, Watch, WatchedEvidence, any_time_evidence
+from msg_analysis.inference.evidence_sums import AnyTimeEvidence, WatchedEvidence, any_time_evidence
 from msg_analysis.inference.given_path import GivenPath, means_given_path
 from msg_analysis.inference.observation import Measurement, Observation, spaced_steps
 from msg_analysis.inference.question import Search, Statistics
@@ -29,7 +29,6 @@ from msg_analysis.inference.time_means import TimeMeans, time_means
 from msg_analysis.inference.timing import Timing, measure_timing
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
-from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.prediction import Prediction, predict
 
 ANALYSES = 20, 80  # at the evidence over time, in short and in long runs: each takes as long as some hundred steps
@@ -55,11 +54,8 @@ class Evidence:
 
     @property
     def tested(self) -> TimeMeans | None:
-        """The errors next to the exact law that they are tested against; None where there is none.
-
-        In lockstep that given the path, which holds for every run, before that over all paths, which needs long runs;
-        but one with the errors of the agents before one without.
-        """
+        """The errors next to the exact law that they are tested against; None where there is none."""
+        # Given the path holds for every run, over all paths needs long runs; but with the errors of the agents first.
         laws = [self.given, self.means if self.means.long_enough else None] if self.decisive else []
         known = [law for law in laws if law]
         return next((law for law in known if len(law.nodes)), known[0] if known else None)
@@ -67,23 +63,20 @@ class Evidence:
     @classmethod
     def of(cls, observation: Observation, level: float, *, decided: bool = False) -> Evidence:
         """Of one run, which ended when its evidence ``decided``; in real time, laws are tested at ``level``."""
-        analyses = spaced_steps(observation.steps, DECIDED_ANALYSES if decided else usual_analyses(observation.steps))
-        with blas_threads(observation.step.agents):
-            return cls._of(observation, level, analyses)
-
-    @classmethod
-    def _of(cls, observation: Observation, level: float, analyses: IntArray) -> Evidence:
+        usual = int(np.clip(observation.steps // STEPS_PER_ANALYSIS, *ANALYSES))
+        analyses = spaced_steps(observation.steps, DECIDED_ANALYSES if decided else usual)
         laws, timing, position, given = None, None, None, None
-        if observation.timers:
-            timing, order = measure_timing(observation), order_events(observation)
-            position = order.position
-            means, laws = measure_laws(observation, order, timing, level)
-        else:
-            means = time_means(observation)
-            kept = observation.prediction.system.readout is not None
-            given = means_in_lockstep(observation) if kept else means_given_path(observation)
-        watch = Watch(observation, analyses)
-        residuals = ResidualSums(observation, position, watch)
+        watched = WatchedEvidence(observation, analyses)
+        with blas_threads(observation.step.agents):
+            if observation.timers:
+                timing, order = measure_timing(observation), order_events(observation)
+                position = order.position
+                means, laws = measure_laws(observation, order, timing, level)
+            else:
+                means = time_means(observation)
+                kept = observation.prediction.system.readout is not None
+                given = means_in_lockstep(observation) if kept else means_given_path(observation)
+            residuals = ResidualSums(observation, position, watched)
         return cls(
             steps=observation.steps,
             means=means,
@@ -93,18 +86,15 @@ class Evidence:
             transitions=Transitions.of(observation.modes, observation.step.modes),
             loss=LossTally.of(observation),
             broadcast=BroadcastSums.of(observation),
-            watched=watch.result(),
+            watched=watched,
             timing=timing,
             laws=laws,
         )
 
     def merged(self, other: Evidence) -> Evidence:
-        """The evidence of these and other runs of the same experiment; the sums of ``self`` are changed in place.
-
-        Time means are weighted with the numbers of steps, so that every step, and every martingale increment, counts
-        the same.
-        """
+        """The evidence of these and other runs of the same experiment; the sums of ``self`` are changed in place."""
         self.residuals.merge(other.residuals)
+        self.watched.merge(other.watched)
         if self.loss and other.loss:
             self.loss.merge(other.loss)
         if self.broadcast and other.broadcast:
@@ -119,19 +109,13 @@ class Evidence:
             decisive=self.decisive and other.decisive,
             given=given,
             transitions=self.transitions.merged(other.transitions),
-            watched=self.watched.merged(other.watched),
             timing=None,
             laws=None,
         )
 
 
-def usual_analyses(steps: int) -> int:
-    """At the evidence over time of a run with so many steps, at most."""
-    few, most = ANALYSES
-    return min(max(steps // STEPS_PER_ANALYSIS, few), most)
-
-
 def _merged_means(one: TimeMeans, steps: int, other: TimeMeans, more: int) -> TimeMeans:
+    # So every step, and every martingale increment, counts the same.
     a, b = steps / (steps + more), more / (steps + more)
     if one.joint != other.joint or len(one.nodes) != len(other.nodes):
         one, other = _coarser(one, other), _coarser(other, one)
@@ -167,25 +151,7 @@ MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
 
 
 def compare_run(trajectory: Run, *, level: float = 0.01) -> Comparison:
-    """Compare a run, or its complete beginning, with what theory predicts for it; see ``api.compare``.
-
-    Every test assumes exactly the law that the record says was run; the probability of any false rejection in the
-    family is at most ``level`` (Holm). A test with nothing to test (no noise, one graph, no loss) is left out. In real
-    time, the family has only tests that are exact whatever the timing was. Where the law has no prediction (a protocol
-    that is not linear, or is not installed), only graphs and losses are tested.
-
-    Parameters
-    ----------
-    trajectory
-        of a bag or of the twin
-    level
-        probability of a false "disagrees", all tests together
-
-    Raises
-    ------
-    InputError
-        no prediction (too large, unbounded), or a log without what is needed
-    """
+    """Compare a run, or its complete beginning, with what theory predicts for it, see ``pool.compare``."""
     unpredicted = trajectory.record.experiment.unpredictable()
     if unpredicted:
         return _measured(trajectory, level, unpredicted)
@@ -201,29 +167,29 @@ def compare_run(trajectory: Run, *, level: float = 0.01) -> Comparison:
 
 
 def evaluate(
-    trajectory: Run,
-    prediction: Prediction,
-    evidence: Evidence,
-    level: float,
-    p_alike: float | None = None,
+    trajectory: Run, prediction: Prediction, evidence: Evidence, level: float, p_alike: float | None = None
 ) -> Comparison:
-    """The verdict on the evidence of one run, or of several, of which ``p_alike`` is the p-value of their being alike.
-
-    Of several runs, ``trajectory`` is one with the completeness of all.
-    """
+    """The verdict on the evidence of one run, or of several, of which ``trajectory`` has the completeness."""
     means, lockstep = evidence.means, prediction.experiment.run.pace == "lockstep"
-    system_error, node_errors = _over_all_paths(means, prediction.system)
-    covariance = _covariance(evidence, prediction.system)
+    system_error, node_errors = estimates(means, prediction.system)
+    if not means.long_enough:  # too short for standard errors over all paths of the graphs
+        system_error, node_errors = system_error.without_error(), [node.without_error() for node in node_errors]
+    covariance = covariance_test(means, prediction.system)
+    if evidence.given:  # tested given the path
+        tested = covariance_test(evidence.given, prediction.system)
+        covariance = replace(tested, measured=covariance.measured, predicted=covariance.predicted)
     law = evidence.tested
     tested_error, tested_nodes = estimates(law, prediction.system) if law else (None, [])
+    switching = evidence.transitions.test(prediction.step.transition)
+    loss = evidence.loss.test() if evidence.loss else None
     run = Statistics(
         system_error=tested_error,
         node_errors=tested_nodes,
         corrected=", corrected" if law and law is evidence.given else "",
-        covariance=covariance if evidence.decisive else None,
+        p_covariance=covariance.p if evidence.decisive else None,
         residuals=evidence.residuals.tests(),
-        switching=evidence.transitions.test(prediction.step.transition),
-        loss=evidence.loss.test() if evidence.loss else None,
+        p_switching=switching.p,
+        p_loss=loss.p if loss else None,
         p_broadcast=evidence.broadcast.p_value() if evidence.broadcast else None,
         findings=evidence.watched.sums.findings(),
         p_alike=p_alike,
@@ -234,8 +200,7 @@ def evaluate(
     rejected = [test.name for test in tests if test.rejected]
     causes: list[Cause] = []
     if rejected and trajectory.completeness.complete:
-        sums = evidence.residuals, evidence.transitions, evidence.loss, evidence.broadcast
-        causes = causes_of(Search(prediction.experiment, *sums, run.findings, level), rejected)
+        causes = causes_of(Search(prediction.experiment, evidence, run.findings, level), rejected)
     return Comparison(
         trajectory=trajectory,
         level=level,
@@ -244,12 +209,14 @@ def evaluate(
         node_errors=node_errors,
         covariance=covariance,
         innovations=run.residuals,
-        switching=run.switching,
+        switching=switching,
         continuous_error=prediction.continuous.system_error if prediction.continuous_moments else None,
         batch=batch_interval(means.system_series),
         tests=tests,
-        running=_running(means, prediction.step.dt),
-        loss=run.loss,
+        running=_running(
+            means.system_series, means.system_variances if means.long_enough else None, prediction.step.dt
+        ),
+        loss=loss,
         p_broadcast=run.p_broadcast,
         timing=evidence.timing,
         laws=evidence.laws,
@@ -274,52 +241,36 @@ def _any_time(
     return any_time_evidence(evidence.watched, level, families, variance, evidence.steps, planned)
 
 
-def _over_all_paths(means: TimeMeans, system: JumpSystem) -> tuple[Estimate, list[Estimate]]:
-    """The system error and the node errors; without standard errors where the run is too short for these."""
-    error, nodes = estimates(means, system)
-    if means.long_enough:
-        return error, nodes
-    return error.without_error(), [node.without_error() for node in nodes]
-
-
-def _covariance(evidence: Evidence, system: JumpSystem) -> CovarianceTest:
-    """The second moments and their expectation over all paths, tested given the path."""
-    shown = covariance_test(evidence.means, system)
-    tested = covariance_test(evidence.given, system) if evidence.given else shown
-    return replace(tested, measured=shown.measured, predicted=shown.predicted)
-
-
 def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
     """Comparison without a prediction."""
     measurement = Measurement.of(trajectory)
-    agents, enough = measurement.step.agents, True
+    series, covariance, step = measurement.system_series, measurement.covariance, measurement.step
     if measurement.steps < MIN_STEPS and not trajectory.completeness.complete:
-        enough = False
-    series, covariance = measurement.system_series, measurement.covariance if enough else None
-    run = Statistics(
-        switching=switching_test(measurement.modes, measurement.step.transition) if enough else None,
-        loss=loss_test(measurement) if enough else None,
-    )
-    nodes = [Estimate()] * agents if covariance is None else [Estimate(float(error)) for error in np.diag(covariance)]
-    counts = spaced_steps(len(series)) if enough else np.empty(0, np.int64)
+        return Comparison(
+            trajectory=trajectory,
+            level=level,
+            steps=measurement.steps,
+            system_error=Estimate(),
+            node_errors=[Estimate()] * step.agents,
+            covariance=CovarianceTest(note="there is no prediction"),
+            running=_running(np.empty(0), None, step.dt),
+            unpredicted=unpredicted,
+        )
+    switching, loss = Transitions.of(measurement.modes, step.modes).test(step.transition), loss_test(measurement)
     return Comparison(
         trajectory=trajectory,
         level=level,
         steps=measurement.steps,
-        system_error=Estimate() if covariance is None else Estimate(float(np.trace(covariance))),
-        node_errors=nodes,
+        system_error=Estimate(float(np.trace(covariance))),
+        node_errors=[Estimate(float(error)) for error in np.diag(covariance)],
         covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
-        switching=run.switching,
-        batch=batch_interval(series) if enough else None,
-        tests=decide(run, level),
-        running={
-            "time": np.asarray((measurement.first + counts) * measurement.step.dt, dtype=float),
-            "system_error": np.cumsum(series)[counts - 1] / counts if enough else np.empty(0),
-            "standard_error": np.zeros(len(counts)),
-        },
-        loss=run.loss,
+        switching=switching,
+        batch=batch_interval(series),
+        tests=decide(Statistics(p_switching=switching.p, p_loss=loss.p if loss else None), level),
+        running=_running(series, None, step.dt, measurement.first),
+        loss=loss,
         unpredicted=unpredicted,
-        transient=measurement.first if enough else None,
+        transient=measurement.first,
     )
 
 
@@ -334,16 +285,17 @@ def without_numbers(trajectory: Run, level: float, prediction: Prediction, steps
         node_errors=[Estimate(predicted=float(error)) for error in predicted.node_errors],
         covariance=CovarianceTest(predicted=predicted.covariance),
         continuous_error=prediction.continuous.system_error if prediction.continuous_moments else None,
-        running={key: np.empty(0) for key in ("time", "system_error", "standard_error")},
+        running=_running(np.empty(0), None, prediction.step.dt),
     )
 
 
-def _running(means: TimeMeans, dt: float) -> dict[str, FloatArray]:
+def _running(series: FloatArray, variances: FloatArray | None, dt: float, first: int = 0) -> dict[str, FloatArray]:
     """Mean of the system error up to some steps, denser at the beginning, and its standard error."""
-    counts = spaced_steps(len(means.system_series))
-    errors = np.sqrt(np.cumsum(means.system_variances)[counts - 1]) / counts
+    counts = spaced_steps(len(series)) if len(series) else np.empty(0, np.int64)
     return {
-        "time": np.asarray(counts * dt, dtype=float),
-        "system_error": np.cumsum(means.system_series)[counts - 1] / counts,
-        "standard_error": errors if means.long_enough else np.zeros(len(counts)),
+        "time": np.asarray((first + counts) * dt, dtype=float),
+        "system_error": np.cumsum(series)[counts - 1] / counts,
+        "standard_error": np.zeros(len(counts))
+        if variances is None
+        else np.sqrt(np.cumsum(variances)[counts - 1]) / counts,
     }

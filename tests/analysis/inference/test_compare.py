@@ -45,7 +45,6 @@ CASES = {
     "line_ring": {"duration": 60, "replicas": 4},
     "tracking": {"duration": 60, "replicas": 4},
     "discrete": {"duration": 400, "replicas": 4},
-    "zero start": {"duration": 60, "replicas": 4, "start": "zero"},
     "far start": {"duration": 30, "replicas": 4, "start": [3.0, 0.0, 0.0, 1.0, -2.0]},
 }
 
@@ -76,12 +75,12 @@ def hard(case):
 @pytest.mark.parametrize("case", HARD)
 @pytest.mark.usefixtures("predicted_once")
 def test_the_level_holds_where_a_few_sojourns_decide(case):
-    """60 correct runs of 10 units (rare: 100), 1,000 for the documentation: alarms at 1e-4 by the binomial law.
+    """30 correct runs of 10 units (rare: 100), 1,000 for the documentation: alarms at 1e-4 by the binomial law.
 
     Over all paths of the graphs, the errors of such runs are far from normal: 3 to 7 % of the verdicts were wrong.
     """
     experiment = hard(case)
-    results = [compare(simulate(experiment.with_run(seed=seed))) for seed in range(60)]
+    results = [compare(simulate(experiment.with_run(seed=seed))) for seed in range(30)]
     assert_few_alarms(results)
     noisy = case in ("far", "rare")
     assert all(("system error, corrected" in p_values(result)) == noisy for result in results)
@@ -149,7 +148,7 @@ def test_document(short_run):
 
 
 def test_many_agents_get_no_joint_test_but_all_numbers():
-    run = simulate(line_ring(60, run={"duration": 10, "start": "zero"}))
+    run = simulate(line_ring(40, run={"duration": 10, "start": "zero"}))
     found = compare(run)
     assert (found.covariance.chi2, found.covariance.dof, found.covariance.p) == (None, None, None)
     assert "too many agents" in found.covariance.note
@@ -209,17 +208,6 @@ def test_without_noise_or_switching_there_is_less_to_reject():
     assert "switching" not in p_values(result)
 
 
-def test_agents_that_are_where_no_noise_could_have_put_them():
-    leaders = {"agents": [1], "gain": "inf", "reference": 2.0}
-    experiment = changed(golden("tracking", duration=20), leaders=leaders)
-    trajectory = simulate(experiment)
-    assert compare(trajectory).verdict == "agrees"
-    trajectory.states[100, 0] += 0.5
-    result = compare(trajectory)
-    assert result.verdict == "disagrees"
-    assert result.innovations.p_covariance == 0.0
-
-
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", [-1e300, 1e160, 1e40])
 @pytest.mark.parametrize("name", ["line_ring", "tracking", "discrete"])
@@ -267,16 +255,10 @@ def test_calibration_with_noise_by_graph(line, ring):
 
 
 def test_noise_in_the_wrong_graph_is_found():
-    """Of the other graph, or where there should be none."""
     swapped, told = (loud(*noise, duration=200) for noise in ((1.0, 0.3), (0.3, 1.0)))
     comparison = compare(claimed(simulate(swapped), told))
     assert comparison.verdict == "disagrees"
     assert comparison.innovations.p_covariance < 1e-6
-    noisy = np.array(SHARED)
-    noisy[2, 2] = 1e-3
-    comparison = compare(claimed(simulate(loud(noisy.tolist(), 1.0)), loud(SHARED, 1.0)))
-    assert comparison.innovations.p_covariance == 0.0
-    assert comparison.verdict == "disagrees"
 
 
 LINE_RING = document(5, 0.5, run={"dt": 0.1, "duration": 400.0, "replicas": 1, "seed": 3})

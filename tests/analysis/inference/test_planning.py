@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.stats
+from tests.support.watched_run import sums_of
 
 from experiments import Observation, compare, predict, simulate
 from msg_analysis import Experiment, InputError, NotAvailableError
-from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.fault_power import Fault, FaultPower, StepInformation, fault_powers
 from msg_analysis.inference.sample_size import REPLICAS
-from msg_analysis.inference.statistics import needed_noncentrality, noncentral_chi2_tail, simultaneous_half_width
+from msg_analysis.inference.statistics import simultaneous_half_width
 from msg_analysis.inference.time_means import time_means
 
 
@@ -21,12 +21,12 @@ def line_ring(**run: Any) -> Experiment:
     return Experiment.load("line_ring").with_run(**run)
 
 
-def test_noncentral_chi_square() -> None:
-    for dof, noncentrality in ((1, 3.0), (15, 24.2), (200, 90.0)):
-        x = scipy.stats.chi2.isf(0.001, dof)
-        expected = scipy.stats.ncx2.sf(x, dof, noncentrality)
-        assert noncentral_chi2_tail(x, dof, noncentrality) == pytest.approx(expected, rel=1e-6)
-        assert needed_noncentrality(x, dof, expected) == pytest.approx(noncentrality, rel=1e-6)
+@pytest.mark.parametrize(("dof", "noncentrality"), [(1, 3.0), (15, 24.2), (200, 90.0)])
+def test_power_is_noncentral_chi_square(dof: int, noncentrality: float) -> None:
+    found = FaultPower(Fault("noise", 2.0), 0, None, [StepInformation("noise", dof, noncentrality / 7)], 0.001, 1.0)
+    expected = scipy.stats.ncx2.sf(scipy.stats.chi2.isf(0.001, dof), dof, noncentrality)
+    assert found.power(7) == pytest.approx(expected, rel=1e-6)
+    assert found.steps(expected) == pytest.approx(7, rel=1e-6)
 
 
 def test_lengths_are_those_of_the_formulas() -> None:
@@ -117,8 +117,7 @@ def test_gains_have_the_information_of_a_run() -> None:
     experiment = line_ring(duration=4000, replicas=4)
     prediction = predict(experiment)
     run = Observation.of(simulate(experiment), prediction)
-    sums = EvidenceSums(prediction, run.replicas)
-    sums.add(run, 0, run.steps)
+    sums = sums_of(run)
     (found,) = powers(experiment, Fault("gain", 0.5))
     assert (found.agent, found.sender) in {(0, 4), (4, 0)}  # only the ring has this link
     by_name = {test.name: test for test in found.tests}

@@ -142,10 +142,10 @@ def test_many_agents() -> None:
     np.testing.assert_allclose(numbers(*our_nodes)[:, 2], numbers(*nodes)[:, 2], rtol=0.01)
 
 
-def test_too_many_agents_for_standard_errors_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("msg_analysis.inference.online_errors.MOST_BYTES", 100)
+def test_too_many_agents_for_standard_errors_of_each() -> None:
     trajectory = simulate(experiment())
-    live = LiveEstimate(trajectory.record)
+    assert not RunningErrors(trajectory.record, predict(trajectory.record.experiment), most_bytes=100).nodes_tested
+    live = LiveEstimate(trajectory.record, nodes=False)
     for message in messages(trajectory):
         live.add(*message)
     report = live.report()

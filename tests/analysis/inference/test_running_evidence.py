@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments import Experiment, Observation, RunRecord, compare, five, predict, simulate
-from msg_analysis.inference import online_errors, online_evidence
+from msg_analysis.inference import online_errors
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.online_errors import LiveEstimate, LiveReport, precision_words, reached
@@ -54,12 +54,11 @@ def test_what_the_states_alone_do_not_give() -> None:
 
 
 @pytest.mark.parametrize("changes", [{}, {"noise": {"loss": 0.1}}], ids=["plain", "loss"])
-def test_too_many_agents(changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_agents(changes: dict[str, Any]) -> None:
     """They have their errors, and no evidence."""
-    monkeypatch.setattr(online_evidence, "MOST_BYTES", 100)
     law = experiment(duration=10, **changes)
-    assert not supports(predict(law))
-    live = LiveEstimate(record_of(law, None)[0])
+    assert not supports(predict(law), most_bytes=100)
+    live = LiveEstimate(record_of(law, None)[0], evidence=False)
     assert live.evidence is None
     assert live.log is None
     assert live.report().any_time.log_evidence is None

@@ -6,7 +6,6 @@ import importlib
 import json
 import re
 import sys
-from bisect import bisect_right
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, TypeVar
@@ -14,11 +13,11 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 from scipy import stats
+from tests.support.watched_run import sums_of
 
-from experiments import Experiment, Observation, compare, five, observed, predict, simulate
+from experiments import Experiment, Observation, chain_path, compare, five, observed, predict, simulate
 from msg_analysis.inference.dependence import ConstantState, LongLags
 from msg_analysis.inference.e_values import Analyses, WindowEvidence, Windows, variance_evidence
-from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.graphs import PARTS, HoldingTimes, SwappedGraphs
 from msg_analysis.inference.messages import StaleValues
 from msg_analysis.inference.noise import LargestResidual, NoiseByGraph, NoiseOverTime
@@ -35,10 +34,7 @@ def seen(seed: int = 1, duration: float = 20.0, **changes: Any) -> Observation:
 
 def summed(observation: Observation, kind: type[Kind], size: int = 37) -> Kind:
     """The sums of a run, in blocks of so many steps."""
-    sums = EvidenceSums(observation.prediction, observation.replicas, in_detail=True)
-    for first in range(0, observation.steps, size):
-        sums.add(observation, first, min(first + size, observation.steps))
-    return next(each for each in sums.diagnostics if isinstance(each, kind))
+    return next(each for each in sums_of(observation, size, in_detail=True).diagnostics if isinstance(each, kind))
 
 
 def whitened(observation: Observation) -> np.ndarray:
@@ -89,7 +85,7 @@ def test_the_evidence_of_windows_is_their_mean(seen: int) -> None:
     evidence = WindowEvidence(windows, 1)
     ended = windows.add(np.zeros((seen, 1)))
     if seen:
-        evidence.add(ended, (logs[ended.first] / (ended.level + 1))[:, None], Analyses.at_the_end(seen))
+        evidence.add(ended, (logs[ended.first] / (ended.level + 1))[:, None], Analyses(np.array([seen])))
     levels = [
         [
             np.exp(logs[first] / (level + 1)) if first + 2**level <= seen else float(first >= seen)
@@ -106,14 +102,6 @@ def test_the_evidence_of_windows_is_their_mean(seen: int) -> None:
     assert twice.logarithms()[0] == pytest.approx(2.0 * alone)
 
 
-def chain(transition: list[list[float]], steps: int, seed: int) -> np.ndarray:
-    random, up_to = np.random.default_rng(seed).random(steps), np.cumsum(transition, axis=1)[:, :-1].tolist()
-    path = [0]
-    for chance in random[1:].tolist():
-        path.append(bisect_right(up_to[path[-1]], chance))
-    return np.array(path)
-
-
 THREE = [[0.8, 0.1, 0.1], [0.3, 0.5, 0.2], [0.2, 0.2, 0.6]]
 SLOW = [[0.95, 0.05], [0.05, 0.95]]
 
@@ -121,6 +109,11 @@ SLOW = [[0.95, 0.05], [0.05, 0.95]]
 def sojourns(transition: list[list[float]], steps: int) -> HoldingTimes:
     """Sums of the law of an experiment in discrete time."""
     return HoldingTimes(law_of(json.dumps(transition), steps))
+
+
+def count(sums: HoldingTimes, graphs: np.ndarray) -> None:
+    """Add steps with these graphs, the last one being that of the next step."""
+    sums.add(SimpleNamespace(graphs=graphs, analyses=Analyses(np.array([len(graphs)]))))  # type: ignore[arg-type]
 
 
 def made(step: StepModel, steps: int, replicas: int, noisy: np.ndarray) -> Law:
@@ -149,10 +142,10 @@ def law_of(transition: str, steps: int) -> Law:
 
 
 def test_sojourns_are_counted_as_by_a_loop() -> None:
-    path = chain(SLOW, 900, 2)
+    path = chain_path(SLOW, 900, 2)
     sums = sojourns(SLOW, 900)
     for first in range(0, 900, 50):
-        sums.count(path[first : first + 51], Analyses.at_the_end(50))
+        count(sums, path[first : first + 51])
     steps, left, age = np.zeros((2, PARTS)), np.zeros((2, PARTS)), 0
     for now, following in zip(path[:-1].tolist(), path[1:].tolist(), strict=True):
         # Part p has the ages by which at least p, and fewer than p + 1, eighths of the sojourns have ended.
@@ -160,19 +153,17 @@ def test_sojourns_are_counted_as_by_a_loop() -> None:
         steps[now, part] += 1
         left[now, part] += now != following
         age = 0 if now != following else age + 1
-    assert (sums.steps == steps).all()
-    assert (sums.left == left).all()
+    assert (sums.sums[0] == steps).all()
+    assert (sums.sums[1] == left).all()
 
 
 def test_the_statistic_of_sojourns_is_that_of_a_table() -> None:
-    path = chain(SLOW, 20_000, 4)
+    path = chain_path(SLOW, 20_000, 4)
     sums = sojourns(SLOW, 20_000)
-    sums.count(path, Analyses.at_the_end(len(path)))
+    count(sums, path)
     finding = sums.finding()
-    total = sum(
-        stats.chi2_contingency(np.vstack([sums.left[g], sums.steps[g] - sums.left[g]]), lambda_="log-likelihood")[0]
-        for g in range(2)
-    )
+    tables = [np.vstack([left, steps - left]) for steps, left in zip(*sums.sums, strict=True)]
+    total = sum(stats.chi2_contingency(table, lambda_="log-likelihood")[0] for table in tables)
     assert np.exp(finding.log_p) == pytest.approx(stats.chi2.sf(total, 14), rel=1e-6)
 
 
@@ -182,7 +173,7 @@ def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], s
     p = []
     for seed in range(200):
         sums = sojourns(transition, steps)
-        sums.count(chain(transition, steps, seed), Analyses.at_the_end(steps))
+        count(sums, chain_path(transition, steps, seed))
         finding = sums.finding()
         p.append(np.exp(finding.log_p))
     assert stats.kstest(p, "uniform").pvalue > 1e-3
@@ -190,7 +181,7 @@ def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], s
 
 def test_few_sojourns_are_not_tested() -> None:
     sums = sojourns(SLOW, 300)
-    sums.count(chain(SLOW, 300, 1), Analyses.at_the_end(300))
+    count(sums, chain_path(SLOW, 300, 1))
     assert sums.finding() is None
 
 
@@ -201,8 +192,8 @@ def test_noise_by_graph() -> None:
     for g in range(2):
         squares = (white[observation.modes == g] ** 2).sum(axis=(0, 2))
         number = 2 * int((observation.modes == g).sum())
-        assert sums.squares[g] == pytest.approx(squares)
-        assert (sums.samples[g] == number).all()
+        assert sums.sums[1][g] == pytest.approx(squares)
+        assert (sums.sums[0][g] == number).all()
         for total, samples in [*((s, number) for s in squares), (squares.sum(), 5 * number)]:
             p.append(2.0 * min(stats.chi2.sf(total, samples), stats.chi2.cdf(total, samples)))
     finding = sums.finding()
@@ -247,7 +238,7 @@ def test_noise_over_time_by_lags(agent: int | None) -> None:
     sums = NoiseOverTime(made(observation.step, 1200, 2, np.ones(5, dtype=bool)))
     for first in range(0, 1200, 37):
         part = SimpleNamespace(
-            first=first, white=white[first : first + 37], analyses=Analyses.at_the_end(min(37, 1200 - first))
+            first=first, white=white[first : first + 37], analyses=Analyses(np.array([min(37, 1200 - first)]))
         )
         sums.add(part)  # type: ignore[arg-type]
     squares = (white**2).sum(axis=2)
@@ -321,8 +312,8 @@ def test_long_lags() -> None:
     for lag in range(1, 101):
         late, early = white[lag:], white[:-lag]
         score, information = (late * early).sum(axis=(0, 2)), (early**2).sum(axis=(0, 2))
-        assert sums.sums.score[lag - 1] == pytest.approx(score, abs=1e-9)
-        assert sums.sums.information[lag - 1] == pytest.approx(information)
+        assert sums.lags.score[lag - 1] == pytest.approx(score, abs=1e-9)
+        assert sums.lags.information[lag - 1] == pytest.approx(information)
         p += (1000 * 2 * stats.norm.sf(np.abs(score / np.sqrt(information)))).tolist()
         p.append(200 * 2 * stats.norm.sf(abs(score.sum() / np.sqrt(information.sum()))))
     finding = sums.finding()
@@ -356,8 +347,8 @@ def test_stale_values(changes: dict[str, Any]) -> None:
                 older = step.nominal[own, i, j] * (heard[max(s - 1, 0), j] - heard[s, j])
                 score[i, j] += older @ e / variance
                 information[i, j] += older @ older / variance
-    assert sums.score == pytest.approx(score, abs=1e-9)
-    assert sums.information == pytest.approx(information)
+    assert sums.sums[0] == pytest.approx(score, abs=1e-9)
+    assert sums.sums[1] == pytest.approx(information)
     links = information > 0.0
     p = 2 * stats.norm.sf(np.abs(score[links] / np.sqrt(information[links]))) * 2 * links.sum()
     common = 2 * stats.norm.sf(abs(score.sum()) / np.sqrt(information.sum())) * 2
@@ -400,9 +391,9 @@ def test_runs_are_merged() -> None:
     largest = pairs[2][0].finding()
     assert (largest.place.run, largest.place.first) == (2, 121)
     lags = [summed(each, LongLags) for each in (first, second)]
-    products = lags[0].sums.score + lags[1].sums.score
+    products = lags[0].lags.score + lags[1].lags.score
     lags[0].merge(lags[1])
-    assert (lags[0].sums.score == products).all()
+    assert (lags[0].lags.score == products).all()
 
 
 BENCHMARKS = Path(__file__).parents[3] / "benchmarks"
@@ -460,7 +451,7 @@ def test_a_fault_is_found_and_named(departures, fault: str) -> None:
     assert re.fullmatch(WORDS[fault], first.words), first.words
     stretch = first.kind == "noise" and first.graph is None and "steps before" not in first.words
     in_time = stretch or first.kind in ("frozen", "graph", "outlier")
-    steps = first.to_json()["steps"]
+    steps = first.steps
     assert (steps is not None) == in_time
     assert steps is None or f"{steps[0]:,}" in first.words
 
@@ -471,4 +462,5 @@ def test_the_stretch_is_the_right_one(departures) -> None:
     states = result.trajectory.states[:, 2]
     still = np.flatnonzero((states[1:] == states[:-1]).all(axis=1)) + 1
     assert result.causes[0].steps == (still[0], still[-1])
+    assert result.causes[0].estimate == pytest.approx(20 / (len(states) - 1))
     assert len(still) == 20

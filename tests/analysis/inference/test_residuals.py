@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiments import observed, pieces
-from msg_analysis.inference.counts import simulate_counts, switching_test
+from experiments import chain_path, observed, pieces
+from msg_analysis.inference.counts import SwitchingTest, Transitions, simulate_counts
 from msg_analysis.inference.regression import regressors
 from msg_analysis.inference.residuals import ResidualSums, residuals
 
@@ -108,28 +108,19 @@ def test_regressors_stay_few(observation, limit, count):
     assert 0.0 < ResidualSums(observation, most_regressors=limit).tests().p_gain < 1.0
 
 
-def test_a_direction_without_noise_must_stand_still():
+def test_directions_without_noise():
+    """Nothing may move in them; where there is hardly any noise, or no direction with noise, there is no alarm."""
     quiet = observe(noise={"process": [1.0, 1.0, 0.0]})
     assert ResidualSums(quiet).tests().p_covariance > 0.001
     quiet.states[30, 2, 1] += 1e-4
     assert ResidualSums(quiet).tests().p_covariance == 0.0
-
-
-@pytest.mark.parametrize("tiny", [1e-4, 1e-6, 1e-9])
-def test_hardly_any_noise_is_no_alarm(tiny):
-    assert ResidualSums(observe(noise={"process": [1.0, 1.0, tiny]})).tests().p_covariance > 0.001
-
-
-def test_grounded_leaders_have_no_noise():
-    leaders = {"agents": [1], "gain": float("inf"), "reference": 2.0}
-    grounded = observe(leaders=leaders)
+    for tiny in (1e-4, 1e-6, 1e-9):
+        assert ResidualSums(observe(noise={"process": [1.0, 1.0, tiny]})).tests().p_covariance > 0.001
+    grounded = observe(leaders={"agents": [1], "gain": float("inf"), "reference": 2.0})
     tests = ResidualSums(grounded).tests()
     assert min(tests.p_covariance, tests.p_whiteness, tests.p_gain) > 0.001
     grounded.states[:, 0] += 0.01
     assert ResidualSums(grounded).tests().p_covariance == 0.0
-
-
-def test_without_noise_there_is_nothing_to_test():
     tests = ResidualSums(observe(noise={"process": 0.0})).tests()
     assert (tests.p_covariance, tests.p_whiteness, tests.p_gain) == (None, None, None)
 
@@ -140,12 +131,8 @@ def test_replicas_with_the_same_noise_are_found():
     assert ResidualSums(copied).tests().p_whiteness < 1e-6
 
 
-def path(transition, steps, seed, first=0):
-    random = np.random.default_rng(seed)
-    modes = [first]
-    for _ in range(steps - 1):
-        modes.append(int(random.choice(len(transition), p=transition[modes[-1]])))
-    return np.array(modes)
+def switching_test(modes: np.ndarray, transition: np.ndarray) -> SwitchingTest:
+    return Transitions.of(modes, len(transition)).test(transition)
 
 
 P = np.array([[0.9, 0.1], [0.3, 0.7]])
@@ -153,7 +140,7 @@ RARE = np.array([[0.97, 0.03, 0.0], [0.02, 0.97, 0.01], [0.05, 0.0, 0.95]])
 
 
 def test_counts_and_likelihood_ratio():
-    modes = path(P, 500, 1)
+    modes = chain_path(P, 500, 1)
     result = switching_test(modes, P)
     counts = np.zeros((2, 2))
     for a, b in pairwise(modes):
@@ -189,12 +176,12 @@ def test_simulated_counts_have_the_exact_means():
 
 def test_short_paths_give_uniform_p_values():
     """Kolmogorov-Smirnov at 1e-3 over 60 paths; discrete p-values only make it more cautious."""
-    p = [switching_test(path(RARE, 300, seed), RARE).p for seed in range(60)]
+    p = [switching_test(chain_path(RARE, 300, seed), RARE).p for seed in range(60)]
     assert stats.kstest(p, "uniform").pvalue > 1e-3
 
 
 def test_a_wrong_rate_is_found_in_short_and_long_paths():
     twice = np.array([[0.94, 0.06, 0.0], [0.04, 0.94, 0.02], [0.1, 0.0, 0.9]])
-    assert switching_test(path(twice, 1000, 4), RARE).p < 1e-3
-    assert switching_test(path(np.array([[0.8, 0.2], [0.3, 0.7]]), 1000, 5), P).p < 1e-6
+    assert switching_test(chain_path(twice, 1000, 4), RARE).p < 1e-3
+    assert switching_test(chain_path(np.array([[0.8, 0.2], [0.3, 0.7]]), 1000, 5), P).p < 1e-6
     assert switching_test(np.zeros(1000, dtype=int), np.array([[0.98, 0.02], [0.02, 0.98]])).p < 1e-4
