@@ -80,15 +80,7 @@ def read_graphml(key: str, file: Path) -> ForeignGraph:
 
     try:
         graph = nx.read_graphml(io.BytesIO(_content(key, file)))
-    except (
-        ParseError,
-        nx.NetworkXError,
-        ValueError,
-        KeyError,
-        StopIteration,
-        AttributeError,
-        TypeError,
-    ) as error:
+    except (ParseError, nx.NetworkXError, ValueError, KeyError, StopIteration, AttributeError, TypeError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise GraphError(problem(key, str(file), f"expected a GraphML file ({reason})", "export it again")) from error
     if not graph:
@@ -336,9 +328,7 @@ def link_problems(key: str, spec: GraphSpec, agents: int, names: Sequence[str] |
     kind = spec.kinds[0]
     largest = largest_label(spec)
     if largest > agents:
-        return [
-            problem(key, f"agent {largest}", f"expected agents 1 to {agents}", "correct it, or raise `agents`"),
-        ]
+        return [problem(key, f"agent {largest}", f"expected agents 1 to {agents}", "correct it, or raise `agents`")]
     found = []
     seen: set[tuple[int, int]] = set()
     for i, j, _ in links(spec, agents):

@@ -127,9 +127,7 @@ class GraphSpec(Section):
     path: list[Agent] | None = Field(None, min_length=2, description="agents along a line", examples=[[1, 2, 3]])
     cycle: list[Agent] | None = Field(None, min_length=3, description="agents around a ring", examples=[[1, 2, 3]])
     edges: Links | None = Field(
-        None,
-        description="undirected: [i, j] or [i, j, weight], weight 1 by default",
-        examples=[[[1, 2], [2, 3, 0.5]]],
+        None, description="undirected: [i, j] or [i, j, weight], weight 1 by default", examples=[[[1, 2], [2, 3, 0.5]]]
     )
     arcs: Links | None = Field(
         None,

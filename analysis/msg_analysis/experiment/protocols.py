@@ -209,8 +209,7 @@ class AgentProtocol:
     def step(self, k: int, mode: int, state: FloatArray, heard: Heard, noise: FloatArray) -> FloatArray:
         """State (S, R) after step k: see ``Protocol.step``."""
         return self._guard(
-            f"{self._agent}, step {k}",
-            lambda: _array(self._protocol.step(k, mode, state, heard, noise), state.shape),
+            f"{self._agent}, step {k}", lambda: _array(self._protocol.step(k, mode, state, heard, noise), state.shape)
         )
 
 

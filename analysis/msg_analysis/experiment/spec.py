@@ -81,9 +81,7 @@ class RunSpec(Section):
     """How long, how often and how to run."""
 
     dt: Positive = Field(
-        0.05,
-        description="simulated time of a step; 0.05 by default, always 1 in discrete time",
-        examples=[0.05],
+        0.05, description="simulated time of a step; 0.05 by default, always 1 in discrete time", examples=[0.05]
     )
     duration: Positive = Field(100.0, description="simulated time units, a whole number of steps", examples=[400.0])
     replicas: Count = Field(1, description="independent copies of every state under the same graphs", examples=[16])
@@ -113,8 +111,7 @@ class RunSpec(Section):
         examples=["best_effort"],
     )
     processes: Annotated[
-        str | int,
-        PlainValidator(_processes, json_schema_input_type=Literal["auto", "one_per_agent"] | Count),
+        str | int, PlainValidator(_processes, json_schema_input_type=Literal["auto", "one_per_agent"] | Count)
     ] = Field("auto", description="'auto', 'one_per_agent' or a number of processes", examples=["auto"])
 
     @property
@@ -130,9 +127,7 @@ class ExperimentSpec(Section):
     """A Markov switching network and a run of it."""
 
     name: str = Field(
-        pattern="^[a-z][a-z0-9_]*$",
-        description="a name for bags and topics, [a-z][a-z0-9_]*",
-        examples=["line_ring"],
+        pattern="^[a-z][a-z0-9_]*$", description="a name for bags and topics, [a-z][a-z0-9_]*", examples=["line_ring"]
     )
     problem: Literal["consensus", "tracking"] = Field(
         "consensus", description="agree with each other, or follow leaders", examples=["consensus"]

@@ -52,10 +52,7 @@ def chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tupl
     key = given[0]
     if (key == "transition") != (time == "discrete"):
         line = problem(
-            f"switching.{key}",
-            f"given in {time} time",
-            f"expected {wanted}",
-            f"give {wanted}, or change `time`",
+            f"switching.{key}", f"given in {time} time", f"expected {wanted}", f"give {wanted}, or change `time`"
         )
         return None, [*found, line]
     if switching.scale != 1.0 and key != "rates":
@@ -85,10 +82,7 @@ def _from_rates(
     index = {name: mode for mode, name in enumerate(names)}
     matrix = np.zeros((len(names), len(names)))
     for source, row in rates.items():
-        for name, key in [
-            (source, "switching.rates"),
-            *((target, f"switching.rates.{source}") for target in row),
-        ]:
+        for name, key in [(source, "switching.rates"), *((target, f"switching.rates.{source}") for target in row)]:
             if name not in index:
                 wanted = f"expected one of the graphs {', '.join(names)}"
                 found.append(problem(f"{key}.{name}", "unknown graph", wanted, "correct the name"))

@@ -300,12 +300,7 @@ def sequential(step: StepModel, phase: FloatArray) -> StepModel:
         offsets[:, i] = step.offsets[:, i] + np.einsum("nj,nj->n", new[:, done], offsets[:, done])
         done[i] = True
     return dataclasses.replace(
-        step,
-        weights=weights,
-        nominal=weights,
-        offsets=offsets,
-        noise_gain=gain,
-        noise=gain @ gain.transpose(0, 2, 1),
+        step, weights=weights, nominal=weights, offsets=offsets, noise_gain=gain, noise=gain @ gain.transpose(0, 2, 1)
     )
 
 

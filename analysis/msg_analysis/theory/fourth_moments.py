@@ -57,20 +57,7 @@ class RandomSteps:
 
 
 def random_steps(step: StepModel, system: JumpSystem) -> RandomSteps:
-    """The steps of ``system``, which ``jump_system.emulated`` made of ``step``.
-
-    Parameters
-    ----------
-    step
-        in real time that of the sequential law
-    system
-        its reduced system, whose coordinates y are used
-
-    Raises
-    ------
-    InputError
-        as of ``message_steps``
-    """
+    """The steps of ``system``, made of ``step`` by ``jump_system.emulated``, in its coordinates y."""
     if step.by_message:
         whole = message_steps(step)
         embedding = np.zeros((whole.entries, system.dimension))
@@ -109,22 +96,12 @@ ROUNDING = 1e-12  # of sums of rows
 
 @dataclass(frozen=True, slots=True)
 class FourthMoment:
-    """Spectral radius of the map of the fourth moments over a step, and what follows from it; None: not known.
+    """Spectral radius of the map of the fourth moments over a step, and what follows from it; None: not known."""
 
-    Attributes
-    ----------
-    radius
-        exact
-    lower, upper
-        bounds of it, equal to ``radius`` where that is known
-    finite
-        whether the fourth moments of the states are finite in the steady state
-    """
-
-    radius: float | None
-    lower: float | None
+    radius: float | None  # exact
+    lower: float | None  # bounds of it, equal to ``radius`` where that is known
     upper: float | None
-    finite: bool | None
+    finite: bool | None  # whether the fourth moments of the states are finite in the steady state
 
     @classmethod
     def between(cls, lower: float | None, upper: float | None) -> FourthMoment:
@@ -147,14 +124,7 @@ def fourth_moment(step: StepModel, system: JumpSystem) -> FourthMoment:
     Otherwise bounded: from below by r^2, r the radius of the second moments, since E[a^4] >= E[a^2]^2. From above by r
     where every agent takes a mean with weights that are not negative: then no step, whatever is lost, makes the largest
     difference between agents (or deviation from the reference) larger, so that E[a(k)^4] <= a(0)^2 E[a(k)^2]. Without
-    losses also by ``lyapunov_bound``.
-
-    Parameters
-    ----------
-    step
-        in real time that of the sequential law
-    system
-        its reduced system, with finite second moments
+    losses also by ``lyapunov_bound``. ``step``: in real time that of the sequential law; ``system``: reduced.
     """
     means = bool((step.nominal >= 0.0).all() and (step.nominal.sum(axis=2) <= 1.0 + ROUNDING).all())
     steps = _affordable(step, system, SMALL_WORK if means else MAX_WORK)
@@ -169,13 +139,9 @@ def fourth_moment(step: StepModel, system: JumpSystem) -> FourthMoment:
 
 
 def fourth_radius(steps: RandomSteps) -> float | None:
-    """Spectral radius of the map of the fourth moments, by Arnoldi on tensors (n, d, d, d, d); None: not found.
-
-    The map is positive, so no other eigenvalue is larger in size.
-    """
+    """Spectral radius of the map of the fourth moments, by Arnoldi on tensors (n, d, d, d, d); None: not found."""
     n, d = steps.shape
-    form = np.eye(d)
-    start = _symmetric(np.multiply.outer(form, form))
+    start = _symmetric(np.multiply.outer(np.eye(d), np.eye(d)))
     return _positive_radius(lambda stack: advance(steps, stack), np.broadcast_to(start, (n, d, d, d, d)))
 
 
@@ -189,10 +155,7 @@ def second_radius(system: JumpSystem) -> float | None:
 
 
 def advance(steps: RandomSteps, stack: FloatArray) -> FloatArray:
-    """(n, d, d, d, d): the symmetric tensors S_j one step later, without noise.
-
-    ``stack`` are S_i (n, d, d, d, d) = E[y y y y; mode i].
-    """
+    """(n, d, d, d, d): the symmetric tensors S_i = E[y y y y; mode i], ``stack``, one step later, without noise."""
     after = np.empty_like(stack)
     embedding = steps.embedding
     for mode, stages in enumerate(steps.stages):
@@ -282,7 +245,7 @@ def _symmetric(tensor: FloatArray) -> FloatArray:
 
 def _positive_radius(after: Callable[[FloatArray], FloatArray], start: FloatArray) -> float | None:
     """Largest eigenvalue in size of a positive map of stacks of this shape; None: not found."""
-    size = start.size
+    size = start.size  # since the map is positive, no other eigenvalue is larger
     if not np.any(after(start)):
         return 0.0
     if size <= 4:

@@ -8,7 +8,7 @@ The errors and certainties themselves are properties of ``prediction.Moments``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,10 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphIndices:
-    """Indices of one undirected connected graph from its effective resistances r_uv (Klein and Randić 1993).
-
-    Edge weights are conductances.
-    """
+    """Indices of one undirected connected graph from its effective resistances r_uv; edge weights are conductances."""
 
     name: str
     # Sum of r_uv over pairs, m tr(L^+) (Klein and Randić 1993): 2 m times the system error of the graph with F = I.
@@ -40,18 +37,11 @@ class GraphIndices:
 
     def to_json(self) -> dict[str, Any]:
         """The document of one graph."""
-        return {
-            "name": self.name,
-            "kirchhoff_index": self.kirchhoff_index,
-            "information_centrality": self.information_centrality.tolist(),
-        }
+        return asdict(self) | {"information_centrality": self.information_centrality.tolist()}
 
 
 def algebraic_connectivity(graph: Graph) -> float:
-    """Second smallest real part of the Laplacian's eigenvalues, at least 0: the rate of agreement under this graph.
-
-    Fiedler, Czechoslovak Mathematical Journal 1973.
-    """
+    """Second smallest real part of the Laplacian's eigenvalues, at least 0: the rate of agreement (Fiedler 1973)."""
     laplacian = graph.laplacian
     values = np.linalg.eigvalsh(laplacian) if graph.symmetric else np.linalg.eigvals(laplacian)
     return max(float(np.sort(values.real)[1]), 0.0)
@@ -73,28 +63,20 @@ def graph_indices(graph: Graph) -> GraphIndices | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bounds:
-    """Bounds of the system error for a given stationary law, whatever the rates (docs/theory.md, "Bounds").
+    """Bounds of the system error for a given stationary law, whatever the rates (docs/theory.md, "Bounds")."""
 
-    Attributes
-    ----------
-    lower
-        error of the averaged graph; None where it is not a bound
-    upper
-        static baseline: mean error of the graphs held fixed; None where it is not a bound, or is infinite
-    note
-        why there are these bounds and no others
-    """
-
-    lower: float | None
-    upper: float | None
-    note: str
+    lower: float | None  # error of the averaged graph; None where it is not a bound
+    upper: float | None  # static baseline: mean error of the graphs held fixed; None where it is no bound, or infinite
+    note: str  # why there are these bounds and no others
 
     def to_json(self) -> dict[str, Any]:
         """The document."""
-        return {"lower": self.lower, "upper": self.upper, "note": self.note}
+        return asdict(self)
 
-
-_NO_BOUNDS = "the averaged graph and the graphs held fixed give no bounds here: "
+    @classmethod
+    def none(cls, reason: str) -> Bounds:
+        """No bounds."""
+        return cls(None, None, f"the averaged graph and the graphs held fixed give no bounds here: {reason}")
 
 
 def error_bounds(prediction: Prediction) -> Bounds:
@@ -116,39 +98,31 @@ def error_bounds(prediction: Prediction) -> Bounds:
     """
     experiment = prediction.experiment
     if experiment.protocol:
-        return Bounds(None, None, _NO_BOUNDS + "they belong to the built-in law, not to a protocol")
-    if experiment.time == "continuous":
-        if prediction.continuous_moments is None:
-            return Bounds(None, None, _NO_BOUNDS + "they belong to the law without noise on the air, loss or delay")
-        system = systems.continuous(experiment)
-    else:
-        system = prediction.system
+        return Bounds.none("they belong to the built-in law, not to a protocol")
+    if experiment.time == "continuous" and prediction.continuous_moments is None:
+        return Bounds.none("they belong to the law without noise on the air, loss or delay")
+    system = systems.continuous(experiment) if experiment.time == "continuous" else prediction.system
     if not all(graph.symmetric for graph in experiment.graph_list):
-        return Bounds(None, None, _NO_BOUNDS + "a graph is directed")
+        return Bounds.none("a graph is directed")
     if not _equal_noise(system):
-        return Bounds(None, None, _NO_BOUNDS + "the noise is not the same, and independent, for every agent")
+        return Bounds.none("the noise is not the same, and independent, for every agent")
     upper = prediction.static.system_error if prediction.static_moments else None
     if system.time == "discrete":
         return Bounds(None, upper, "undirected graphs and equal noise: E is at most that of the graphs held fixed")
+    # The limit of infinitely fast switching, averaged over pi.
+    averaged = replace(
+        system,
+        matrices=np.tensordot(system.stationary, system.matrices, axes=1)[None],
+        noise=np.tensordot(system.stationary, system.noise, axes=1)[None],
+        chain=np.zeros((1, 1)),
+        stationary=np.ones(1),
+    )
     try:
-        lower = float(np.trace(MomentSolver(averaged(system)).steady()[0]))
+        lower = float(np.trace(MomentSolver(averaged).steady()[0]))
     except InputError:  # connected, but so weakly that rounding hides it
         lower = None
     note = "undirected graphs and equal noise: E lies between the averaged graph and the graphs held fixed"
     return Bounds(lower, upper, note)
-
-
-def averaged(system: JumpSystem) -> JumpSystem:
-    """The limit of infinitely fast switching in continuous time, averaged over pi (docs/theory.md, "Bounds")."""
-    weights = system.stationary[:, None, None]
-    return JumpSystem(
-        time=system.time,
-        matrices=(weights * system.matrices).sum(axis=0)[None],
-        noise=(weights * system.noise).sum(axis=0)[None],
-        chain=np.zeros((1, 1)),
-        stationary=np.ones(1),
-        lift=system.lift,
-    )
 
 
 def _equal_noise(system: JumpSystem) -> bool:

@@ -3,7 +3,7 @@
 
 """Leaders: what a set of them is worth (joint robustness centrality), and which set is best.
 
-After Section 4 of the paper, "Robustness and leadership indices"; docs/leaders.md has the proofs and bounds.
+After Section 4 of the paper, "Robustness and leadership indices"; docs/leader_theory.md has the proofs and bounds.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class LeaderProblem:
 
     @cached_property
     def doubt(self) -> str | None:
-        """Why supermodularity is not known; None where it is (docs/leaders.md, "Supermodularity").
+        """Why supermodularity is not known; None where it is (docs/leader_theory.md, "Supermodularity").
 
         E(S) sums, over pairs of walkers that start at one agent and see the same graphs, the noise covariance between
         the agents where they are, until a leader absorbs one of them. With entries >= 0 in every factor this is a
@@ -88,24 +88,18 @@ class LeaderProblem:
         """Number of agents that no leader (from 0) reaches in the union of all graphs; E is finite only if it is 0."""
         return int((~self._reach[sorted(leaders)].any(axis=0)).sum())
 
-    def system(self, leaders: Leaders) -> JumpSystem:
-        """The reduced system with these leaders; infinite gain deletes them (continuous time) or zeroes their rows."""
-        return self._system(leaders, self.gain)
-
     def system_error(self, leaders: Leaders) -> float:
-        """E(S), the sum of the mean-square deviations from the reference; inf where S does not reach all agents.
-
-        1/E(S) at infinite gain is the joint robustness centrality of S (Section 4 of the paper).
-        """
+        """E(S), the sum of the mean-square deviations from the reference; inf where S does not reach all agents."""
         if not leaders or self.unreached(leaders):
             return math.inf
-        system = self.system(leaders)
+        system = self._system(leaders, self.gain)
         if system.dimension == 0:
             return 0.0
         steady = MomentSolver(system).steady()
         return float(np.trace(system.lifted(steady.sum(axis=0))))
 
     def _system(self, leaders: Leaders, gain: float) -> JumpSystem:
+        """The reduced system with these leaders; infinite gain deletes them (continuous time) or zeroes their rows."""
         spec = LeadersSpec.model_construct(agents=[agent + 1 for agent in sorted(leaders)], gain=gain, reference=0.0)
         changes = {"problem": "tracking", "leaders": spec}
         led = dataclasses.replace(self.experiment, spec=self.experiment.spec.model_copy(update=changes))
@@ -254,11 +248,7 @@ def select_leaders(
     top: int = 10,
     watch: SearchProgress = ignore,
 ) -> Selection:
-    """The set of leaders with the least system error, or a good one; arguments as in ``Experiment.leaders``.
-
-    docs/leaders.md, "Search methods". InputError: impossible count, gain or law; too many sets, or none that reaches
-    all agents.
-    """
+    """The set of leaders with the least system error, or a good one; arguments and errors of ``Experiment.leaders``."""
     _check(method in get_args(SearchMethod), f"method {method}: expected one of {', '.join(get_args(SearchMethod))}")
     own = experiment.spec.leaders
     leading = tuple(int(agent) for agent in np.flatnonzero(experiment.leader_gains))
@@ -288,8 +278,7 @@ def select_leaders(
             bound = search.bound(frozenset(order))
         found = search.evaluated(count, top)
     _check(
-        bool(found),
-        f"count {count}: no set of {count} reaches all agents in the union of all graphs: use more leaders",
+        bool(found), f"count {count}: no set of {count} reaches all agents in the union of all graphs: use more leaders"
     )
     if chosen_method == "exhaustive" or count == 1:  # a single leader: all of them were evaluated
         bound = found[0][0]

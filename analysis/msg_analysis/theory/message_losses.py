@@ -26,14 +26,7 @@ from msg_analysis.common.arrays import BoolArray, FloatArray
 def lost(lift: FloatArray, variance: FloatArray, moments: FloatArray) -> FloatArray:
     """(..., n, d, d): sum_ij variance_ij <(e_i - e_j)(e_i - e_j)^T, C> e_i e_i^T in reduced coordinates.
 
-    Parameters
-    ----------
-    lift
-        (k, d), see ``JumpSystem``; k = m without delay
-    variance
-        (n, k, k), or (k, k) for one graph; see ``StepModel.loss_variance``
-    moments
-        (..., n, d, d) symmetric C
+    ``lift``: (k, d), see ``JumpSystem``; ``variance``: (n, k, k), see ``StepModel``; ``moments``: symmetric C.
     """
     full = lift @ moments @ lift.T
     own = np.diagonal(full, axis1=-2, axis2=-1)
@@ -43,10 +36,7 @@ def lost(lift: FloatArray, variance: FloatArray, moments: FloatArray) -> FloatAr
 
 
 def lost_adjoint(lift: FloatArray, variance: FloatArray, forms: FloatArray) -> FloatArray:
-    """(..., n, d, d): sum_ij variance_ij <e_i e_i^T, Y> (e_i - e_j)(e_i - e_j)^T in reduced coordinates.
-
-    The adjoint of ``lost``, with the same arguments; ``forms``: (..., n, d, d) symmetric Y.
-    """
+    """(..., n, d, d): sum_ij variance_ij <e_i e_i^T, Y> (e_i - e_j)(e_i - e_j)^T, the adjoint of ``lost``."""
     seen = variance * ((lift @ forms) * lift).sum(axis=-1)[..., None]
     laplacian = -(seen + seen.swapaxes(-1, -2))
     laplacian += np.eye(len(lift)) * (seen.sum(axis=-1) + seen.sum(axis=-2))[..., None]

@@ -111,19 +111,13 @@ class Transient:
 
 
 def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | None = None) -> Snapshot:
-    """Agents at a known place, independent of the graph.
-
-    ``deviation``: (m,) x(0) - (what x should be), in consensus x(0); ``law``: (n,) of g(0), by default stationary.
-    """
+    """Agents at a known place (m,), x(0) or its deviation from the reference; ``law``: (n,) of g(0), or stationary."""
     law = system.stationary if law is None else law
     return Snapshot(law, np.multiply.outer(law, system.reduced(deviation)), system.started(deviation[None], law))
 
 
 def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray) -> Snapshot:
-    """The start that ``run.start`` and ``switching.initial`` define, for one of the experiment's laws.
-
-    ``stationary``: (n, d, d) second moments for ``run.start: stationary``.
-    """
+    """The start that the experiment defines, for one of its laws; ``stationary``: (n, d, d) steady second moments."""
     law = system.stationary
     if experiment.switching.initial != "stationary":
         law = system.of_modes(
@@ -178,10 +172,7 @@ def solve_transient(
 
 
 def unreduced_consensus(experiment: Experiment) -> JumpSystem:
-    """Consensus in continuous time with the mean of the agents included: its second moments grow without bound.
-
-    Proposition 1 of the paper with Z_i = L_i. In steps, ``systems.emulated(step, "tracking")`` reduces nothing either.
-    """
+    """Consensus in continuous time with the mean of the agents, which grows: Proposition 1 of the paper, Z_i = L_i."""
     gain = experiment.noise_gain
     drift = np.stack([graph.laplacian for graph in experiment.graph_list])
     return JumpSystem(
@@ -208,24 +199,9 @@ def transient(
         discrete:   nu(k+1) = H nu(k), C_i(k+1) = sum_j P_ji (K_j[C_j] + pi_j(k) N_j),   pi(k+1) = P^T pi(k)
 
     With a steady state the distance to it is propagated, so that it is reached exactly, however long the time.
-
-    Parameters
-    ----------
-    system
-        continuous or discrete time
-    start
-        at time 0
-    times
-        (T,) >= 0, ascending; units of time, or whole numbers of steps
-    steady
-        (n, d, d) of ``MomentSolver(system).steady()``; None where there is no steady state
-    most_unknowns
-        up to which the joint equations are propagated as a whole
-
-    Raises
-    ------
-    InputError
-        times not usable, or too large
+    ``times``: (T,) >= 0, ascending; units of time, or whole numbers of steps. ``steady``: (n, d, d); None: there is
+    none. ``most_unknowns``: up to which the joint equations are propagated as a whole. InputError: wrong times, or too
+    large.
     """
     times = np.asarray(times, dtype=float)
     _check_times(system, times)
@@ -240,18 +216,10 @@ def unknowns(system: JumpSystem) -> int:
 
 
 def joint_flow(
-    system: JumpSystem,
-    stack: FloatArray,
-    slow: Callable[[], float],
-    *,
-    decays: bool,
-    most_unknowns: int = MAX_UNKNOWNS,
+    system: JumpSystem, stack: FloatArray, slow: Callable[[], float], *, decays: bool, most_unknowns: int = MAX_UNKNOWNS
 ) -> Flow:
-    """The flow of the joint equations for one ``joint_stack`` (n, p + 1): reduced for it where they are large.
-
-    ``slow`` gives the slowest rate of interest [1 / unit of time]; ``decays``: the stack is a distance from the steady
-    state.
-    """
+    """The flow of the joint equations for one ``joint_stack`` (n, p + 1): reduced for it where they are large."""
+    # slow gives the slowest rate of interest [1 / unit of time]; decays: the stack is a distance from the steady state.
     if unknowns(system) <= most_unknowns:
         return second_moment_propagator(system)
     return RationalFlow(system, stack, slow(), decays=decays)

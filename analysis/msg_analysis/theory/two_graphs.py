@@ -67,17 +67,7 @@ def two_topology(system: JumpSystem) -> TwoTopology:
     These are Propositions 4 and 5 of the paper, with pi_1 pi_2 (I / beta + Omega)^-1 for alpha (I + beta Omega)^-1,
     which is the same without overflow, and right for every beta > 0. In discrete time, with S_i: C -> C - K_i[C] and
     beta = P_12 + P_21, Omega - I takes the place of Omega. The differences are computed from S_2 - S_1, without
-    cancellation.
-
-    Parameters
-    ----------
-    system
-        two modes; continuous or discrete time, consensus or tracking, any noise and loss
-
-    Raises
-    ------
-    InputError
-        not two graphs, too many agents, or a graph without a steady error of its own
+    cancellation. InputError: not two graphs, too many agents, or a graph without a steady error of its own.
     """
     if system.modes != 2:
         raise InputError(f"two-topology form: {system.modes} graphs, expected 2: use predict")

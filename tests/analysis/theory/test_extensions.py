@@ -18,6 +18,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.model.step_model import build_step_model
 from msg_analysis.theory.jump_system import emulated, held
 from msg_analysis.theory.moments import MomentSolver, transient_mean
+from msg_analysis.theory.solvers import DenseSolver
 
 MODELS = settings(max_examples=40, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
@@ -192,7 +193,7 @@ def test_steps_with_everything_are_those_of_brute_force(seed):
     scale = np.abs(expected).max()
     np.testing.assert_allclose(prediction.emulated.by_mode, expected, rtol=1e-7, atol=1e-8 * scale)
     np.testing.assert_allclose(prediction.emulated.covariance, expected.sum(axis=0), rtol=1e-7, atol=1e-8 * scale)
-    dense = MomentSolver(prediction.system, method="dense").steady()
+    dense = DenseSolver(prediction.system).steady()
     np.testing.assert_allclose(prediction.system.lifted(dense), expected, rtol=1e-7, atol=1e-8 * scale)
     json.dumps(prediction.to_json(), allow_nan=False)
 

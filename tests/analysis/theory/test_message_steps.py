@@ -1,6 +1,3 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """Messages one by one: held values, agents one after the other, bursts; against brute force, nothing reduced.
 
 The oracle is built from the document of the experiment alone. It makes a period message by message, on vectors of
@@ -33,9 +30,9 @@ from msg_analysis.theory.fourth_moments import (
     second_radius,
 )
 from msg_analysis.theory.leaders import select_leaders, system_error
-from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import stationary_start_factor
 from msg_analysis.theory.settling import asymptotic_rates
+from msg_analysis.theory.solvers import DenseSolver, IterativeSolver
 from msg_analysis.theory.transient import solve_transient
 from msg_analysis.theory.two_graphs import two_topology
 
@@ -303,11 +300,10 @@ def test_longer_bursts_of_a_held_value_are_worse():
 def test_dense_and_iterative_solutions_and_their_adjoint(case):
     prediction = predict(parse(case))
     system = prediction.system
-    dense = MomentSolver(system, method="dense")
-    steady = dense.steady()
-    np.testing.assert_allclose(steady, prediction.steady, rtol=1e-8, atol=1e-10)
+    dense = DenseSolver(system)
+    np.testing.assert_allclose(dense.steady(), prediction.steady, rtol=1e-8, atol=1e-10)
     form = system.output.T @ system.output
-    for solver in (dense, MomentSolver(system, method="krylov")):
+    for solver in (dense, IterativeSolver(system)):
         dual = solver.dual(form[None])[0]
         value = np.einsum("i,ij,jab,iab->", system.stationary, system.chain, dual, system.noise)
         assert value == pytest.approx(prediction.emulated.system_error, rel=1e-9)

@@ -8,8 +8,8 @@ from switching_systems import generator
 from switching_systems import system as switching
 
 from msg_analysis.errors import InputError
-from msg_analysis.theory import moments, solvers
 from msg_analysis.theory.moments import MomentSolver, mode_potential
+from msg_analysis.theory.solvers import DenseSolver
 
 MODELS = settings(max_examples=25, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
@@ -60,21 +60,20 @@ def test_poisson_equation(seed, m, n):
         assert now - after == pytest.approx(y @ form @ y - means[0], rel=1e-8, abs=1e-8)
 
 
-def test_too_large_says_the_size(monkeypatch):
-    monkeypatch.setattr(solvers, "MAX_UNKNOWNS", 10)
+def test_too_large_says_the_size():
     system = switching(np.random.default_rng(8), 4, generator(np.random.default_rng(9), 2))
-    with pytest.raises(InputError, match="2 graphs of 4 agents give 12 coupled unknowns"):
-        MomentSolver(system, method="dense")
+    with pytest.raises(InputError, match=r"2 graphs of 4 agents give 12 coupled unknowns.* at most 11 are"):
+        DenseSolver(system, most_unknowns=11)
+    DenseSolver(system, most_unknowns=12)
 
 
-def test_adjoint_solutions_are_kept_while_they_are_small(monkeypatch):
+def test_adjoint_solutions_are_kept_while_they_are_small():
     system = switching(np.random.default_rng(8), 4, generator(np.random.default_rng(9), 2))
-    solver = MomentSolver(system)
+    solver = MomentSolver(system, most_kept=2 * 2 * 3 * 3)
     one, other = np.eye(3)[None], np.diag([1.0, 2.0, 3.0])[None]
     first, second = solver.dual(one), solver.dual(other)
     assert solver.dual(one.copy()) is first
     assert not first.flags.writeable
-    monkeypatch.setattr(moments, "MAX_KEPT", first.size + second.size)
     third = solver.dual(one + other)
     assert solver.dual(other) is second
     assert solver.dual(one + other) is not third

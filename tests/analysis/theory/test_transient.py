@@ -14,7 +14,8 @@ from switching_systems import LINE_RING, network, steady_of
 from experiments import Experiment, predict
 from msg_analysis.errors import InputError
 from msg_analysis.theory import jump_system as systems
-from msg_analysis.theory import rational_krylov, transient
+from msg_analysis.theory import transient
+from msg_analysis.theory.rational_krylov import RationalFlow
 from msg_analysis.theory.settling import asymptotic_rates, settling_time
 from msg_analysis.theory.transient import point_start, start_of, unreduced_consensus
 
@@ -234,12 +235,11 @@ def test_delay_and_loss():
     np.testing.assert_allclose(found.node_errors[2], prediction.emulated.node_errors, rtol=1e-10)
 
 
-def test_memory_of_large_systems(monkeypatch):
+def test_memory_of_large_systems():
     system = systems.continuous(Experiment.parse(LINE_RING))
-    monkeypatch.setattr(rational_krylov, "MAX_BYTES", 1.0)
-    start, steady = point_start(system, np.zeros(5)), steady_of(system)
-    with pytest.raises(InputError, match="GB in continuous time"):
-        transient.transient(system, start, np.array([1.0]), steady, most_unknowns=1)
+    stack = transient.joint_stack(point_start(system, np.zeros(5)))
+    with pytest.raises(InputError, match=r"2 graphs of 5 agents need 0.0 GB in continuous time"):
+        RationalFlow(system, stack, 1.0, decays=False, most_bytes=1.0)
 
 
 def test_what_is_refused():
