@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.model.phases import phases
 from msg_analysis.model.run import Run
-from msg_analysis.model.step_model import StepModel
+from msg_analysis.model.step_model import StepModel, phases
 
 BLOCK = 256
 PROCESS, BROADCAST, LINK, LOSS = 3, 4, 5, 6  # numbers of the streams

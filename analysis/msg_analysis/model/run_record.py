@@ -81,44 +81,20 @@ def _now() -> datetime.datetime:
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """One run of an experiment.
+    """One run of an experiment."""
 
-    Start and matrices are computed once, when the record is made: every process, the twin and the check use the same
-    numbers, whatever their machines.
-
-    Attributes
-    ----------
-    run
-        run id
-    experiment
-        what is run
-    start
-        (m, width) x(0)
-    versions
-        versions of the software that started the run, and the machine that it was started on
-    matrices
-        of a step, in discrete time or of a linear protocol; else None: they follow from the experiment
-    key
-        with which the nodes sign what steers the run: see ``wire.signatures``; None where it is not known, in bags for
-        example, or not used
-    started
-        when the record was made
-    until
-        when the run may end before its duration; None: it does not
-    planned
-        number of steps that were planned, of a run that has ended before: ``experiment`` has those that it made. None
-        otherwise
-    """
+    # Start and matrices are computed once, when the record is made: every process, the twin and the check use the same
+    # numbers, whatever their machines.
 
     run: uuid.UUID
     experiment: Experiment
-    start: FloatArray
-    versions: dict[str, str] = field(default_factory=software_versions)
-    matrices: StepMatrices | None = None
-    key: bytes | None = field(default=None, repr=False)
+    start: FloatArray  # (m, width) x(0)
+    versions: dict[str, str] = field(default_factory=software_versions)  # of the software that started the run
+    matrices: StepMatrices | None = None  # in discrete time or of a linear protocol; else the experiment gives them
+    key: bytes | None = field(default=None, repr=False)  # with which nodes sign what steers the run; not in bags
     started: datetime.datetime = field(default_factory=_now)
-    until: Until | None = None
-    planned: int | None = None
+    until: Until | None = None  # when the run may end before its duration
+    planned: int | None = None  # steps that were planned, of a run that has ended before: ``experiment`` has those made
 
     @cached_property
     def model(self) -> Wiring:
@@ -127,13 +103,7 @@ class RunRecord:
 
     @property
     def step_model(self) -> StepModel:
-        """What a step of this run does, if its law is linear.
-
-        Raises
-        ------
-        InputError
-            the experiment has a protocol that is not linear, or not here
-        """
+        """What a step of this run does. InputError: it has a protocol that is not linear, or not here."""
         return self.model if isinstance(self.model, StepModel) else build_step_model(self.experiment)
 
     @property
@@ -176,20 +146,7 @@ class RunRecord:
 
     @classmethod
     def from_json(cls, text: str, source: str) -> RunRecord:
-        """Read a run record.
-
-        Parameters
-        ----------
-        text
-            what ``to_json`` wrote
-        source
-            where it came from, for messages
-
-        Raises
-        ------
-        InputError
-            not a run record, of another format, or with an invalid experiment in it
-        """
+        """Read what ``to_json`` wrote; ``source`` is for messages. InputError: it is something else, or not valid."""
         try:
             document: Any = json.loads(text)
             if document["format"] != FORMAT:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GraphIndices:
-    """Indices of one undirected connected graph from its effective resistances r_uv; edge weights are conductances."""
+    """Indices of one undirected connected graph from its resistances r_uv (Klein and Randić 1993), weights 1 / r."""
 
     name: str
     # Sum of r_uv over pairs, m tr(L^+) (Klein and Randić 1993): 2 m times the system error of the graph with F = I.

@@ -17,8 +17,7 @@ from tests.support.switching_systems import LINE_RING, steady_of
 
 from experiments import Experiment, line_ring, predict
 from msg_analysis.errors import InputError
-from msg_analysis.model.phases import phases
-from msg_analysis.model.step_model import build_run_model, build_step_model
+from msg_analysis.model.step_model import build_run_model, build_step_model, phases
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.fourth_moments import (
     FourthMoment,

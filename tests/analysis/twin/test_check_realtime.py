@@ -11,11 +11,9 @@ import pytest
 from experiments import Completeness, Experiment, Run, check, flipped, new_record, stored
 from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK
 from msg_analysis.arithmetic.update_law import from_payload, to_payload
-from msg_analysis.model.agent_law import agent_law
+from msg_analysis.model.agent_law import ProcessNoise, agent_law
 from msg_analysis.model.graph_path import mode_path
-from msg_analysis.model.phases import phases
-from msg_analysis.model.process_noise import ProcessNoise
-from msg_analysis.model.step_model import build_step_model
+from msg_analysis.model.step_model import build_step_model, phases
 from msg_analysis.twin.log_replay import replay
 
 DT = 50_000_000  # ns

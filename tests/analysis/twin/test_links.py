@@ -11,8 +11,8 @@ from links_by_hand import assert_by_hand
 
 from experiments import Experiment, Run, check, claimed, predict, simulate, stored
 from msg_analysis.model.agent_law import agent_law
-from msg_analysis.model.phases import phases
 from msg_analysis.model.reception import LOST
+from msg_analysis.model.step_model import phases
 from msg_analysis.report.documents import describe_transient
 
 BY_LINK = {"default": 0.1, "edges": [[2, 3, 0.6]], "arcs": [[1, 2, 0.0], [2, 1, 0.8]]}
