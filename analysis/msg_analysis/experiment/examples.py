@@ -44,11 +44,8 @@ def shows(name: str) -> str:
 
 
 def find(given: str | Path, folder: Path = Path()) -> Path:
-    """The file of an experiment: ``given``, relative to ``folder``, or the example of this name.
-
-    A file wins over an example, also ``given`` with the ending .yaml. What has a slash or an ending is a path, which
-    is not checked here. InputError: neither file nor example.
-    """
+    """The file of an experiment: ``given``, relative to ``folder``, or an example. InputError: neither."""
+    # A file wins over an example, also with the ending .yaml. What has a slash or an ending is a path, not checked.
     word = str(given)
     path = folder / word
     if os.sep in word or (path.exists() and not path.is_dir()):

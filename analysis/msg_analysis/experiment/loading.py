@@ -20,7 +20,7 @@ from msg_analysis.common.files import SAFE_LOADER, load_yaml, read_text
 from msg_analysis.common.text import listed
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import graph_sources, protocols, validation
-from msg_analysis.experiment.graph_sources import ForeignGraph, GraphError, is_networkx
+from msg_analysis.experiment.graph_sources import ForeignGraph, GraphError
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
 from msg_analysis.experiment.network_spec import GraphSpec, NoiseSpec
@@ -121,11 +121,7 @@ def other_kind(mapping: Mapping[Any, Any], wanted: str) -> str | None:
 
 
 def read_yaml(path: Path) -> Any:
-    """The content of a YAML (or JSON) file in UTF-8.
-
-    InputError, with file and (if known) line: the file cannot be read, is not YAML in UTF-8, is too large or too deep,
-    or has a key twice.
-    """
+    """The content of a YAML (or JSON) file in UTF-8. InputError: it cannot be read, or is something else."""
     if is_bag(path):
         raise InputError(f"{path}: is a bag: {_NOT_A_BAG}")
     try:
@@ -159,10 +155,8 @@ _MATRICES_PER_GRAPH = 8  # adjacency, W, its coupling, F, B, N, the variance of 
 def memory_needed(
     agents: int, modes: int, steps: int, replicas: int, delay: int = 0, truth: bool = False
 ) -> tuple[int, int]:
-    """Bytes for the states of a run, and for the matrices of all graphs; ``replicas``: numbers in an agent's state.
-
-    A delay [steps] makes the matrices larger. With ``truth``, states are kept twice: as they are and as published.
-    """
+    """Bytes for the states of a run, and for the matrices of all graphs; ``replicas``: numbers in an agent's state."""
+    # A delay [steps] makes the matrices larger. With truth, states are kept twice: as they are and as published.
     states = (steps + 1) * agents * replicas * 8 * (2 if truth else 1)
     return states, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
 
@@ -221,37 +215,23 @@ def _section(key: str, mapping: Mapping[Any, Any]) -> Any:
 _OWN_WEIGHTS = ("path", "cycle", "star", "grid", "complete")  # kinds of graphs that a ``weight`` may stand beside
 
 
-def _graphs_of_networkx(mapping: Mapping[Any, Any]) -> tuple[dict[str, Any], Mapping[Any, Any]]:
-    """The graphs of networkx in a document, by name, and the document with empty graphs in their places."""
-    graphs = mapping.get("graphs")
-    if not isinstance(graphs, Mapping):
-        return {}, mapping
-    found = {name: graph for name, graph in graphs.items() if is_networkx(graph)}
-    if not found:
-        return {}, mapping
-    return found, {**mapping, "graphs": {**graphs, **{name: {"edges": []} for name in found}}}
-
-
 class Sections:
-    """A document that is being checked: a section is None as long as it is not known to be valid.
-
-    ``recorded``: protocol of a recorded run, which need not be installed.
-    """
+    """A document that is being checked: a section is None as long as it is not known to be valid."""
 
     def __init__(self, mapping: Mapping[Any, Any], recorded: ProtocolInfo | None = None) -> None:
         self.problems: list[str] = []
-        self._networkx, mapping = _graphs_of_networkx(graph_sources.plain_document(mapping))
+        document, self._networkx = graph_sources.plain_document(mapping)
         self._foreign: dict[str, ForeignGraph] = {}  # read, but not numbered yet
         self._named_by_files = False
         self.keys: dict[str, str] = {}  # of the graphs, for messages
         bad: set[str] = set()
         try:
-            spec = ExperimentSpec.model_validate(dict(mapping))
+            spec = ExperimentSpec.model_validate(document)
             self.values = {key: getattr(spec, key) for key in ExperimentSpec.model_fields}
         except ValidationError as error:
             self.problems += [translate(detail) for detail in error.errors(include_url=False)]
             bad = {str(detail["loc"][0]) for detail in error.errors(include_url=False)}
-            self.values = {key: None if key in bad else _section(key, mapping) for key in ExperimentSpec.model_fields}
+            self.values = {key: None if key in bad else _section(key, document) for key in ExperimentSpec.model_fields}
         self.known = set(self.values) - bad
         run = self.values["run"]
         if run is not None and self.values["time"] == "discrete" and "dt" not in run.model_fields_set:
@@ -261,7 +241,7 @@ class Sections:
         self.chain: MarkovChain | None = None
         self.noise_gain: FloatArray | None = None
         self.loss: FloatArray | None = None
-        self._recorded = recorded
+        self._recorded = recorded  # the protocol of a recorded run need not be installed
         self.protocol: ChosenProtocol | None = None
 
     def resolve(self, directory: Path) -> None:
@@ -417,10 +397,7 @@ class Sections:
         numbers = [names.index(agent) + 1 if agent in names else agent for agent in leaders.agents]
         unknown = [agent for agent in numbers if isinstance(agent, str)]
         if unknown and self.agents is not None:
-            wanted = (
-                f"expected one of the names {listed(names)}" if names else "expected a number, since no agent is named"
-            )
-            self.problems += [problem("leaders.agents", show(agent), wanted, "correct it") for agent in unknown]
+            self.problems += [validation.unknown_name("leaders.agents", agent, names) for agent in unknown]
         known = [agent for agent in numbers if not isinstance(agent, str)]
         self.values["leaders"] = leaders.model_copy(update={"agents": known})
         if unknown:
@@ -435,10 +412,8 @@ class Sections:
         for agent, value in run.start.items():
             number = names.index(agent) + 1 if agent in names else agent
             if isinstance(number, str) or number > self.agents:
-                wanted = (
-                    f"expected one of the names {listed(names)}" if names else f"expected agents 1 to {self.agents}"
-                )
-                self.problems.append(problem("run.start", show(agent), wanted, "correct it"))
+                others = f"expected agents 1 to {self.agents}"
+                self.problems.append(validation.unknown_name("run.start", agent, names, others))
             else:
                 values[number - 1] = value
         self.values["run"] = run.model_copy(update={"start": values})
@@ -446,7 +421,7 @@ class Sections:
     def _resolve_losses(self, noise: NoiseSpec, time: Time) -> None:
         """Numbers instead of names in ``noise.loss``, and the probability of every link."""
         names: list[str] | None = self.values["names"]
-        loss, found = validation.numbered_losses(noise.loss, names)
+        loss, found = validation.numbered_losses(noise.loss, names or [])
         if not found:
             self.values["noise"] = noise.model_copy(update={"loss": loss})
             self.loss, found = validation.loss_matrix(loss, self.graphs, time, names)
@@ -468,12 +443,9 @@ class Sections:
     def _build_graphs(self) -> None:
         assert self.agents is not None
         graphs: dict[str, GraphSpec] = self.values["graphs"]
-        names: list[str] | None = self.values["names"]
-        found = [
-            line
-            for name, spec in graphs.items()
-            for line in graph_sources.link_problems(self.keys[name], spec, self.agents, names)
-        ]
+        found: list[str] = []
+        for name, spec in graphs.items():
+            found += graph_sources.link_problems(self.keys[name], spec, self.agents, self.values["names"])
         self.problems += found
         if not found:
             self.graphs = tuple(graph_sources.build_graph(name, spec, self.agents) for name, spec in graphs.items())

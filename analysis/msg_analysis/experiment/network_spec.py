@@ -72,17 +72,16 @@ def is_agent(value: object) -> bool:
     return is_count(value) or (isinstance(value, str) and re.match(NAME_PATTERN, value) is not None)
 
 
+def _parts(value: object, counts: tuple[int, ...], wanted: str) -> list[Any]:
+    """A list of so many entries that begins with two agents; else ``wanted`` says what was expected."""
+    if not isinstance(value, list | tuple) or len(value) not in counts or not all(map(is_agent, value[:2])):
+        raise expected(wanted)
+    return list(value)
+
+
 def _link(value: object) -> WrittenLink:
-    wanted = expected(
-        "[agent, agent] or [agent, agent, weight], agents by number from 1 or name, the weight a number > 0"
-    )
-    if not isinstance(value, list | tuple) or len(value) not in (2, 3):
-        raise wanted
-    first, second = value[:2]
-    for label in (first, second):
-        if not is_agent(label):
-            raise wanted
-    weight = value[2] if len(value) == 3 else 1.0
+    wanted = "[agent, agent] or [agent, agent, weight], agents by number from 1 or name, the weight a number > 0"
+    first, second, weight = (*_parts(value, (2, 3), wanted), 1.0)[:3]
     if not is_number(weight) or weight <= 0:
         raise expected("a weight > 0 as the third entry")
     return (first, second, float(weight))
@@ -197,14 +196,10 @@ NoiseGain = float | list[float] | list[list[float]]
 
 
 def _lossy_link(value: object) -> tuple[int | str, int | str, float]:
-    wanted = expected("[agent, agent, probability], agents by number or name, 0 <= probability < 1")
-    if not isinstance(value, list | tuple) or len(value) != 3:
-        raise wanted
-    first, second, probability = value
-    if not (is_agent(first) and is_agent(second)):
-        raise wanted
+    wanted = "[agent, agent, probability], agents by number or name, 0 <= probability < 1"
+    first, second, probability = _parts(value, (3,), wanted)
     if not is_number(probability) or not 0 <= probability < 1:
-        raise wanted
+        raise expected(wanted)
     return (first, second, float(probability))
 
 

@@ -31,12 +31,11 @@ LONGEST_DURATION = 2**31 - 1
 
 
 def chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tuple[MarkovChain | None, list[str]]:
-    """The chain that the file describes, and what is wrong with it (then the chain is None).
-
-    Within the tolerance of the check, the diagonal of a generator is replaced by minus the sum of the other rates, and
-    rows of a transition matrix are divided by their sum.
-    """
-    found = _initial_problems(switching, names)
+    """The chain that the file describes, and what is wrong with it (then the chain is None)."""
+    found = []
+    if switching.initial not in ("stationary", *names):
+        wanted = f"expected 'stationary' or one of the graphs {', '.join(names)}"
+        found.append(problem("switching.initial", show(switching.initial), wanted, "use one of them"))
     given = [key for key in ("generator", "rates", "transition") if getattr(switching, key) is not None]
     wanted = "generator or rates" if time == "continuous" else "transition"
     if not given:
@@ -64,15 +63,8 @@ def chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tupl
     if matrix is None:
         return None, found + more
     chain = MarkovChain(time, matrix)
-    found += ergodicity_problems(chain, names, f"switching.{key}")
+    found += _ergodicity_problems(chain, names, f"switching.{key}")
     return (None if found else chain), found
-
-
-def _initial_problems(switching: SwitchingSpec, names: Sequence[str]) -> list[str]:
-    if switching.initial == "stationary" or switching.initial in names:
-        return []
-    wanted = f"expected 'stationary' or one of the graphs {', '.join(names)}"
-    return [problem("switching.initial", show(switching.initial), wanted, "use one of them")]
 
 
 def _from_rates(
@@ -136,7 +128,7 @@ def wrong_sums(matrix: FloatArray, target: float) -> Iterator[tuple[int, float]]
             yield i, total
 
 
-def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> list[str]:
+def _ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> list[str]:
     """Graphs that cannot be reached, or a period of the chain (assumption 1 of the paper); ``key`` is for messages."""
     if chain.ergodic:
         return []
@@ -152,11 +144,9 @@ def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> l
 def connection_problems(
     graphs: Sequence[Graph], leaders: LeadersSpec | None, names: Sequence[str] | None = None
 ) -> list[str]:
-    """Agents that are not connected in the union of all graphs; ``leaders`` is None in consensus.
-
-    Mean-square stability of the disagreement (tracking: of the deviation from the reference) needs a union in which
-    some agent (tracking: the leaders together) reaches every other one.
-    """
+    """Agents that are not connected in the union of all graphs; ``leaders`` is None in consensus."""
+    # Mean-square stability of the disagreement (tracking: of the deviation from the reference) needs a union in which
+    # some agent (tracking: the leaders together) reaches every other one.
     union = np.any([graph.adjacency.T > 0 for graph in graphs], axis=0)
     sources = widest_reaching(union) if leaders is None else [label - 1 for label in leaders.agents]
     lost = np.flatnonzero(hops(union, sources) < 0).tolist()
@@ -175,13 +165,10 @@ def _list(agents: Sequence[int], names: Sequence[str] | None, longest: int = 8) 
 
 
 def noise_gain_of(noise: NoiseSpec, names: Sequence[str], agents: int) -> tuple[FloatArray, list[str]]:
-    """(n, m, m) F of every graph as ``noise.process`` has it, and what is wrong with it.
-
-    If all graphs have the same F it is stored once, in a read-only view.
-    """
+    """(n, m, m) F of every graph as ``noise.process`` has it, and what is wrong with it."""
     if not isinstance(noise.process, dict):
         gain, found = _gain_of("noise.process", noise.process, agents)
-        return np.broadcast_to(gain, (len(names), *gain.shape)), found
+        return np.broadcast_to(gain, (len(names), *gain.shape)), found  # stored once
     found = []
     for name in noise.process:
         if name not in names:
@@ -202,26 +189,20 @@ def noise_gain_of(noise: NoiseSpec, names: Sequence[str], agents: int) -> tuple[
 
 def _gain_of(key: str, value: NoiseGain, agents: int) -> tuple[FloatArray, list[str]]:
     """(m, m) F, and what is wrong with its shape."""
-    f = np.array(value, dtype=float) if not _ragged(value) else np.empty((0, 0))
+    rows = value if isinstance(value, list) else []
+    ragged = len({len(row) for row in rows if isinstance(row, list)}) > 1
+    f = np.empty((0, 0)) if ragged else np.array(value, dtype=float)
     if f.ndim == 0:
         return np.eye(agents) * f, []
     if f.shape == (agents,):
         return np.diag(f), []
     if f.shape == (agents, agents):
         return f, []
-    if f.ndim == 1:
-        shape = f"{len(f)} entries"
-    elif f.size:
-        shape = f"{f.shape[0]} x {f.shape[1]}"
-    else:
-        shape = "rows of different lengths"
+    shape = "rows of different lengths"
+    if f.size:
+        shape = f"{len(f)} entries" if f.ndim == 1 else f"{f.shape[0]} x {f.shape[1]}"
     wanted = f"expected a number, {agents} numbers or a {agents} x {agents} matrix F"
     return f, [problem(key, shape, wanted, f"there are {agents} agents")]
-
-
-def _ragged(value: object) -> bool:
-    rows = value if isinstance(value, list) else []
-    return len({len(row) for row in rows if isinstance(row, list)}) > 1
 
 
 def burst_problems(burst: float, loss: LossSpec) -> list[str]:
@@ -348,17 +329,22 @@ def heard_links(graphs: Sequence[Graph], time: Time) -> BoolArray:
     return np.asarray(heard)
 
 
-def numbered_losses(loss: LossSpec, names: Sequence[str] | None) -> tuple[LossSpec, list[str]]:
+def unknown_name(
+    key: str, agent: int | str, names: Sequence[str], others: str = "expected a number, since no agent is named"
+) -> str:
+    """The mistake of an agent that is not there; ``others``: what was expected where no agent has a name."""
+    return problem(key, show(agent), f"expected one of the names {listed(names)}" if names else others, "correct it")
+
+
+def numbered_losses(loss: LossSpec, names: Sequence[str]) -> tuple[LossSpec, list[str]]:
     """The same with numbers instead of names of agents, and the names that are unknown."""
     found: list[str] = []
 
     def number(key: str, agent: int | str) -> int | str:
-        if not isinstance(agent, str):
-            return agent
-        if agent in (names or []):
-            return (names or []).index(agent) + 1
-        wanted = f"expected one of the names {listed(names)}" if names else "expected a number, since no agent is named"
-        found.append(problem(key, show(agent), wanted, "correct it"))
+        if agent in names:
+            return names.index(str(agent)) + 1
+        if isinstance(agent, str):
+            found.append(unknown_name(key, agent, names))
         return agent
 
     numbers = {
@@ -371,10 +357,7 @@ def numbered_losses(loss: LossSpec, names: Sequence[str] | None) -> tuple[LossSp
 def loss_matrix(
     loss: LossSpec, graphs: Sequence[Graph], time: Time, names: Sequence[str] | None
 ) -> tuple[FloatArray, list[str]]:
-    """(m, m) probability that a message from agent j (column) to agent i (row) is lost, 0 on the diagonal.
-
-    Also the links in ``loss``, which has numbers of agents, that are in no graph or are repeated.
-    """
+    """(m, m) probability that a message from agent j (column) to agent i (row) is lost, and what is wrong with it."""
     agents, found = graphs[0].agents, []
     heard = heard_links(graphs, time)
     matrix = np.where(np.eye(agents, dtype=np.bool_), 0.0, loss.default)

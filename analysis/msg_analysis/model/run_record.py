@@ -24,7 +24,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.resources import __version__, ros_distribution
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.experiment.protocols import info_of
+from msg_analysis.experiment.protocols import ProtocolInfo
 from msg_analysis.model.step_model import StepMatrices, StepModel, Wiring, build_model, build_step_model
 
 DECIDED = "decided"
@@ -154,7 +154,8 @@ class RunRecord:
                     f"{source}: run record of format {document['format']}, expected {FORMAT}: "
                     "read it with the version of msg_analysis that wrote it"
                 )
-            experiment = Experiment.parse(document["experiment"], source=source, recorded=info_of(document))
+            protocol = ProtocolInfo.from_json(document.get("protocol"))
+            experiment = Experiment.parse(document["experiment"], source=source, recorded=protocol)
             start = np.array(document["start"], dtype=float)
             step = document.get("step")
             matrices = None if step is None else _matrices(step, experiment, source)

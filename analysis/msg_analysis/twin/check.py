@@ -30,9 +30,21 @@ class Check:
 
 
 def check(trajectory: Run) -> Check:
-    """Compute a run again with the offline twin, and compare every state, lost message and graph bit for bit."""
-    # In lockstep the twin needs only the run record. In real time it also takes from the log which values every agent
-    # used in every step, and no value may be used before it was made, according to the stamps.
+    """Compute a run again with the offline twin, and compare every state, lost message and graph bit for bit.
+
+    In lockstep the twin needs only the run record. In real time it also takes from the log which values every agent
+    used in every step, and no value may be used before it was made, according to the stamps.
+
+    Parameters
+    ----------
+    trajectory
+        the run, as read from its bag
+
+    Raises
+    ------
+    NotAvailableError
+        the twin cannot repeat a run of this kind
+    """
     record, count = trajectory.record, trajectory.completeness
     path = mode_path(record.experiment, record.model.initial)
     if record.experiment.run.pace == "realtime":
