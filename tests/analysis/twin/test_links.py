@@ -34,7 +34,7 @@ CORRELATED = [[0.5, 0.1, 0.0, 0.0], [0.0, 0.4, 0.0, -0.3], [0.0, 0.0, 0.6, 0.0],
 LAWS: dict[str, dict[str, Any]] = {
     "consensus": {"graphs": {"a": {"path": [1, 2, 3, 4]}, "b": {"arcs": [[1, 3, 0.5], [4, 1], [2, 4], [2, 1]]}}},
     "correlated": {"process": {"a": CORRELATED, "b": [0.5, 0.1, 0.0, 1.0]}},
-    "tracking": {"problem": "tracking", "leaders": {"agents": [2], "gain": 0.7, "reference": 2.5}},
+    "tracking": {"problem": "tracking", "leaders": {"agents": [2], "gain": 7.0, "reference": 2.5}},
     "grounded": {"problem": "tracking", "leaders": {"agents": [3], "gain": "inf", "reference": -1.0}},
     "noise of grounded leaders by graph": {
         "problem": "tracking",
