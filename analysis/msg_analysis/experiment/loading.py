@@ -191,11 +191,11 @@ def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: i
 
 def amount(size: float) -> str:
     """A number of bytes as text with a unit: ``1.5 GB``."""
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if size < 1000 or unit == "TB":
-            return f"{size:.3g} {unit}"
+    units = ["B", "kB", "MB", "GB", "TB"]
+    while size >= 1000 and len(units) > 1:
         size /= 1000
-    raise AssertionError
+        units.pop(0)
+    return f"{size:.3g} {units[0]}"
 
 
 @functools.cache
@@ -390,16 +390,14 @@ class Sections:
 
     def _name_leaders(self) -> None:
         """Numbers instead of names in ``leaders``; what is not a name of an agent is a mistake."""
-        leaders = self.values["leaders"]
-        if leaders is None or not any(isinstance(agent, str) for agent in leaders.agents):
+        leaders, names = self.values["leaders"], self.values["names"] or []
+        if leaders is None:
             return
-        names: list[str] = self.values["names"] or []
         numbers = [names.index(agent) + 1 if agent in names else agent for agent in leaders.agents]
         unknown = [agent for agent in numbers if isinstance(agent, str)]
-        if unknown and self.agents is not None:
+        if self.agents is not None:
             self.problems += [validation.unknown_name("leaders.agents", agent, names) for agent in unknown]
-        known = [agent for agent in numbers if not isinstance(agent, str)]
-        self.values["leaders"] = leaders.model_copy(update={"agents": known})
+        self.values["leaders"] = leaders.model_copy(update={"agents": [a for a in numbers if a not in unknown]})
         if unknown:
             self.known.discard("leaders")
 
@@ -431,12 +429,10 @@ class Sections:
 
     def _fits(self, run: RunSpec | None) -> bool:
         assert self.agents is not None
-        steps = run.steps if run else 1
-        replicas = run.replicas if run else 1
-        noise = self.values["noise"]
+        steps, replicas = (run.steps, run.replicas) if run else (1, 1)
+        noise: NoiseSpec | None = self.values["noise"]
         delay, truth = (noise.delay, noise.broadcast > 0) if noise else (0, False)
-        modes = len(self.values["graphs"])
-        found = memory_problems(self.agents, modes, steps, replicas, delay, truth)
+        found = memory_problems(self.agents, len(self.values["graphs"]), steps, replicas, delay, truth)
         self.problems += found
         return not found
 

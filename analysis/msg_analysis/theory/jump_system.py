@@ -18,8 +18,7 @@ import scipy.sparse.csgraph
 
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.experiment.markov_chain import Time
-from msg_analysis.theory.message_losses import LossEvents, lost, lost_adjoint
-from msg_analysis.theory.message_steps import message_steps
+from msg_analysis.theory.message_steps import LossEvents, message_steps
 
 if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
@@ -106,18 +105,28 @@ class JumpSystem:
         return self.loss_variance is not None or self.losses is not None
 
     def lost(self, moments: FloatArray) -> FloatArray:
-        """(..., n, d, d): what lost messages add to W C W^T, for moments C (..., n, d, d)."""
+        """(..., n, d, d): what lost messages add to W C W^T, for symmetric moments C (..., n, d, d).
+
+        Without kept values, sum_ij variance_ij <(e_i - e_j)(e_i - e_j)^T, C> e_i e_i^T.
+        """
         if self.losses is not None:
             return self.losses.lost(moments)
         assert self.loss_variance is not None
-        return lost(self.lift, self.loss_variance, moments)
+        full = self.lift @ moments @ self.lift.T
+        own = np.diagonal(full, axis1=-2, axis2=-1)
+        squares = own[..., :, None] + own[..., None, :] - 2.0 * full
+        spread = (self.loss_variance * squares).sum(axis=-1)
+        return np.asarray(self.lift.T @ (spread[..., None] * self.lift))
 
     def lost_adjoint(self, forms: FloatArray) -> FloatArray:
-        """(..., n, d, d): the adjoint of ``lost``, for forms Y (..., n, d, d)."""
+        """(..., n, d, d): the adjoint of ``lost``, for symmetric forms Y: <e_i e_i^T, Y> (e_i - e_j)(e_i - e_j)^T."""
         if self.losses is not None:
             return self.losses.adjoint(forms)
         assert self.loss_variance is not None
-        return lost_adjoint(self.lift, self.loss_variance, forms)
+        seen = self.loss_variance * ((self.lift @ forms) * self.lift).sum(axis=-1)[..., None]
+        laplacian = -(seen + seen.swapaxes(-1, -2))
+        laplacian += np.eye(len(self.lift)) * (seen.sum(axis=-1) + seen.sum(axis=-2))[..., None]
+        return np.asarray(self.lift.T @ laplacian @ self.lift)
 
     def of_modes(self, law: FloatArray) -> FloatArray:
         """(n,) law of the modes from that of the graphs; channels are in their stationary state."""

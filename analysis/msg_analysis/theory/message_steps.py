@@ -23,7 +23,56 @@ from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.validation import MOST_STATES, MOST_VALUES
 from msg_analysis.model.step_model import StepModel
-from msg_analysis.theory.message_losses import LossEvents
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LossEvents:
+    """The losses of one step under each of n graphs, matrix-free; zeros where a graph has fewer than L.
+
+    A loss changes the stack z by xi u v^T z, with xi of mean 0 and variance 1, independent of all others: u is what it
+    acts on, at the end of the step, v the difference between what the message brings and what takes its place, for the
+    z at the beginning. A loss may act on the difference that a later one sees: with q_e = E[(v_e^T z)^2] at that time,
+
+        q_e = v_e^T C v_e + sum_(f before e) R_ef q_f,    L[C] = sum_e q_e u_e u_e^T is added to A C A^T
+    """
+
+    into: FloatArray  # (n, L, d) u
+    differences: FloatArray  # (n, L, d) v
+    chain: FloatArray | None  # (n, L, L) (I - R)^-1; None where no loss acts on what another one sees
+
+    def lost(self, moments: FloatArray) -> FloatArray:
+        """(..., n, d, d): L[C] of the moments C (..., n, d, d)."""
+        seen = ((self.differences @ moments) * self.differences).sum(axis=-1)
+        if self.chain is not None:
+            seen = (self.chain @ seen[..., None])[..., 0]
+        return np.asarray(self.into.swapaxes(-1, -2) @ (seen[..., None] * self.into))
+
+    def adjoint(self, forms: FloatArray) -> FloatArray:
+        """(..., n, d, d): the adjoint of ``lost``, of forms Y (..., n, d, d)."""
+        felt = ((self.into @ forms) * self.into).sum(axis=-1)
+        if self.chain is not None:
+            felt = (self.chain.swapaxes(-1, -2) @ felt[..., None])[..., 0]
+        return np.asarray(self.differences.swapaxes(-1, -2) @ (felt[..., None] * self.differences))
+
+    def uses(self) -> BoolArray:
+        """(d, d): whether a loss changes coordinate a by what it sees in b, in any graph; too often with a chain."""
+        found = np.zeros((self.into.shape[2],) * 2, dtype=np.bool_)
+        for changed, seen in zip(self.into != 0.0, self.differences != 0.0, strict=True):
+            if self.chain is None:
+                found |= (changed.T.astype(float) @ seen.astype(float)) > 0.0
+            else:
+                found |= np.outer(changed.any(axis=0), seen.any(axis=0))
+        return found
+
+    def of_mode(self, mode: int) -> LossEvents:
+        """Those of one graph, from 0."""
+        chain = None if self.chain is None else self.chain[mode : mode + 1]
+        return LossEvents(self.into[mode : mode + 1], self.differences[mode : mode + 1], chain)
+
+    def projected(self, basis: FloatArray) -> LossEvents:
+        """In the coordinates that the columns of ``basis`` (d, d') span."""
+        return LossEvents(self.into @ basis, self.differences @ basis, self.chain)
+
 
 _Loss = tuple[int, int, int, float, float]
 """Entry that it changes; the entries that the message brings, and that take its place; probability; weight."""

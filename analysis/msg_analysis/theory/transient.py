@@ -293,15 +293,9 @@ def _stepped(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Flo
 
 
 def _check_times(system: JumpSystem, times: FloatArray) -> None:
-    wrong = "numbers >= 0 in ascending order"
-    if (
-        times.ndim != 1
-        or not len(times)
-        or not np.isfinite(times).all()
-        or times[0] < 0.0
-        or (np.diff(times) < 0.0).any()
-    ):
-        raise InputError(f"times: {times.tolist()!r:.80}: expected {wrong}: give at least one")
+    if times.ndim != 1 or not times.size or not np.isfinite(times).all() or (np.diff(times, prepend=0.0) < 0.0).any():
+        wanted = "expected numbers >= 0 in ascending order"
+        raise InputError(f"times: {times.tolist()!r:.80}: {wanted}: give at least one")
     if system.time == "discrete":
         if (times != np.round(times)).any():
             raise InputError("times: expected whole numbers of steps in discrete time")
