@@ -40,7 +40,8 @@ TESTS = {
     "analysis/msg_analysis/messages/acceptance.py": "tests/analysis/wire/test_receiving.py",
 }
 ENOUGH = 0.85  # of all changes
-OURS = ("msg_", "test", "conftest", "_pytest", "__main__", "rclpy")  # not imported before the fork
+SUPPORT = [file.stem for file in (ROOT / "tests/support").glob("*.py")]
+OURS = ("msg_", "test", "conftest", "_pytest", "__main__", "rclpy", *SUPPORT)  # not imported before the fork
 
 
 class Changed(importlib.abc.MetaPathFinder, importlib.abc.Loader):
@@ -97,6 +98,8 @@ def survivors(file: str, seconds: float) -> tuple[list[str], int]:
         for name in json.loads(Path(imports.name).read_text()):
             with contextlib.suppress(Exception):
                 importlib.import_module(name)
+        _, code = os.waitpid(forked(file, (ROOT / file).read_text(encoding="utf-8"), ""), 0)
+        assert code == 0, f"{file}: its tests fail without a change in a process that has imported the libraries"
     left, count = changes(file), 0
     running: dict[int, tuple[str, float]] = {}
     survived: list[str] = []
