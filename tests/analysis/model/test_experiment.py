@@ -111,13 +111,6 @@ def test_graphml_is_read_and_becomes_part_of_the_document(tmp_path: Path, direct
     assert Experiment.parse(experiment.to_document()) == experiment
 
 
-def test_graphml_nodes_with_other_names_are_numbered_in_file_order(tmp_path: Path) -> None:
-    graph = nx.Graph([("carol", "alice"), ("alice", "bob")])
-    nx.write_graphml(graph, tmp_path / "net.graphml")
-    experiment = Experiment.parse(SMALL | {"graphs": {"net": {"graphml": "net.graphml"}}}, directory=tmp_path)
-    assert np.array_equal(experiment.graph_list[0].adjacency, nx.to_numpy_array(graph))
-
-
 @pytest.mark.parametrize(
     ("process", "expected"),
     [

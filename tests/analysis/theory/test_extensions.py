@@ -263,23 +263,6 @@ def test_noise_by_graph_with_names_and_without_steps():
     assert prediction.static.system_error == pytest.approx(5 / 7 * 4.0 * 2.0 + 2 / 7 * 0.25 * 1.0, rel=1e-12)
 
 
-@pytest.mark.parametrize("delay", [1, 2, 5])
-def test_two_agents_late(delay):
-    """The difference of two agents goes its own way: z(k+1) = (1 - dt) z(k) - dt z(k - d) + noise; scipy solves it."""
-    dt = 0.2
-    given = {"name": "two", "graphs": {"a": {"path": [1, 2]}}, "noise": {"delay": delay}, "run": {"dt": dt}}
-    companion = np.eye(delay + 1, k=-1)
-    companion[0, 0] += 1.0 - dt
-    companion[0, -1] += -dt
-    entering = np.zeros_like(companion)
-    entering[0, 0] = 2.0 * dt  # variance of the noise of x_1 - x_2
-    difference = scipy.linalg.solve_discrete_lyapunov(companion, entering)[0, 0]
-    prediction = predict(Experiment.parse(given))
-    assert prediction.emulated.system_error == pytest.approx(difference / 2, rel=1e-11)
-    assert prediction.continuous_moments is None
-    assert prediction.static_moments is None
-
-
 def test_held_keeps_the_delay():
     experiment = fast(delay=2, process={"line": 1.0, "ring": 3.0})
     alone = held(emulated(build_step_model(experiment), "consensus"), 1)
@@ -290,30 +273,25 @@ def test_held_keeps_the_delay():
 
 def complete(dt, **noise):
     """Four agents who all hear each other: stable below dt = 0.5 without delay, and below 1/3 with one step of it."""
-    return {
-        "name": "complete",
-        "agents": 4,
-        "graphs": {"all": {"complete": True}},
-        "noise": noise,
-        "run": {"dt": dt, "duration": 10 * dt},
-    }
+    graphs, run = {"all": {"complete": True}}, {"dt": dt, "duration": 10 * dt}
+    return line_ring(agents=4, graphs=graphs, switching={}, noise=noise, run=run)
 
 
 def test_steps_that_delay_makes_unstable_are_refused():
-    assert predict(Experiment.parse(complete(0.4))).emulated.system_error > 0.0
-    assert predict(Experiment.parse(complete(0.33, delay=1))).emulated.system_error > 0.0
+    assert predict(complete(0.4)).emulated.system_error > 0.0
+    assert predict(complete(0.33, delay=1)).emulated.system_error > 0.0
     with pytest.raises(InputError, match=r"grow without bound.* every dt below 0\.3333 is stable"):
-        predict(Experiment.parse(complete(0.4, delay=1)))
+        predict(complete(0.4, delay=1))
 
 
 @pytest.mark.parametrize("process", [0.0, [[1.0] * 4] * 4])
 def test_noise_that_does_not_show_instability_hides_nothing(process):
     """Without noise, or with the same noise for everybody, nothing grows from agreement; from elsewhere it does."""
-    stable = predict(Experiment.parse(complete(0.4, process=process))).to_json()["emulated"]
+    stable = predict(complete(0.4, process=process)).to_json()["emulated"]
     assert stable["system_error"] == 0.0
     assert stable["system_certainty"] is None
     with pytest.raises(InputError, match="without bound"):
-        predict(Experiment.parse(complete(0.4, process=process, delay=1)))
+        predict(complete(0.4, process=process, delay=1))
 
 
 def test_agents_without_errors_have_no_certainty():

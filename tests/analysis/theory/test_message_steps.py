@@ -72,17 +72,15 @@ CASES = {
 }
 
 
-def parse(case, **run):
+def parse(case, start="stationary", **changes):
     graphs, noise, more = CASES[case]
     more = dict(more)
-    run = {"dt": 0.3, "duration": 6, "pace": more.pop("pace", "lockstep"), "seed": 3} | run
-    document = {"name": "case", "graphs": graphs, "noise": noise, "run": run}
+    run = {"dt": 0.3, "duration": 6, "pace": more.pop("pace", "lockstep"), "seed": 3, "start": start}
+    switching = {"generator": [[-2.0, 2.0], [3.0, -3.0]]}
     if more.get("time") == "discrete":
-        del run["dt"]
-        document["switching"] = {"transition": [[0.8, 0.2], [0.4, 0.6]]}
-    else:
-        document["switching"] = {"generator": [[-2.0, 2.0], [3.0, -3.0]]}
-    return Experiment.parse(document | more)
+        run["dt"], switching = 1.0, {"transition": [[0.8, 0.2], [0.4, 0.6]]}
+    document = {"name": "case", "graphs": graphs, "noise": noise, "switching": switching, "run": run}
+    return Experiment.parse(document | more | changes)
 
 
 def loss_of(noise, i, j):
@@ -193,11 +191,8 @@ class Brute:
         return chain, law
 
     def maps(self):
-        found = []
-        for graph in range(self.n):
-            for pattern in self.patterns:
-                found.append(self.period(graph, dict(zip(self.lossy, pattern, strict=True))))
-        return np.stack(found)
+        every = itertools.product(range(self.n), self.patterns)
+        return np.stack([self.period(graph, dict(zip(self.lossy, lost, strict=True))) for graph, lost in every])
 
     def errors(self, moments):
         """(..., m) of E[x x^T] (..., m, m)."""
@@ -314,10 +309,8 @@ def test_a_stationary_start_is_what_agents_are_and_have_heard(case):
     experiment = parse(case)
     prediction = predict(experiment)
     step = prediction.step
-    squares = [
-        np.diag(factor @ factor.T)
-        for factor in (stationary_start_factor(experiment, mode) for mode in range(step.modes))
-    ]
+    factors = np.stack([stationary_start_factor(experiment, mode) for mode in range(step.modes)])
+    squares = (factors**2).sum(axis=2)
     np.testing.assert_allclose(step.stationary @ squares, prediction.emulated.node_errors, rtol=1e-9)
     course = solve_transient(experiment, np.arange(3) * experiment.step_length).course
     np.testing.assert_allclose(course.node_errors[0], prediction.emulated.node_errors, rtol=1e-9, atol=1e-12)
@@ -348,16 +341,8 @@ def test_rates_are_eigenvalues_of_the_whole(case):
 
 
 def test_too_many_values_or_channels_are_refused():
-    many = Experiment.parse(
-        LINE_RING
-        | {
-            "graphs": {"a": {"complete": True}},
-            "agents": 41,
-            "switching": {"generator": [[0.0]]},
-            "noise": {"loss": 0.1, "on_loss": "hold"},
-            "run": {"dt": 0.01, "duration": 10},
-        }
-    )
+    changes = {"graphs": {"a": {"complete": True}}, "switching": {"generator": [[0.0]]}, "run": {"dt": 0.01}}
+    many = line_ring(agents=41, noise={"loss": 0.1, "on_loss": "hold"}, **changes)
     with pytest.raises(InputError, match="1640 links of 41 agents make 1681 values"):
         predict(many)
     with pytest.raises(InputError, match=r"noise.burst: 2 graphs and 10 links .* 2\^10 states"):
@@ -377,17 +362,7 @@ def test_unreduced_moments_have_the_same_disagreement(case):
 @pytest.mark.parametrize("case", ["held, by link, noisy", "real time, own", "real time, held"])
 def test_closed_form_for_two_graphs(case):
     """With losses that are kept from step to step, too; each graph must have an error of its own."""
-    graphs, noise, more = CASES[case]
-    pace = more.get("pace", "lockstep")
-    document = {
-        "name": "two",
-        "graphs": {"a": {"arcs": [[1, 2], [2, 3, 0.7], [3, 1]]}, "b": {"path": [1, 2, 3]}},
-        "switching": {"generator": [[-2.0, 2.0], [3.0, -3.0]]},
-        "noise": noise,
-        "run": {"dt": 0.3, "duration": 6, "pace": pace},
-    }
-    prediction = predict(Experiment.parse(document))
-    assert graphs is GRAPHS
+    prediction = predict(parse(case, graphs=GRAPHS | {"b": {"path": [1, 2, 3]}}))
     found = two_topology(prediction.system)
     np.testing.assert_allclose(found.node_errors, prediction.emulated.node_errors, rtol=1e-9)
 
@@ -396,13 +371,8 @@ def test_closed_form_for_two_graphs(case):
 @pytest.mark.parametrize("gain", [0.8, math.inf])
 def test_leaders(case, gain):
     """The value of a set is the prediction with these leaders; the oracle's for one of them."""
-    graphs, noise, more = CASES[case]
-    run = {"dt": 0.3, "duration": 6, "pace": more.get("pace", "lockstep"), "seed": 3}
-    document = {"name": "led", "graphs": graphs, "switching": {"generator": [[-2.0, 2.0], [3.0, -3.0]]}}
-    document |= {"noise": noise, "run": run}
-    consensus = Experiment.parse(document)
-    leaders = {"problem": "tracking", "leaders": {"agents": [3], "gain": gain}}
-    tracking = Experiment.parse(document | leaders)
+    consensus = parse(case)
+    tracking = consensus.with_leaders(3, gain=gain)
     found = system_error(consensus, [3], gain=gain)
     assert found == pytest.approx(predict(tracking).emulated.system_error, rel=1e-10)
     brute = Brute(case, tracking)
@@ -471,18 +441,10 @@ def test_the_radius_is_that_of_the_kronecker_powers(document):
     assert fourth_moment(step, prediction.system) == found
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        "held",
-        "own, by link",
-        "own, bursts",
-        "real time, own",
-        "real time, held",
-        "held, delay",
-        "real time, own, delay",
-    ],
-)
+OF_EVERY_KIND = "held", "own, by link", "own, bursts", "real time, own", "real time, held", "held, delay"
+
+
+@pytest.mark.parametrize("case", [*OF_EVERY_KIND, "real time, own, delay"])
 def test_fourth_moments_from_a_known_start(case):
     """E[y^4] without noise, over three steps of messages that are lost, late, held or used one after the other.
 
@@ -512,12 +474,8 @@ def test_fourth_moments_from_a_known_start(case):
         np.testing.assert_allclose(np.einsum("abcd,ia,ib,ic,id->i", tensor, *[rows] * 4), expected[k], rtol=1e-9)
         if len(alive) * len(maps) > 300_000:
             break
-        alive = [
-            (p * chain[mode, after], after, maps[mode] @ z)
-            for p, mode, z in alive
-            for after in range(len(maps))
-            if chain[mode, after] > 0.0
-        ]
+        moved = [(p, mode, maps[mode] @ z) for p, mode, z in alive]
+        alive = [(p * c, after, z) for p, mode, z in moved for after, c in enumerate(chain[mode].tolist()) if c > 0.0]
         stack = advance(steps, stack)
     assert k > 0
 
@@ -545,16 +503,8 @@ def test_means_with_weights_that_are_not_negative_have_light_tails(noise):
 
 def test_what_is_too_large_is_bounded():
     """20 agents: bounds only, and still finite, since every agent takes a mean."""
-    document = {
-        "name": "large",
-        "graphs": {"ring": {"cycle": list(range(1, 21))}, "star": {"star": {"center": 1}}},
-        "agents": 20,
-        "switching": {"generator": [[-1.0, 1.0], [1.0, -1.0]]},
-        "noise": {"process": 1.0, "loss": 0.2},
-        "run": {"dt": 0.05, "duration": 5.0},
-    }
-    _, prediction = of(document)
-    found = prediction.fourth_moment
+    graphs = {"ring": {"cycle": list(range(1, 21))}, "star": {"star": {"center": 1}}}
+    found = predict(line_ring(20, graphs=graphs, noise={"loss": 0.2})).fourth_moment
     assert found.radius is None
     assert found.lower == pytest.approx(found.upper**2)
     assert found.finite

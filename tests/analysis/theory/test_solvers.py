@@ -45,15 +45,11 @@ def test_continuous_time_is_the_dense_solution(seed, m, n, rate, kind):
     agree(system(random, m, generator(random, n, rate), kind))
 
 
+kinds = st.sampled_from(["symmetric", "directed", "chain"])
+
+
 @MODELS
-@given(
-    seeds,
-    st.integers(2, 7),
-    st.integers(1, 4),
-    rates,
-    st.sampled_from(["symmetric", "directed", "chain"]),
-    st.booleans(),
-)
+@given(seeds, st.integers(2, 7), st.integers(1, 4), rates, kinds, st.booleans())
 def test_discrete_time_is_the_dense_solution(seed, m, n, rate, kind, loss):
     random = np.random.default_rng(seed)
     agree(system(random, m, generator(random, n, rate), kind, dt=0.03, loss=loss), rtol=1e-8)
@@ -311,35 +307,13 @@ def test_many_forms_are_solved_in_batches():
     np.testing.assert_allclose(IterativeSolver(model, chunk=400).dual(forms), together, rtol=1e-10, atol=1e-12)
 
 
-@pytest.fixture
-def random():
-    return np.random.default_rng(1)
-
-
-def symmetric_matrices(random, d, count=2):
-    a = random.standard_normal((count, d, d))
-    return a + a.transpose(0, 2, 1)
-
-
 @pytest.mark.parametrize("d", [0, 1, 2, 5])
-def test_pack_and_unpack_are_inverse_and_keep_the_inner_product(random, d):
-    a, b = symmetric_matrices(random, d)
+def test_packed_matrices_keep_the_inner_product_and_adjoints(d):
+    w, *others = np.random.default_rng(1).standard_normal((3, d, d))
+    a, b = (other + other.T for other in others)
     assert symmetric.pack(a).shape == (symmetric.size(d),)
     np.testing.assert_allclose(symmetric.unpack(symmetric.pack(a), d), a, rtol=1e-15)
     assert symmetric.pack(a) @ symmetric.pack(b) == pytest.approx(np.trace(a @ b), abs=1e-12)
-
-
-@pytest.mark.parametrize("d", [1, 2, 5])
-def test_packed_lyapunov(random, d):
-    c, _ = symmetric_matrices(random, d)
-    w = random.standard_normal((d, d))
-    np.testing.assert_allclose(symmetric.lyapunov(w) @ symmetric.pack(c), symmetric.pack(w @ c + c @ w.T), atol=1e-12)
-
-
-def test_adjoint_is_the_transpose(random):
-    c, h = symmetric_matrices(random, 4)
-    w = random.standard_normal((4, 4))
-    np.testing.assert_allclose(
-        symmetric.unpack(symmetric.lyapunov(w).T @ symmetric.pack(h), 4), w.T @ h + h @ w, atol=1e-12
-    )
-    assert np.trace(h @ (w @ c + c @ w.T)) == pytest.approx(np.trace((w.T @ h + h @ w) @ c))
+    lyapunov = symmetric.lyapunov(w)
+    np.testing.assert_allclose(lyapunov @ symmetric.pack(a), symmetric.pack(w @ a + a @ w.T), atol=1e-12)
+    np.testing.assert_allclose(lyapunov.T @ symmetric.pack(a), symmetric.pack(w.T @ a + a @ w), atol=1e-12)
