@@ -97,7 +97,7 @@ class ChosenProtocol:
         return None if self.info.linear else f"{self.info} is not linear, and runs without a prediction"
 
     def unavailable(self, purpose: Purpose) -> list[str]:
-        """Why it cannot be used for a purpose, one line each: see ``Experiment.unavailable``."""
+        """Why it cannot be used for a purpose, one line each."""
         name, reason = show(self.info.name), self.unpredictable()
         if self.absent:
             remedy = f"install {self.info.package} {self.info.version}"

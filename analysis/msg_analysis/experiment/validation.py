@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,7 +17,10 @@ from msg_analysis.experiment.graphs import Graph, hops, widest_reaching
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
 from msg_analysis.experiment.network_spec import LossSpec, NoiseGain, NoiseSpec, SwitchingSpec
 from msg_analysis.experiment.problems import problem, show
-from msg_analysis.experiment.spec import LeadersSpec, RunSpec
+from msg_analysis.experiment.spec import LeadersSpec, Purpose, RunSpec
+
+if TYPE_CHECKING:
+    from msg_analysis.experiment.experiment import Experiment
 
 MOST_STATES = 512
 """Of graph and links together, in a prediction with losses in bursts."""
@@ -157,10 +161,10 @@ def connection_problems(
     return [problem("graphs", text, "expected a union that connects all agents", "add an edge, or lower `agents`")]
 
 
-def _list(agents: Sequence[int], names: Sequence[str] | None, longest: int = 8) -> str:
+def _list(agents: Sequence[int], names: Sequence[str] | None) -> str:
     """`` 3`` or ``s 1, 2, 3``: agents (from 0) as texts count or name them, after the word "agent"."""
-    shown = ", ".join(agent_name(agent + 1, names) for agent in agents[:longest])
-    more = f" and {len(agents) - longest} more" if len(agents) > longest else ""
+    shown = ", ".join(agent_name(agent + 1, names) for agent in agents[:8])
+    more = f" and {len(agents) - 8} more" if len(agents) > 8 else ""
     return ("s " if len(agents) > 1 else " ") + shown + more
 
 
@@ -302,19 +306,28 @@ def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
     return gains
 
 
-def too_large_to_predict(
-    noise: NoiseSpec, graphs: Sequence[Graph], loss: FloatArray, gains: FloatArray, pace: str, time: Time
-) -> list[str]:
-    """What has no prediction because it would be too large; ``loss`` (m, m), ``gains`` (m,) kappa of the leaders."""
-    lines = []
-    links = heard_links(graphs, time) & np.isfinite(gains)[:, None]
-    lossy = int((links & (loss > 0.0)).sum())
+def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
+    """What the experiment asks for that this version cannot do, one line each."""
+    lines = _too_large_to_predict(experiment) if purpose == "predict" else []
+    return lines + (experiment.protocol.unavailable(purpose) if experiment.protocol else [])
+
+
+def unpredictable(experiment: Experiment) -> str | None:
+    """Why there is no prediction, as a part of a sentence; None where there is one."""
+    reason = experiment.protocol.unpredictable() if experiment.protocol else None
+    return reason or next(iter(_too_large_to_predict(experiment)), None)
+
+
+def _too_large_to_predict(experiment: Experiment) -> list[str]:
+    lines, noise, graphs, gains = [], experiment.noise, experiment.graph_list, experiment.leader_gains
+    links = heard_links(graphs, experiment.time) & np.isfinite(gains)[:, None]
+    lossy = int((links & (experiment.loss > 0.0)).sum())
     if noise.burst is not None and len(graphs) * 2.0**lossy > MOST_STATES:
         wanted = f"has no prediction: 2^{lossy} states of {lossy} links that lose messages, expected at most "
         wanted += f"{MOST_STATES} with those of the graph"
         lines.append(problem("noise.burst", noise.burst, wanted, "remove it, or give fewer links a loss"))
     kept = len(gains) * (noise.delay + 2) + lossy * (noise.delay + 1) * noise.holds
-    by_message = noise.holds or (pace == "realtime" and noise.steps_only)
+    by_message = noise.holds or (experiment.run.pace == "realtime" and noise.steps_only)
     if by_message and kept > MOST_VALUES:
         wanted = f"has no prediction: {kept} values are kept from step to step, expected at most {MOST_VALUES}"
         lines.append(problem("noise.on_loss", noise.on_loss, wanted, "use fewer agents or links, or own values"))

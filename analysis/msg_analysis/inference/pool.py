@@ -15,6 +15,7 @@ import numpy as np
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.inference.comparison import Comparison, Member, Pool, first_difference
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.observation import Observation
@@ -120,7 +121,7 @@ def _examine(name: str, run: Run, prediction: Prediction, level: float) -> tuple
 
 
 def _require_prediction(name: str, experiment: Experiment) -> None:
-    reason = experiment.unpredictable()
+    reason = unpredictable(experiment)
     if reason:
         raise InputError(f"{name}: {reason}, so there is nothing to pool: compare one bag at a time")
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.common.resources import blas_threads
+from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.comparison import Comparison, trusted
 from msg_analysis.inference.counts import LossTally, Transitions, loss_test, switching_test
@@ -186,7 +187,7 @@ def compare_run(trajectory: Run, *, level: float = 0.01) -> Comparison:
     InputError
         no prediction (too large, unbounded), or a log without what is needed
     """
-    unpredicted = trajectory.record.experiment.unpredictable()
+    unpredicted = unpredictable(trajectory.record.experiment)
     if unpredicted:
         return _measured(trajectory, level, unpredicted)
     prediction = predict(trajectory.record.experiment, trajectory.record.step_model)

@@ -16,7 +16,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.protocols import AgentProtocol
 from msg_analysis.model.reception import NOTHING, AgentAir
 from msg_analysis.model.run_record import RunRecord
-from msg_analysis.model.step_model import StepModel, Wiring
+from msg_analysis.model.step_model import StepModel, Wiring, step_noise_gain
 from msg_analysis.protocol import Heard
 
 
@@ -145,7 +145,7 @@ class ProtocolLaw:
         modes = range(model.modes)
         self._neighbours = [model.neighbours(mode, agent) for mode in modes]
         self._weights = [experiment.graph_list[mode].adjacency[agent, self._neighbours[mode]] for mode in modes]
-        self._noise = ProcessNoise(experiment.run.seed, experiment.step_noise_gain, experiment.run.replicas)
+        self._noise = ProcessNoise(experiment.run.seed, step_noise_gain(experiment), experiment.run.replicas)
         for shared in (*self._neighbours, *self._weights):
             shared.flags.writeable = False
         self._noises = self._draw(0)

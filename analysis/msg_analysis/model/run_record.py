@@ -25,7 +25,14 @@ from msg_analysis.common.resources import __version__, ros_distribution
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.protocols import ProtocolInfo
-from msg_analysis.model.step_model import StepMatrices, StepModel, Wiring, build_model, build_step_model
+from msg_analysis.model.step_model import (
+    StepMatrices,
+    StepModel,
+    Wiring,
+    build_model,
+    build_step_model,
+    step_noise_gain,
+)
 
 DECIDED = "decided"
 DECIDED_PRECISION = 0.05
@@ -189,7 +196,7 @@ def _entries(matrix: FloatArray) -> list[list[float]]:
 
 
 def _matrices(document: Any, experiment: Experiment, source: str) -> StepMatrices:
-    stacks = {"noise_gain": experiment.step_noise_gain}
+    stacks = {"noise_gain": step_noise_gain(experiment)}
     for key in ("weights", "noise_gain")[: 2 if experiment.protocol else 1]:
         stack = np.zeros((len(experiment.graph_list), experiment.agents, experiment.agents))
         if len(document[key]) != len(stack):

@@ -162,7 +162,7 @@ def step_matrices(experiment: Experiment) -> StepMatrices:
         weights[:, range(agents), range(agents)] -= dt * np.where(grounded, 0.0, experiment.leader_gains)
         weights[:, grounded] = 0.0
     else:
-        weights, gain = _built_in(experiment), experiment.step_noise_gain
+        weights, gain = _built_in(experiment), step_noise_gain(experiment)
     if experiment.time == "continuous":
         gain[:, grounded] = 0.0  # a leader held at the reference has no noise either
     return StepMatrices(weights, gain)
@@ -209,6 +209,11 @@ def build_step_model(experiment: Experiment, matrices: StepMatrices | None = Non
         link=experiment.noise.link,
         holds=experiment.noise.holds,
     )
+
+
+def step_noise_gain(experiment: Experiment) -> FloatArray:
+    """(n, m, m) sqrt(dt) F_i: the noise that a step of the built-in law adds is this times N(0, I)."""
+    return np.asarray(np.sqrt(experiment.step_length) * experiment.noise_gain)
 
 
 def _built_in(experiment: Experiment) -> FloatArray:

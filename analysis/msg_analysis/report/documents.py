@@ -261,7 +261,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
         "stability_limit": min((limit for limit in limits if limit is not None), default=None),
         "predicted_system_error": _predicted_system_error(experiment),
         "memory": {"states": states, "matrices": matrices},
-        "unavailable": experiment.unavailable(),
+        "unavailable": validation.unavailable(experiment),
     }
 
 

@@ -182,7 +182,7 @@ def resolve_law(experiment: Experiment, law: SelectionLaw | None = None) -> Sele
     """``law`` if the experiment has it, else InputError; None stands for the paper's law, or else that of the steps."""
     if experiment.time == "discrete":
         possible: list[SelectionLaw] = ["discrete"]
-    elif experiment.steps_only:
+    elif experiment.noise.steps_only or experiment.protocol:
         possible = ["emulated"]
     else:
         possible = ["continuous", "emulated"]

@@ -274,7 +274,7 @@ def predict(experiment: Experiment, step: StepModel | None = None) -> Prediction
     step = step or build_step_model(experiment)
     continuous = paper = None
     if not experiment.noise.steps_only:
-        if experiment.time == "continuous" and not experiment.steps_only:
+        if experiment.time == "continuous" and not experiment.protocol:
             paper = systems.continuous(experiment)
             exact = MomentSolver(paper)
             continuous = _moments(exact, exact.steady(), experiment.names)

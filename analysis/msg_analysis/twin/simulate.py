@@ -23,6 +23,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.problems import problem
 from msg_analysis.experiment.protocols import AgentProtocol
+from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.model.agent_law import ProcessNoise, ProtocolLaw
 from msg_analysis.model.graph_path import mode_path, past_modes, sojourns
 from msg_analysis.model.reception import Air, AirReception, MessagesUsed, add_broadcast_noise, ahead
@@ -232,7 +233,7 @@ def draw_start(experiment: Experiment, model: Wiring, first_mode: int) -> FloatA
         return np.repeat(np.array(start, dtype=float)[:, None], replicas, axis=1)
     assert isinstance(model, StepModel), "experiments without a prediction start from given values"
     found = _from_the_past(experiment, model, first_mode)
-    if found is None and (reason := experiment.unpredictable()):
+    if found is None and (reason := unpredictable(experiment)):
         wanted = f"expected 'zero' or one value per agent, since a past would take too long, and {reason}"
         raise InputError(f"{experiment.source}: {problem('run.start', 'stationary', wanted, 'give x(0)')}")
     return _gaussian(experiment, first_mode) if found is None else found

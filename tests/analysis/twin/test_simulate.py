@@ -74,7 +74,7 @@ def test_seeds_and_lengths() -> None:
 def test_another_agent_changes_nobody_elses_noise() -> None:
     """Agents 1 and 2 hear nothing of agents 3 and 4, who come later: their states and the fates of messages stay."""
     graphs = {"a": {"arcs": [[1, 2], [2, 1], [2, 3]]}, "b": {"arcs": [[1, 2], [2, 1], [3, 4]]}}
-    shared = {"noise": {"broadcast": 0.3, "link": 0.2, "loss": 0.3}}
+    shared = {"noise": AIR}
     two = simulate(line_ring(graphs={key: {"path": [1, 2]} for key in "ab"}, run={"start": [1, 2]}, **shared))
     four = simulate(line_ring(graphs=graphs, run={"start": [1, 2, 0, 0]}, **shared))
     assert np.array_equal(two.states, four.states[:, :2])
