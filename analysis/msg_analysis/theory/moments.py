@@ -54,21 +54,20 @@ class MomentSolver:
         self.report: SolverReport | None = None  # how the steady state was found
         self._most_kept, self._duals = most_kept, dict[bytes, FloatArray]()
         unknowns = system.modes * packed_symmetric.size(system.dimension)
-        self._dense_too = 0 < unknowns <= most_dense
+        self._dense_too = unknowns <= most_dense
         self._solver: DenseSolver | IterativeSolver
         self._solver = IterativeSolver(system, guess) if unknowns else DenseSolver(system)
 
     def steady(self) -> FloatArray:
         """(n, d, d): C_i = E[y y^T; mode i] in the steady state."""
         moments = self._solved(lambda solver: solver.steady())
-        shift = MAX_RELATIVE_ERROR * np.abs(moments).max(initial=0.0) or 1.0
-        try:
-            np.linalg.cholesky(moments + shift * np.eye(self.system.dimension))
-        except np.linalg.LinAlgError:
+        least = np.linalg.eigvalsh(moments).min(initial=0.0)
+        # Not "<": NaN must be refused, too.
+        if not least >= -MAX_RELATIVE_ERROR * np.abs(moments).max(initial=0.0):
             raise InputError(
                 "second moments: the equations have no positive solution, so the errors grow without bound: "
                 "lower run.dt, or add edges until the union of the graphs connects all agents"
-            ) from None
+            )
         report = self._solver.report
         assert report is not None
         self.report = replace(report, error=max(report.error, _rounding(self.system, moments)))
@@ -133,11 +132,11 @@ def transient_mean(
     away, law_away = initial - steady, law - system.stationary
     scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))
     total = np.zeros_like(steady)
-    for step in range(steps):
-        # Not looked at every time: a look takes as long as a step.
-        if step % 8 == 0 and np.abs(away).max(initial=0.0) <= 1e-17 * scale and np.abs(law_away).max() <= 1e-17:
+    for step in range(0, steps, 8):  # not looked at every time: a look takes as long as a step
+        if np.abs(away).max(initial=0.0) <= 1e-17 * scale and np.abs(law_away).max() <= 1e-17:
             break
-        total += away
-        away, law_away = system.advance(away, law_away)
-        law_away -= law_away.sum() * system.stationary  # the rounding of its sum, 0, would stay for ever
+        for _ in range(min(8, steps - step)):
+            total += away
+            away, law_away = system.advance(away, law_away)
+            law_away -= law_away.sum() * system.stationary  # the rounding of its sum, 0, would stay for ever
     return np.asarray(steady.sum(axis=0) + total.sum(axis=0) / steps)

@@ -211,25 +211,6 @@ def test_one_graph_is_the_h2_norm(kind):
     assert np.trace(MomentSolver(model).steady()[0]) == pytest.approx(control.system_norm(plant, 2) ** 2, rel=1e-8)
 
 
-@pytest.mark.parametrize("dt", [None, 0.05])
-def test_a_guess_saves_iterations_and_changes_nothing(dt):
-    random = np.random.default_rng(9)
-    gamma = generator(random, 3)
-    first = system(np.random.default_rng(1), 15, gamma, dt=dt)
-    second = system(np.random.default_rng(1), 15, gamma * (1 + 1e-4), dt=dt)
-    start = MomentSolver(first).steady()
-    cold, warm = MomentSolver(second), MomentSolver(second, guess=start)
-    np.testing.assert_allclose(warm.steady(), cold.steady(), rtol=1e-10, atol=1e-12)
-    assert warm.report.iterations < cold.report.iterations
-
-
-def test_a_guess_for_another_system_is_refused():
-    random = np.random.default_rng(9)
-    model = system(random, 5, generator(random, 2))
-    with pytest.raises(InputError, match=r"guess: shape \(2, 3, 3\).*\(2, 4, 4\)"):
-        MomentSolver(model, guess=np.zeros((2, 3, 3)))
-
-
 @pytest.mark.parametrize("time", ["continuous", "discrete"])
 @pytest.mark.parametrize("kind", ["symmetric", "directed", "chain"])
 def test_single_graphs_are_scipys(time, kind):
