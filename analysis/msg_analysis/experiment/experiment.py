@@ -21,10 +21,9 @@ from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.loading import Sections, other_kind, read_yaml
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
-from msg_analysis.experiment.network_spec import NoiseSpec, SwitchingSpec
 from msg_analysis.experiment.problems import ExperimentError, problem, show
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
-from msg_analysis.experiment.spec import ExperimentSpec, Purpose, RunSpec, json_schema
+from msg_analysis.experiment.spec import ExperimentSpec, NoiseSpec, Purpose, RunSpec, SwitchingSpec, json_schema
 from msg_analysis.experiment.variants import Variants
 from msg_analysis.protocol import Network
 

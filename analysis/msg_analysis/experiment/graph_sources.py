@@ -22,8 +22,8 @@ import numpy as np
 from msg_analysis.common.files import read_bytes
 from msg_analysis.common.text import agent_text
 from msg_analysis.experiment.graphs import Graph
-from msg_analysis.experiment.network_spec import NAME_PATTERN, GraphSpec, Link, WrittenLink, is_number
 from msg_analysis.experiment.problems import problem, show
+from msg_analysis.experiment.spec import NAME_PATTERN, GraphSpec, Link, WrittenLink, is_number
 
 _COLUMNS = ("source", "target", "weight", "type")
 _NODE = f"expected a node's name of the form {NAME_PATTERN.strip('^$')}"

@@ -23,10 +23,9 @@ from msg_analysis.experiment import graph_sources, protocols, validation
 from msg_analysis.experiment.graph_sources import ForeignGraph, GraphError
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
-from msg_analysis.experiment.network_spec import GraphSpec, NoiseSpec
 from msg_analysis.experiment.problems import WEIGHT, problem, show, translate
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
-from msg_analysis.experiment.spec import ExperimentSpec, RunSpec
+from msg_analysis.experiment.spec import ExperimentSpec, GraphSpec, NoiseSpec, RunSpec
 
 
 class _StrictLoader(SAFE_LOADER):  # type: ignore[misc]  # one of two classes: see there

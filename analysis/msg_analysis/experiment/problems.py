@@ -15,8 +15,7 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.network_spec import GraphSpec
-from msg_analysis.experiment.spec import ExperimentSpec
+from msg_analysis.experiment.spec import ExperimentSpec, GraphSpec
 
 _LONGEST_VALUE = 60
 _MOST_LINES = 100  # problems shown; a file with more mostly repeats one of them

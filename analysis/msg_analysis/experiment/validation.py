@@ -15,9 +15,8 @@ from msg_analysis.common.arrays import BoolArray, FloatArray
 from msg_analysis.common.text import agent_name, agent_text, listed
 from msg_analysis.experiment.graphs import Graph, hops, widest_reaching
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
-from msg_analysis.experiment.network_spec import LossSpec, NoiseGain, NoiseSpec, SwitchingSpec
 from msg_analysis.experiment.problems import problem, show
-from msg_analysis.experiment.spec import LeadersSpec, Purpose, RunSpec
+from msg_analysis.experiment.spec import LeadersSpec, LossSpec, NoiseGain, NoiseSpec, Purpose, RunSpec, SwitchingSpec
 
 if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
