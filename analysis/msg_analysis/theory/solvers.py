@@ -173,12 +173,7 @@ class IterativeSolver:
     """Steady moments and duals of one system; starts from ``guess`` (n, d, d), steady moments of a similar one."""
 
     def __init__(
-        self,
-        system: JumpSystem,
-        guess: FloatArray | None = None,
-        *,
-        chunk: int = CHUNK,
-        single_from: int = SINGLE_FROM,
+        self, system: JumpSystem, guess: FloatArray | None = None, *, chunk: int = CHUNK, single_from: int = SINGLE_FROM
     ) -> None:
         self._chunk, self._equations = chunk, CoupledEquations(system, single_from=single_from)
         self._averaged = averaged_equations(self._equations)

@@ -28,12 +28,12 @@ from msg_analysis.theory.fourth_moments import (
     random_steps,
     second_radius,
 )
+from msg_analysis.theory.graph_indices import two_topology
 from msg_analysis.theory.leaders import select_leaders, system_error
 from msg_analysis.theory.prediction import stationary_start_factor
 from msg_analysis.theory.settling import asymptotic_rates
 from msg_analysis.theory.solvers import DenseSolver, IterativeSolver
 from msg_analysis.theory.transient import solve_transient
-from msg_analysis.theory.two_graphs import two_topology
 
 GRAPHS = {"a": {"arcs": [[1, 2], [2, 3, 0.7], [3, 1]]}, "b": {"edges": [[1, 2, 0.5]]}}
 PAIR = {"a": {"edges": [[1, 2]]}, "b": {"arcs": [[1, 2, 0.5]]}}

@@ -14,8 +14,8 @@ from switching_systems import network
 from experiments import predict
 from msg_analysis.errors import InputError
 from msg_analysis.theory import jump_system as systems
+from msg_analysis.theory.graph_indices import MAX_UNKNOWNS, two_topology
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.two_graphs import MAX_UNKNOWNS, two_topology
 
 MODELS = settings(max_examples=25, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
