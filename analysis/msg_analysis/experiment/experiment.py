@@ -375,11 +375,10 @@ class Experiment(Variants):
         InputError
             an impossible count, gain or law; no count in consensus; too many sets; no set that reaches all agents
         """
-        from msg_analysis.theory.leader_search import ignore
         from msg_analysis.theory.leaders import select_leaders
 
         self.require_available("predict")
-        return select_leaders(self, count, method=method, law=law, gain=gain, top=top, watch=watch or ignore)
+        return select_leaders(self, count, method=method, law=law, gain=gain, top=top, watch=watch)
 
     def require_available(self, purpose: Purpose = "run") -> None:
         """Refuse an experiment that asks for something that this version cannot do.

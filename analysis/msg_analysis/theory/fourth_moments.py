@@ -49,12 +49,6 @@ class RandomSteps:
     # (k, d) with orthonormal columns: z = embedding @ y before, y = embedding^T z after; None: z is y
     embedding: FloatArray | None
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Modes n, and dimension d."""
-        k = len(self.stages[0][0].matrix)
-        return len(self.chain), k if self.embedding is None else self.embedding.shape[1]
-
 
 def random_steps(step: StepModel, system: JumpSystem) -> RandomSteps:
     """The steps of ``system``, made of ``step`` by ``jump_system.emulated``, in its coordinates y."""
@@ -140,18 +134,16 @@ def fourth_moment(step: StepModel, system: JumpSystem) -> FourthMoment:
 
 def fourth_radius(steps: RandomSteps) -> float | None:
     """Spectral radius of the map of the fourth moments, by Arnoldi on tensors (n, d, d, d, d); None: not found."""
-    n, d = steps.shape
+    n, k = len(steps.chain), len(steps.stages[0][0].matrix)
+    d = k if steps.embedding is None else steps.embedding.shape[1]
     start = _symmetric(np.multiply.outer(np.eye(d), np.eye(d)))
     return _positive_radius(lambda stack: advance(steps, stack), np.broadcast_to(start, (n, d, d, d, d)))
 
 
 def second_radius(system: JumpSystem) -> float | None:
     """Spectral radius of the second moments, C_j -> sum_i P_ij K_i[C_i]; None: not found."""
-
-    def after(stack: FloatArray) -> FloatArray:
-        return np.asarray(np.tensordot(system.chain, system.propagate(stack), axes=(0, 0)))
-
-    return _positive_radius(after, np.broadcast_to(np.eye(system.dimension), system.matrices.shape))
+    start = np.broadcast_to(np.eye(system.dimension), system.matrices.shape)
+    return _positive_radius(lambda stack: np.tensordot(system.chain, system.propagate(stack), axes=(0, 0)), start)
 
 
 def advance(steps: RandomSteps, stack: FloatArray) -> FloatArray:

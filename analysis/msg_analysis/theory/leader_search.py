@@ -42,14 +42,10 @@ class SetFunction(Protocol):
         """E(S) of a set that reaches all agents."""
 
 
-def ignore(_stage: str, _done: int, _total: int, _best: float) -> None:
-    """A ``SearchProgress`` that does nothing."""
-
-
 class LeaderSearch:
     """One search, which keeps the value of every set that it has evaluated; agents count from 0."""
 
-    def __init__(self, function: SetFunction, watch: SearchProgress = ignore) -> None:
+    def __init__(self, function: SetFunction, watch: SearchProgress | None = None) -> None:
         self._function = function
         self._watch = watch
         self._known: dict[Leaders, float] = {}
@@ -206,7 +202,8 @@ class LeaderSearch:
 
     def _advance(self, done: int, best: float) -> None:
         self._done += done
-        self._watch(self._stage, min(self._done, self._total), self._total, best)
+        if self._watch:
+            self._watch(self._stage, min(self._done, self._total), self._total, best)
 
 
 def _ranked(sets: list[tuple[float, Leaders]]) -> list[tuple[float, Leaders]]:

@@ -27,7 +27,7 @@ from msg_analysis.experiment.spec import LeadersSpec
 from msg_analysis.model.step_model import build_run_model
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.jump_system import JumpSystem
-from msg_analysis.theory.leader_search import Leaders, LeaderSearch, SearchProgress, ignore
+from msg_analysis.theory.leader_search import Leaders, LeaderSearch, SearchProgress
 from msg_analysis.theory.moments import MomentSolver
 
 SelectionLaw = Literal["continuous", "emulated", "discrete"]
@@ -246,7 +246,7 @@ def select_leaders(
     law: SelectionLaw | None = None,
     gain: float | None = None,
     top: int = 10,
-    watch: SearchProgress = ignore,
+    watch: SearchProgress | None = None,
 ) -> Selection:
     """The set of leaders with the least system error, or a good one; arguments and errors of ``Experiment.leaders``."""
     _check(method in get_args(SearchMethod), f"method {method}: expected one of {', '.join(get_args(SearchMethod))}")
@@ -266,7 +266,7 @@ def select_leaders(
     problem = LeaderProblem(experiment, resolve_law(experiment, law), gain)
     sets = math.comb(experiment.agents, count)
     chosen_method = method if method != "auto" else "exhaustive" if sets <= AUTO_SETS else "swap"
-    search = LeaderSearch(problem, lambda stage, *rest: watch(with_names(stage, experiment.names), *rest))
+    search = LeaderSearch(problem, watch and (lambda stage, *rest: watch(with_names(stage, experiment.names), *rest)))
     order: list[int] = []
     bound: float | None = None
     if chosen_method == "exhaustive":

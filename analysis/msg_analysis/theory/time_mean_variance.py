@@ -66,20 +66,16 @@ def mean_variance(prediction: Prediction, *, most_work: float = MAX_WORK) -> Mea
     system, solver, losses = prediction.system, prediction.solver, prediction.step.losses
     if not system.dimension:
         return MeanVariance(0.0, 0.0, True)
-    rank = _most_followed(system.modes, most_work)
-    if system.dimension <= rank:
+    # The largest dimension whose M is followed along the path, with so many graphs.
+    largest = next(d for d in range(1, 1000) if system.modes * float(packed_symmetric.size(d + 1)) ** 3 > most_work)
+    if system.dimension <= largest:
         return MeanVariance(*_variance(solver, prediction.steady, losses, follow=True), followed=True)
     rough = _variance(solver, prediction.steady, losses, follow=False)
-    principal = MomentSolver(_principal(system, prediction.steady, rank))
+    principal = MomentSolver(_principal(system, prediction.steady, largest))
     steady = principal.steady()
     exact, near = (_variance(principal, steady, losses, follow=follow) for follow in (True, False))
     path, replica = (max(a + b - c, 0.0) for a, b, c in zip(rough, exact, near, strict=True))
     return MeanVariance(path, replica, followed=False)
-
-
-def _most_followed(modes: int, most_work: float) -> int:
-    """Largest dimension whose M is followed along the path, with so many graphs."""
-    return max(1, next(d for d in range(1, 1000) if modes * float(packed_symmetric.size(d + 1)) ** 3 > most_work))
 
 
 def _principal(system: JumpSystem, steady: FloatArray, rank: int) -> JumpSystem:
