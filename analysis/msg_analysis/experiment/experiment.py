@@ -73,11 +73,9 @@ class Experiment(Variants):
     protocol: ChosenProtocol | None = None
 
     def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, Experiment)
-            and self.spec == other.spec
-            and list(self.spec.graphs) == list(other.spec.graphs)
-        )
+        if not isinstance(other, Experiment):
+            return False
+        return self.spec == other.spec and list(self.spec.graphs) == list(other.spec.graphs)
 
     __hash__ = None  # type: ignore[assignment]  # the document has lists in it
 

@@ -71,11 +71,7 @@ class Graph:
     @property
     def arcs(self) -> list[tuple[int, int, float]]:
         """(source, target, weight) of every arc, agents from 1: target listens to source. Sorted by target, source."""
-        targets, sources = np.nonzero(self.adjacency)
-        return [
-            (int(source) + 1, int(target) + 1, float(self.adjacency[target, source]))
-            for target, source in zip(targets, sources, strict=True)
-        ]
+        return [(s + 1, t + 1, float(self.adjacency[t, s])) for t, s in np.argwhere(self.adjacency).tolist()]
 
     @property
     def edges(self) -> list[tuple[int, int, float]]:

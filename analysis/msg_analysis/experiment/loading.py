@@ -38,9 +38,8 @@ class _StrictLoader(SAFE_LOADER):  # type: ignore[misc]  # one of two classes: s
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
                 if key.value in seen:
-                    raise yaml.constructor.ConstructorError(
-                        None, None, f"key '{key.value}' appears twice: remove one", key.start_mark
-                    )
+                    text = f"key '{key.value}' appears twice: remove one"
+                    raise yaml.constructor.ConstructorError(None, None, text, key.start_mark)
                 seen.add(key.value)
         return dict(super().construct_mapping(node, deep))
 
@@ -375,11 +374,9 @@ class Sections:
         try:
             numbers, names = graph_sources.numbered(sources.values(), given)
         except KeyError as error:
-            wanted = f"expected one of the names {listed(given or [])}"
-            place = next(self.keys[name] for name, graph in sources.items() if error.args[0] in graph.nodes)
-            self.problems.append(
-                problem(place, f"node {show(error.args[0])}", wanted, "correct it, or add it to `names`")
-            )
+            node, wanted = error.args[0], f"expected one of the names {listed(given or [])}"
+            place = next(self.keys[name] for name, graph in sources.items() if node in graph.nodes)
+            self.problems.append(problem(place, f"node {show(node)}", wanted, "correct it, or add it to `names`"))
             return False
         graphs |= {name: graph_sources.as_spec(graph, numbers) for name, graph in self._foreign.items()}
         graphs |= {name: graph_sources.with_numbers(graphs[name], numbers) for name in named}

@@ -201,9 +201,8 @@ class AgentProtocol:
 
     def step(self, k: int, mode: int, state: FloatArray, heard: Heard, noise: FloatArray) -> FloatArray:
         """State (S, R) after step k: see ``Protocol.step``."""
-        return self._guard(
-            f"{self._agent}, step {k}", lambda: _array(self._protocol.step(k, mode, state, heard, noise), state.shape)
-        )
+        step, place = self._protocol.step, f"{self._agent}, step {k}"
+        return self._guard(place, lambda: _array(step(k, mode, state, heard, noise), state.shape))
 
 
 def _states(protocol: Protocol) -> int:

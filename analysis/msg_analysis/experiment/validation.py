@@ -44,19 +44,14 @@ def chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tupl
     if not given:
         if len(names) == 1:
             return MarkovChain(time, np.array([[0.0 if time == "continuous" else 1.0]])), found
-        line = problem(
-            "switching", "missing", f"expected {wanted}, since there are {len(names)} graphs", f"add {wanted}"
-        )
-        return None, [*found, line]
+        why = f"expected {wanted}, since there are {len(names)} graphs"
+        return None, [*found, problem("switching", "missing", why, f"add {wanted}")]
     if len(given) > 1:
-        line = problem("switching", " and ".join(given), "expected one of them", "remove the others")
-        return None, [*found, line]
+        return None, [*found, problem("switching", " and ".join(given), "expected one of them", "remove the others")]
     key = given[0]
     if (key == "transition") != (time == "discrete"):
-        line = problem(
-            f"switching.{key}", f"given in {time} time", f"expected {wanted}", f"give {wanted}, or change `time`"
-        )
-        return None, [*found, line]
+        remedy = f"give {wanted}, or change `time`"
+        return None, [*found, problem(f"switching.{key}", f"given in {time} time", f"expected {wanted}", remedy)]
     if switching.scale != 1.0 and key != "rates":
         found.append(problem("switching.scale", switching.scale, "expected with rates only", "remove it"))
     if switching.rates is not None:
@@ -232,9 +227,8 @@ def leader_problems(
         return [problem("leaders", "missing", wanted, "for example leaders: {agents: [1], gain: 1.0}")]
     found = []
     for label in sorted(label for label in set(leaders.agents) if leaders.agents.count(label) > 1):
-        found.append(
-            problem("leaders.agents", f"{agent_text(label, names)} twice", "expected every leader once", "remove one")
-        )
+        who = agent_text(label, names)
+        found.append(problem("leaders.agents", f"{who} twice", "expected every leader once", "remove one"))
     if agents is None:
         return found
     for label in leaders.agents:

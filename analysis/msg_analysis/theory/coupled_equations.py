@@ -121,9 +121,8 @@ class CoupledEquations:
         flow = flow - np.diag(np.diag(flow))
         self.reversible = bool((np.abs(flow - flow.T) <= 1e-13 * (flow + flow.T)).all())
         # In the inner product with the weights; ``inner.definite`` checks that every graph is symmetric, too.
-        self.definite = (
-            system.time == "continuous" and self.reversible and len(self._levels) == 1 and self.whole.definite
-        )
+        symmetric = system.time == "continuous" and self.reversible
+        self.definite = symmetric and len(self._levels) == 1 and self.whole.definite
 
     @cached_property
     def modes(self) -> LocalSolves:
@@ -142,9 +141,7 @@ class CoupledEquations:
             return other
         other.modes = self.modes.single()
         other.drift, other.rates, other.leaving = other.modes.drift, single(self.rates), single(self.leaving)
-        other._levels = [
-            Level(single(level.average), single(level.members), level.solves.single()) for level in self._levels
-        ]
+        other._levels = [Level(single(law), single(members), solves.single()) for law, members, solves in self._levels]
         return other
 
     @property

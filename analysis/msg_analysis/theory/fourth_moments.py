@@ -195,11 +195,8 @@ def lyapunov_bound(system: JumpSystem) -> float:
     best = math.inf
     for _ in range(BOUND_FORMS):
         inverse = np.linalg.inv(np.linalg.cholesky(forms))
-        grown = (
-            inverse[:, None]
-            @ (transposed[:, None] @ forms[None] @ system.matrices[:, None])
-            @ (inverse.transpose(0, 2, 1)[:, None])
-        )
+        after = transposed[:, None] @ forms[None] @ system.matrices[:, None]
+        grown = inverse[:, None] @ after @ inverse.transpose(0, 2, 1)[:, None]
         largest = np.linalg.eigvalsh(grown)[..., -1]  # (n, n) of i and j
         best = min(best, float((system.chain * largest**2).sum(axis=1).max()))
         forms = transposed @ np.tensordot(system.chain, forms, axes=1) @ system.matrices
@@ -242,13 +239,13 @@ def _positive_radius(after: Callable[[FloatArray], FloatArray], start: FloatArra
         return 0.0
     if size <= 4:
         return float(np.abs(np.linalg.eigvals([after(one.reshape(start.shape)).ravel() for one in np.eye(size)])).max())
-    operator = scipy.sparse.linalg.LinearOperator(
-        (size, size), matvec=lambda packed: after(packed.reshape(start.shape)).ravel(), dtype=float
-    )
+
+    def step(packed: FloatArray) -> FloatArray:
+        return after(packed.reshape(start.shape)).ravel()
+
+    operator, begin = scipy.sparse.linalg.LinearOperator((size, size), matvec=step, dtype=float), start.ravel()
     try:
-        values = scipy.sparse.linalg.eigs(
-            operator, k=1, v0=start.ravel(), tol=1e-9, maxiter=1000, return_eigenvectors=False
-        )
+        values = scipy.sparse.linalg.eigs(operator, k=1, v0=begin, tol=1e-9, maxiter=1000, return_eigenvectors=False)
     except scipy.sparse.linalg.ArpackError:  # also where it does not converge
         return None
     return float(np.abs(values).max())

@@ -142,11 +142,9 @@ class LeaderSearch:
             gains = [max(value - self._least(base, v), 0.0) for v in range(self._function.agents) if v not in base]
             gains.sort(reverse=True)
             kept = sorted(least_worth[agent] for agent in base)
-            # shared: how many agents T has in common with A.
+            # How many agents T may have in common with A.
             shares = range(max(0, count - len(gains)), min(count, len(base)) + 1)
-            bounds.append(
-                min(value - sum(gains[: count - shared]) + sum(kept[: len(base) - shared]) for shared in shares)
-            )
+            bounds.append(min(value - sum(gains[: count - s]) + sum(kept[: len(base) - s]) for s in shares))
         return min(max(bounds), self._value(leaders))  # rounding must not lift it above
 
     def evaluated(self, count: int, top: int) -> list[tuple[float, Leaders]]:

@@ -218,9 +218,8 @@ def system_error(
     InputError
         the experiment does not have this law, or E(S) cannot be computed
     """
-    return LeaderProblem(experiment, resolve_law(experiment, law), gain).system_error(
-        frozenset(experiment.indices(agents))
-    )
+    problem = LeaderProblem(experiment, resolve_law(experiment, law), gain)
+    return problem.system_error(frozenset(experiment.indices(agents)))
 
 
 def joint_robustness_centrality(
@@ -277,9 +276,8 @@ def select_leaders(
         if count > 1 and problem.supermodular and not problem.unreached(frozenset(order)):
             bound = search.bound(frozenset(order))
         found = search.evaluated(count, top)
-    _check(
-        bool(found), f"count {count}: no set of {count} reaches all agents in the union of all graphs: use more leaders"
-    )
+    unreached = f"count {count}: no set of {count} reaches all agents in the union of all graphs: use more leaders"
+    _check(bool(found), unreached)
     if chosen_method == "exhaustive" or count == 1:  # a single leader: all of them were evaluated
         bound = found[0][0]
     result = [(error, _numbers(sorted(agents))) for error, agents in found]

@@ -200,7 +200,7 @@ class _Period:
     def __init__(self, size: int) -> None:
         self.matrix, self.noise = np.eye(size), np.zeros((size, size))
         self.into, self.differences = np.empty((0, size)), np.empty((0, size))
-        self.acts: list[FloatArray] = []  # row by row, R of ``loss_events``
+        self.acts: list[FloatArray] = []  # row by row, R of ``LossEvents``
         self.moves: list[Move] = []
 
     def step(

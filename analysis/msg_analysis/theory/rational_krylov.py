@@ -60,9 +60,8 @@ class RationalFlow(Flow):
 
     def rotated(self, z: FloatArray) -> FloatArray:
         """(k,) of the start, the only z that is represented."""
-        return np.asarray(
-            self._basis @ self._joined(packed_symmetric.unpack(z[:, :-1], self._system.dimension), z[:, -1])
-        )
+        moments = packed_symmetric.unpack(z[:, :-1], self._system.dimension)
+        return np.asarray(self._basis @ self._joined(moments, z[:, -1]))
 
     def restored(self, y: FloatArray) -> FloatArray:
         """(n, p + 1) of (k,)."""
@@ -72,9 +71,8 @@ class RationalFlow(Flow):
     def _build(self, start: FloatArray, slow: float) -> None:
         """Extend the space until the course does not change any more."""
         system = self._system
-        fast = 2.0 * float(np.linalg.norm(system.matrices, 2, axis=(1, 2)).max()) + float(
-            -system.chain.diagonal().min()
-        )
+        largest = float(np.linalg.norm(system.matrices, 2, axis=(1, 2)).max())
+        fast = 2.0 * largest - float(system.chain.diagonal().min())
         basis = [start / np.linalg.norm(start)]
         images = [self._apply(basis[0])]
         before, calm = np.zeros((0, 0)), 0

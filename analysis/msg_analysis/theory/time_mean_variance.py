@@ -234,9 +234,8 @@ def _moments_of_path(system: JumpSystem, moved: FloatArray, losses: list[list[_L
     noise = packed_symmetric.pack(system.noise)  # (n, p)
     cross = packed_symmetric.pack(moved)[:, :, None] * noise[:, None, :]
     added = cross + cross.transpose(0, 2, 1) + law * noise[:, :, None] * noise[:, None, :]
-    spreads = (
-        [_LossSpread(step, some) for step, some in zip(system.matrices, losses, strict=True)] if system.lossy else []
-    )
+    pairs = zip(system.matrices, losses, strict=True) if system.lossy else ()
+    spreads = [_LossSpread(step, some) for step, some in pairs]
     moments, spread = np.zeros_like(added), np.zeros_like(added)
     for _ in range(MAX_ROUNDS):
         twice = JumpSystem(

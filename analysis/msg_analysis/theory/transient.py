@@ -18,7 +18,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.resources import few_blas_threads
 from msg_analysis.common.text import markdown_table, number_text
 from msg_analysis.errors import InputError
-from msg_analysis.model.step_model import build_run_model
+from msg_analysis.model.step_model import build_run_model, first_graph
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.jump_system import JumpSystem
@@ -120,9 +120,7 @@ def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray)
     """The start that the experiment defines, for one of its laws; ``stationary``: (n, d, d) steady second moments."""
     law = system.stationary
     if experiment.switching.initial != "stationary":
-        law = system.of_modes(
-            np.array([float(graph.name == experiment.switching.initial) for graph in experiment.graph_list])
-        )
+        law = system.of_modes(first_graph(experiment))
     start = experiment.run.start
     if start == "stationary":
         return Snapshot(law, np.zeros((system.modes, system.dimension)), system.started_steady(stationary, law))
@@ -319,9 +317,8 @@ def _system(experiment: Experiment, law: TransientLaw) -> tuple[JumpSystem, floa
     if experiment.protocol:
         raise InputError(f"law continuous: {experiment.protocol.info} has steps only: leave it out")
     if noise.steps_only:
-        raise InputError(
-            "law continuous: noise.broadcast, link, loss and delay belong to steps, expected 0: leave it out"
-        )
+        belong = "noise.broadcast, link, loss and delay belong to steps, expected 0"
+        raise InputError(f"law continuous: {belong}: leave it out")
     return systems.continuous(experiment), None
 
 
@@ -332,7 +329,6 @@ def _steps(times: FloatArray, unit: float | None) -> FloatArray:
     steps = np.round(times / unit)
     wrong = np.abs(times - steps * unit) > 1e-9 * np.maximum(np.abs(times), unit)
     if wrong.any():
-        raise InputError(
-            f"times: {times[wrong][0]:g} is not a multiple of the step {unit:g}: correct it, or use the law continuous"
-        )
+        place = f"{times[wrong][0]:g} is not a multiple of the step {unit:g}"
+        raise InputError(f"times: {place}: correct it, or use the law continuous")
     return np.asarray(steps)

@@ -283,10 +283,8 @@ def test_bursts_as_short_as_those_of_independent_losses(pace, on_loss):
 
 
 def test_longer_bursts_of_a_held_value_are_worse():
-    errors = [
-        predict(line_and_ring(loss={"edges": [[2, 3, 0.5]]}, on_loss="hold", burst=b)).emulated.system_error
-        for b in (2, 8, 40)
-    ]
+    laws = [line_and_ring(loss={"edges": [[2, 3, 0.5]]}, on_loss="hold", burst=burst) for burst in (2, 8, 40)]
+    errors = [predict(law).emulated.system_error for law in laws]
     assert errors == sorted(errors)
 
 

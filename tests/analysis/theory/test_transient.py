@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from switching_systems import LINE_RING, network, steady_of
 
-from experiments import Experiment, predict
+from experiments import Experiment, line_ring, predict
 from msg_analysis.errors import InputError
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory import transient
@@ -176,10 +176,7 @@ def test_large_systems_are_reduced_without_loss(rate, kind):
 def test_sixty_agents_in_continuous_time():
     """A path that gains an edge at times, against one graph's closed form when the chain is left out."""
     m = 60
-    document = LINE_RING | {
-        "graphs": {"line": {"path": list(range(1, m + 1))}, "ring": {"cycle": list(range(1, m + 1))}}
-    }
-    experiment = Experiment.parse(document)
+    experiment = line_ring(m, 0.5)
     system = systems.held(systems.continuous(experiment), 0)
     values = np.linalg.eigvalsh(experiment.graph_list[0].laplacian)[1:]
     times = np.array([0.0, 0.01, 1.0, 30.0, 1e4])

@@ -169,12 +169,8 @@ def test_what_is_refused():
     with pytest.raises(InputError, match="1 graphs, expected 2"):
         two_topology(systems.held(system, 0))
     m = 80
-    large = dataclasses.replace(
-        system,
-        matrices=np.broadcast_to(np.eye(m), (2, m, m)),
-        noise=np.broadcast_to(np.eye(m), (2, m, m)),
-        lift=np.eye(m),
-    )
+    both = np.broadcast_to(np.eye(m), (2, m, m))
+    large = dataclasses.replace(system, matrices=both, noise=both, lift=np.eye(m))
     assert m * (m + 1) // 2 > MAX_UNKNOWNS
     with pytest.raises(InputError, match="80 agents"):
         two_topology(large)
