@@ -296,15 +296,10 @@ def test_noise_that_does_not_show_instability_hides_nothing(process):
 
 def test_agents_without_errors_have_no_certainty():
     """Noise at the end of a chain that nobody listens to: the others follow the leader exactly."""
-    given = {
-        "name": "chain",
-        "problem": "tracking",
-        "graphs": {"a": {"arcs": [[1, 2], [2, 3]]}, "b": {"arcs": [[1, 2], [1, 3]]}},
-        "switching": {"generator": [[-1.0, 1.0], [1.0, -1.0]]},
-        "leaders": {"agents": [1]},
-        "noise": {"process": [0.0, 0.0, 1.0], "delay": 2},
-    }
-    law = predict(Experiment.parse(given)).to_json()["emulated"]
+    graphs = {"a": {"arcs": [[1, 2], [2, 3]]}, "b": {"arcs": [[1, 2], [1, 3]]}}
+    noise = {"process": [0.0, 0.0, 1.0], "delay": 2}
+    chain = line_ring(problem="tracking", graphs=graphs, leaders={"agents": [1]}, noise=noise)
+    law = predict(chain).to_json()["emulated"]
     assert law["node_errors"][:2] == [0.0, 0.0]
     assert law["node_certainty"][:2] == [None, None]
     assert law["node_certainty"][2] > 0.0

@@ -13,8 +13,8 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from experiments import Experiment, line_ring
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory.leaders import (
     LeaderProblem,
     joint_robustness_centrality,
@@ -262,14 +262,8 @@ def test_large_steps_get_no_guarantee() -> None:
 def test_agents_that_hear_nobody_must_lead() -> None:
     """Agents 1 and 6 only speak: whoever leads, they must."""
     arcs = [[1, 2], [2, 3], [3, 4], [4, 3], [6, 5], [5, 4]]
-    document = {
-        "name": "roots",
-        "problem": "tracking",
-        "graphs": {"g": {"arcs": arcs}},
-        "leaders": {"agents": [1, 6]},
-        "run": {"dt": 0.1, "duration": 10},
-    }
-    experiment = Experiment.parse(document)
+    graphs = {"g": {"arcs": arcs}}
+    experiment = line_ring(problem="tracking", graphs=graphs, switching={}, leaders={"agents": [1, 6]})
     assert system_error(experiment, [2, 3]) == math.inf
     assert joint_robustness_centrality(experiment, [2, 3]) == 0.0
     for method in ("exhaustive", "greedy", "swap"):
