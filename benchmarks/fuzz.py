@@ -33,6 +33,7 @@ from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import loading
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.experiment.validation import unavailable
 from msg_analysis.inference.pool import compare
 from msg_analysis.report.documents import describe_bag, describe_experiment
 
@@ -109,7 +110,7 @@ def fuzz_experiment(seed: int, files: list[Path], folder: Path) -> str:
     target.write_bytes(data)
     try:
         experiment = Experiment.load(target)
-        experiment.unavailable()
+        unavailable(experiment)
         if max(experiment.agents, experiment.chain.modes) <= SMALL:
             describe_experiment(experiment)
             assert Experiment.parse(experiment.to_document()).to_document() == experiment.to_document()

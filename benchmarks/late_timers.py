@@ -13,11 +13,10 @@ import numpy as np
 
 from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.agent_law import ProcessNoise
 from msg_analysis.model.graph_path import mode_path
-from msg_analysis.model.phases import phases
-from msg_analysis.model.process_noise import ProcessNoise
 from msg_analysis.model.run import Completeness, Run
-from msg_analysis.model.step_model import StepModel, build_step_model
+from msg_analysis.model.step_model import StepModel, build_step_model, phases
 from msg_analysis.twin.simulate import new_record
 
 Lateness = Callable[[np.random.Generator], float]

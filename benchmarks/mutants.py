@@ -42,7 +42,8 @@ TESTS = {
     "analysis/msg_analysis/messages/acceptance.py": "tests/analysis/wire/test_receiving.py",
 }
 ENOUGH = 0.85  # of all changes
-OURS = ("msg_", "test", "conftest", "_pytest", "__main__", "rclpy")  # not imported before the fork
+SUPPORT = [file.stem for file in (ROOT / "tests/support").glob("*.py")]
+OURS = ("msg_", "test", "conftest", "_pytest", "__main__", "rclpy", *SUPPORT)  # not imported before the fork
 
 
 class Changed(importlib.abc.MetaPathFinder, importlib.abc.Loader):

@@ -9,6 +9,7 @@ import pytest
 
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
+from msg_analysis.experiment.validation import unavailable
 from msg_analysis.protocol import Protocol
 from msg_analysis.twin.simulate import simulate
 
@@ -61,7 +62,7 @@ def missing_laws(messages: str, pace: Pace, purpose: Any) -> list[str]:
     return [
         law
         for law in LAWS
-        if any(experiment(messages, law, pace, process).unavailable(purpose) for process in PROCESS_NOISE)
+        if any(unavailable(experiment(messages, law, pace, process), purpose) for process in PROCESS_NOISE)
     ]
 
 
@@ -79,5 +80,5 @@ def test_what_it_says_runs_does(law: str, messages: str) -> None:
     """Ten steps of the twin in both paces."""
     for pace in ("lockstep", "realtime"):
         what = experiment(messages, law, pace)  # type: ignore[arg-type]
-        assert what.unavailable() == []
+        assert unavailable(what) == []
         assert simulate(what.with_run(duration=0.5)).completeness.complete

@@ -30,8 +30,8 @@ from msg_agents.environment import node_environment
 from msg_agents.run.result import read_steps
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.inference.pool import compare
-from msg_analysis.model.phases import phases
 from msg_analysis.model.run import Run
+from msg_analysis.model.step_model import phases
 from msg_analysis.twin.check import check
 
 # 100 steps a second for 4 s, and for 2 s where nobody is killed or stopped in the middle.

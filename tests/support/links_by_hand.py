@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.model.phases import phases
 from msg_analysis.model.run import Run
-from msg_analysis.model.step_model import StepModel
+from msg_analysis.model.step_model import StepModel, phases, step_noise_gain
 
 BLOCK = 256
 PROCESS, BROADCAST, LINK, LOSS = 3, 4, 5, 6  # numbers of the streams
@@ -24,7 +23,7 @@ class Links:
         self._noise, self._loss, self._replicas = what.noise, what.loss.tolist(), what.run.replicas
         self._key = np.random.SeedSequence(what.run.seed).generate_state(2, np.uint64)
         self.normal, self._uniform, self._chain = cache(self._normals), cache(self._uniforms), cache(self._fates)
-        gain = model.noise_gain if isinstance(model, StepModel) else what.step_noise_gain
+        gain = model.noise_gain if isinstance(model, StepModel) else step_noise_gain(what)
         self.sources = cache(lambda g, i: [(j, w) for j, w in enumerate(gain[g][i].tolist()) if w])
         self.senders = cache(lambda g, i: model.neighbours(g, i).tolist())
         self.inputs = cache(lambda g, i: [(j, float(model.nominal[g, i, j])) for j in model.inputs(g, i).tolist()])

@@ -10,8 +10,8 @@ import numpy as np
 import scipy.linalg
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.model.phases import phases
 from msg_analysis.model.run import Completeness, Run
+from msg_analysis.model.step_model import phases
 from msg_analysis.twin.simulate import new_record
 
 

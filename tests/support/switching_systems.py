@@ -1,5 +1,7 @@
 """Experiments for tests of the theory: the line and the ring, and random graphs under random chains."""
 
+import itertools
+
 import networkx as nx
 import numpy as np
 import scipy.linalg
@@ -13,15 +15,21 @@ from msg_analysis.theory.moments import MomentSolver
 LINE_RING = document(5, 0.5, noise={"process": 1.0}, run={"duration": 10, "replicas": 1})
 
 
-def network(seed, m, n, *, time="continuous", problem="consensus", directed=True, **run):
+def network(
+    seed, m, n, *, time="continuous", problem="consensus", directed=True, noise=None, rate=1.0, gain=0.8, dt=0.05
+):
+    """Random weighted graphs, each of which holds all agents together, and a random chain; noise None: correlated."""
     random = np.random.default_rng(seed)
     graphs = {}
     for i in range(n):
-        links = [[a, a + 1, float(random.uniform(0.3, 1.5))] for a in range(1, m)]
+        order = (random.permutation(m) + 1).tolist()
+        pairs = [*itertools.pairwise(order), *random.integers(1, m + 1, (m // 2, 2)).tolist()]
         if directed:
-            links += [[m, 1, float(random.uniform(0.3, 1.5))]] if m > 2 else []
-        graphs[f"g{i}"] = {"arcs" if directed else "edges": links}
-    chain = random.uniform(0.1, 1.0, (n, n))
+            pairs.append((order[-1], order[0]))
+        links = {tuple(pair) if directed else tuple(sorted(pair)) for pair in pairs if pair[0] != pair[1]}
+        kind = "arcs" if directed else "edges"
+        graphs[f"g{i}"] = {kind: [[*pair, float(random.uniform(0.3, 1.5))] for pair in sorted(links)]}
+    chain = rate * random.uniform(0.1, 1.0, (n, n))
     if time == "continuous":
         np.fill_diagonal(chain, 0.0)
         switching = {"generator": (chain - np.diag(chain.sum(axis=1))).tolist()}
@@ -34,11 +42,11 @@ def network(seed, m, n, *, time="continuous", problem="consensus", directed=True
         "agents": m,
         "graphs": graphs,
         "switching": switching | {"initial": "g0"},
-        "noise": {"process": random.standard_normal((m, m)).tolist()},
-        "run": ({"dt": 0.05, "duration": 5} if time == "continuous" else {"duration": 10}) | run,
+        "noise": {"process": random.standard_normal((m, m)).tolist() if noise is None else noise},
+        "run": {"dt": dt, "duration": 100 * dt} if time == "continuous" else {"duration": 10},
     }
     if problem == "tracking":
-        document["leaders"] = {"agents": [1], "gain": 0.8, "reference": 2.0}
+        document["leaders"] = {"agents": [1], "gain": gain, "reference": 2.0}
     return Experiment.parse(document)
 
 

@@ -26,11 +26,10 @@ _LARGEST = 2**63 - 1
 
 
 class StepClock:
-    """Simulated time of the steps in whole nanoseconds, without rounding drift.
+    """Simulated time of the steps in whole nanoseconds, without rounding drift."""
 
-    Step k is due at (k + phase) dt, phase in [0, 1): k dt to the nearest nanosecond (half up), plus phase dt rounded
-    once. ``dt``, in units of simulated time written as seconds, counts as its decimal text: 0.1 is one tenth.
-    """
+    # Step k is due at (k + phase) dt, phase in [0, 1): k dt to the nearest nanosecond (half up), plus phase dt rounded
+    # once. dt, in units of simulated time written as seconds, counts as its decimal text: 0.1 is one tenth.
 
     def __init__(self, dt: float, phase: float = 0.0) -> None:
         step = Fraction(repr(float(dt))) * SECOND
@@ -73,11 +72,7 @@ class Stream(IntEnum):
 
 
 def generator(seed: int, stream: Stream, agent: int = 0, block: int = 0) -> np.random.Generator:
-    """The generator of one block of one agent's stream.
-
-    ``agent`` counts from 0 (0 where the stream belongs to no agent), or is a ``link_number``. ``block`` is the step //
-    STEPS_PER_BLOCK, negative for the steps before the start.
-    """
+    """The generator of one block of a stream, of an agent (from 0; 0 where there is none) or a ``link_number``."""
     return np.random.Generator(np.random.Philox(key=_key(seed), counter=_counter(stream, agent, block)))
 
 
@@ -107,8 +102,11 @@ def uniforms(seed: int, stream: Stream, agent: int, block: int, count: int) -> F
 
 
 def _reused_generator(seed: int, stream: Stream, agent: int, block: int) -> np.random.Generator:
-    """As ``generator``, valid until the next call in this thread."""
-    own = _reused.generator
+    """As ``generator``, valid until the next call in this thread: to make a new one takes 12 us."""
+    try:
+        own: np.random.Generator = _reused.generator
+    except AttributeError:
+        own = _reused.generator = np.random.Generator(np.random.Philox(key=0))
     own.bit_generator.state = {
         "bit_generator": "Philox",
         "state": {"key": _key(seed), "counter": _counter(stream, agent, block)},
@@ -120,14 +118,7 @@ def _reused_generator(seed: int, stream: Stream, agent: int, block: int) -> np.r
     return own
 
 
-class _Reused(threading.local):
-    """A generator of each thread: to make a new one takes 12 us, most of them for a seed from the system."""
-
-    def __init__(self) -> None:
-        self.generator = np.random.Generator(np.random.Philox(key=0))
-
-
-_reused = _Reused()
+_reused = threading.local()  # ``generator`` of each thread
 
 
 SLICES = 3
@@ -136,10 +127,8 @@ TERMS = 13
 
 
 def exponential(matrix: FloatArray) -> FloatArray:
-    """(m, m) exp(A) by scaling and squaring of exp(A) - I, which keeps the accuracy of small entries.
-
-    That of the libraries differs between processors, because the order of the sums in a matrix product does.
-    """
+    """(m, m) exp(A) by scaling and squaring of exp(A) - I, which keeps the accuracy of small entries."""
+    # That of the libraries differs between processors, because the order of the sums in a matrix product does.
     norm = float(np.abs(matrix).sum(axis=1).max(initial=0.0))
     squarings = max(0, math.frexp(norm)[1] + 3)
     scaled = matrix * 2.0**-squarings
@@ -153,10 +142,8 @@ def exponential(matrix: FloatArray) -> FloatArray:
 
 
 def reproducible_product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(m, m) A B, the same on every processor; its error is about 1e-16 of the largest entries of A and B.
-
-    Products of slices of few bits have sums that are exact in any order (Ozaki, Ogita, Oishi and Rump 2012).
-    """
+    """(m, m) A B, the same on every processor; its error is about 1e-16 of the largest entries of A and B."""
+    # Products of slices of few bits have sums that are exact in any order (Ozaki, Ogita, Oishi and Rump 2012).
     bits = (53 - math.frexp(len(a))[1]) // 2
     left, right = _slices(a, bits), _slices(b, bits)
     total = np.zeros(a.shape)

@@ -20,10 +20,7 @@ from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 
 
 def weighted_sum(weights: Sequence[float | FloatArray], values: Sequence[FloatArray]) -> FloatArray:
-    """sum_j weights[j] * values[j], term after term in the order given; at least one term, values of one shape.
-
-    A weight is a number, or an array that broadcasts against the values.
-    """
+    """sum_j weights[j] * values[j], term after term in the order given; at least one term, values of one shape."""
     terms = zip(values, weights, strict=True)
     value, weight = next(terms)
     total = value * weight
@@ -35,8 +32,7 @@ def weighted_sum(weights: Sequence[float | FloatArray], values: Sequence[FloatAr
 def step(weights: Sequence[float | FloatArray], values: Sequence[FloatArray], drive: FloatArray) -> FloatArray:
     """x_i(k+1) = sum_j W_ij x_j(k) + drive_i(k), for the non-zero W_ij of row i, j ascending, and values of shape (R,).
 
-    For many rows at once: weights (m, 1), padded with zeros, and values (m, R). The drive, of the shape of a value, is
-    the noise plus the offset that a reference adds to the row.
+    For many rows at once: weights (m, 1), padded with zeros, and values (m, R). The drive is noise plus offset.
     """
     total = weighted_sum(weights, values)
     total += drive
@@ -57,10 +53,7 @@ def from_payload(payload: bytes) -> FloatArray:
 
 
 def combine_with_numpy(weights: Sequence[float], payloads: Sequence[bytes], drive: bytes) -> bytes:
-    """``law.step`` on payloads of equal size: sum_j weights[j] payloads[j], term after term, plus the drive.
-
-    The kernel accepts only a tuple of weights (at least one) and a list of payloads.
-    """
+    """``step`` on payloads of equal size; the kernel accepts only a tuple of weights and a list of payloads."""
     return to_payload(step(weights, [from_payload(payload) for payload in payloads], from_payload(drive)))
 
 
@@ -95,11 +88,10 @@ class Round:
 
 @dataclass(frozen=True, slots=True)
 class Reception:
-    """What becomes of the values that agents send each other in K steps or more, over L links sorted by receiver.
+    """What becomes of the values that agents send each other in K steps or more, over L links sorted by receiver."""
 
-    The messages are those of C steps in a row, the first of which is ``delay`` before the first of the K; in step k a
-    link brings message k + ahead. So C is K, or K + 1 if one is ahead.
-    """
+    # The messages are those of C steps in a row, the first of which is ``delay`` before the first of the K; in step k a
+    # link brings message k + ahead. So C is K, or K + 1 if one is ahead.
 
     links: IntArray  # (m, m) number of the link from the sender, the column; L for an agent's own value
     first: IntArray  # (m + 1,) number of the first link to each receiver, and L
@@ -146,10 +138,7 @@ class ManySteps:
     """The steps of m agents, under each graph in one or several rounds."""
 
     def __init__(self, rounds: Sequence[Sequence[Round]], *, compiled: bool = COMPILED) -> None:
-        """``rounds[mode]`` are the rounds of a graph, in order; each agent is in one of them.
-
-        ``compiled``: else by numpy, with the same bits.
-        """
+        """``rounds[mode]``: the rounds of a graph, in order; not ``compiled``: by numpy, with the same bits."""
         self._rounds, self._compiled = rounds, compiled
         self._agents = sum(len(one.agents) for one in rounds[0])
         together = [one for of_graph in rounds for one in of_graph]
@@ -163,21 +152,17 @@ class ManySteps:
     def advance(
         self, modes: IntArray, past: FloatArray, drives: FloatArray, reception: Reception | None = None
     ) -> FloatArray:
-        """(K, m, R): x(1) to x(K) under the graphs ``modes`` (K,), from ``past``, which ends with x(0).
-
-        ``past`` (delay + 1, m, R) goes back as far as the delay of the ``reception``. ``drives`` (K, m, R) has the
-        noise of each step and what the reference adds.
-        """
+        """(K, m, R): x(1) to x(K) under the graphs ``modes`` (K,), from ``past`` (delay + 1, m, R), the last x(0)."""
+        # drives (K, m, R) has the noise of each step and what the reference adds.
         states = np.empty((len(past) + len(modes), *past.shape[1:]))
         states[: len(past)] = past
         if self._compiled:
             arrays = self._order, self._offsets, self._columns, self._weights, np.ascontiguousarray(modes)
             received: list[Any] = []
-            if reception is not None:
-                received = [reception.links, reception.first, reception.senders, reception.ahead, reception.delay]
-                received += [reception.lost]
-                received += [b"" if noise is None else noise for noise in (reception.broadcast, reception.link)]
-                received += [] if reception.held is None else [reception.held]
+            if (r := reception) is not None:
+                received = [r.links, r.first, r.senders, r.ahead, r.delay, r.lost]
+                received += [b"" if noise is None else noise for noise in (r.broadcast, r.link)]
+                received += [] if r.held is None else [r.held]
             _kernel.advance(*arrays, np.ascontiguousarray(drives), states, *past.shape[1:], *received)
         else:
             self._with_numpy(modes, states, drives, reception)

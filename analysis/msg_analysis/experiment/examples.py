@@ -44,11 +44,8 @@ def shows(name: str) -> str:
 
 
 def find(given: str | Path, folder: Path = Path()) -> Path:
-    """The file of an experiment: ``given``, relative to ``folder``, or the example of this name.
-
-    A file wins over an example, also ``given`` with the ending .yaml. What has a slash or an ending is a path, which
-    is not checked here. InputError: neither file nor example.
-    """
+    """The file of an experiment: ``given``, relative to ``folder``, or an example. InputError: neither."""
+    # A file wins over an example, also with the ending .yaml. What has a slash or an ending is a path, not checked.
     word = str(given)
     path = folder / word
     if os.sep in word or (path.exists() and not path.is_dir()):
@@ -123,14 +120,11 @@ def experiment_name(stem: str) -> str:
 def experiment_text(name: str, choices: Choices) -> str:
     """The file: every key that was chosen, and the defaults that are changed most often."""
     discrete, leaders = choices.time == "discrete", choices.leaders
+    problem, noise = "tracking" if leaders else "consensus", _number(choices.noise)
     lines = [
         "# Agents count from 1. The defaults of keys that are not here: msg-analysis schema",
         f"name: {name}",
-        _line(
-            "problem:",
-            "tracking" if leaders else "consensus",
-            "consensus: the agents agree | tracking: they follow leaders",
-        ),
+        _line("problem:", problem, "consensus: the agents agree | tracking: they follow leaders"),
         _line("time:", choices.time, "continuous: Euler steps of run.dt | discrete: W = exp(-Z), one step is 1"),
         f"agents: {choices.agents}",
         "",
@@ -139,9 +133,7 @@ def experiment_text(name: str, choices: Choices) -> str:
         *_switching(choices),
         "",
         "noise:",
-        _line(
-            "  process:", _number(choices.noise), "gain F of each agent, or a list with one for each; covariance F F^T"
-        ),
+        _line("  process:", noise, "gain F of each agent, or a list with one for each; covariance F F^T"),
         _line("  loss:", _number(choices.loss), "probability that a message is lost"),
     ]
     if leaders:

@@ -21,10 +21,9 @@ from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.loading import Sections, other_kind, read_yaml
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
-from msg_analysis.experiment.network_spec import NoiseSpec, SwitchingSpec
 from msg_analysis.experiment.problems import ExperimentError, problem, show
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
-from msg_analysis.experiment.spec import ExperimentSpec, Purpose, RunSpec, json_schema
+from msg_analysis.experiment.spec import ExperimentSpec, NoiseSpec, Purpose, RunSpec, SwitchingSpec, json_schema
 from msg_analysis.experiment.variants import Variants
 from msg_analysis.protocol import Network
 
@@ -74,11 +73,9 @@ class Experiment(Variants):
     protocol: ChosenProtocol | None = None
 
     def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, Experiment)
-            and self.spec == other.spec
-            and list(self.spec.graphs) == list(other.spec.graphs)
-        )
+        if not isinstance(other, Experiment):
+            return False
+        return self.spec == other.spec and list(self.spec.graphs) == list(other.spec.graphs)
 
     __hash__ = None  # type: ignore[assignment]  # the document has lists in it
 
@@ -167,7 +164,7 @@ class Experiment(Variants):
         network = Network(
             graphs=self.graph_list,
             dt=self.step_length,
-            noise_gain=self.step_noise_gain,
+            noise_gain=np.asarray(np.sqrt(self.step_length) * self.noise_gain),
             tracking=self.problem == "tracking",
             leader_gains=self.leader_gains,
             reference=self.reference,
@@ -376,42 +373,25 @@ class Experiment(Variants):
         InputError
             an impossible count, gain or law; no count in consensus; too many sets; no set that reaches all agents
         """
-        from msg_analysis.theory.leader_search import ignore
         from msg_analysis.theory.leaders import select_leaders
 
         self.require_available("predict")
-        return select_leaders(self, count, method=method, law=law, gain=gain, top=top, watch=watch or ignore)
+        return select_leaders(self, count, method=method, law=law, gain=gain, top=top, watch=watch)
 
-    def unavailable(self, purpose: Purpose = "run") -> list[str]:
-        """What the experiment asks for that this version cannot do, one line each.
+    def require_available(self, purpose: Purpose = "run") -> None:
+        """Refuse an experiment that asks for something that this version cannot do.
 
         Parameters
         ----------
         purpose
             "run" (simulate it or run a network) or "predict"
-        """
-        lines = self._unpredicted() if purpose == "predict" else []
-        return lines + (self.protocol.unavailable(purpose) if self.protocol else [])
-
-    def unpredictable(self) -> str | None:
-        """Why there is no prediction, as a part of a sentence; None where there is one."""
-        reason = self.protocol.unpredictable() if self.protocol else None
-        return reason or next(iter(self._unpredicted()), None)
-
-    def _unpredicted(self) -> list[str]:
-        """What has no prediction because it would be too large, apart from protocols that are not linear."""
-        network = self.graph_list, self.loss, self.leader_gains
-        return validation.too_large_to_predict(self.noise, *network, self.run.pace, self.time)
-
-    def require_available(self, purpose: Purpose = "run") -> None:
-        """Refuse an experiment with something ``unavailable``; see there for the parameters.
 
         Raises
         ------
         NotAvailableError
             lists it
         """
-        lines = self.unavailable(purpose)
+        lines = validation.unavailable(self, purpose)
         if lines and self.protocol and lines == self.protocol.unavailable(purpose):
             raise NotAvailableError(f"{self.source}: {lines[0]}")
         if lines:
@@ -458,11 +438,6 @@ class Experiment(Variants):
         return self.spec.run
 
     @property
-    def steps_only(self) -> bool:
-        """Whether the law exists only in steps, not in continuous time: noise on the air, loss, delay or a protocol."""
-        return self.noise.steps_only or self.protocol is not None
-
-    @property
     def width(self) -> int:
         """Numbers in an agent's state: the number of replicas, times the numbers in the state of a protocol."""
         protocol = self.protocol
@@ -493,8 +468,3 @@ class Experiment(Variants):
     def step_length(self) -> float:
         """Simulated time of a step, ``run.dt`` [units of simulated time]; 1 in discrete time."""
         return self.run.dt
-
-    @property
-    def step_noise_gain(self) -> FloatArray:
-        """(n, m, m) sqrt(dt) F_i: the noise that a step of the built-in law adds is this times N(0, I)."""
-        return np.asarray(np.sqrt(self.step_length) * self.noise_gain)

@@ -9,6 +9,7 @@ import csv
 import io
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
@@ -21,8 +22,8 @@ import numpy as np
 from msg_analysis.common.files import read_bytes
 from msg_analysis.common.text import agent_text
 from msg_analysis.experiment.graphs import Graph
-from msg_analysis.experiment.network_spec import NAME_PATTERN, GraphSpec, Link, WrittenLink, is_number
 from msg_analysis.experiment.problems import problem, show
+from msg_analysis.experiment.spec import NAME_PATTERN, GraphSpec, Link, WrittenLink, is_number
 
 _COLUMNS = ("source", "target", "weight", "type")
 _NODE = f"expected a node's name of the form {NAME_PATTERN.strip('^$')}"
@@ -41,24 +42,23 @@ def plain(value: Any) -> Any:
         return {key: plain(each) for key, each in value.items()}
     if isinstance(value, Path):
         return str(value)
-    return _rows(value) if _is_array(value) else value
+    if _is_array(value):
+        return np.asarray(value.toarray() if hasattr(value, "toarray") else value).tolist()
+    return value
 
 
 def _is_array(value: object) -> bool:
     return hasattr(value, "toarray") or hasattr(value, "__array__")
 
 
-def _rows(value: Any) -> Any:
-    return np.asarray(value.toarray() if hasattr(value, "toarray") else value).tolist()
-
-
-def plain_document(mapping: Mapping[Any, Any]) -> dict[Any, Any]:
-    """The document, in which a graph that is an array is one that has this ``adjacency``."""
-    graphs = mapping.get("graphs")
+def plain_document(mapping: Mapping[Any, Any]) -> tuple[dict[Any, Any], dict[str, Any]]:
+    """The document, in which arrays have become graphs with this ``adjacency``; and its graphs of networkx, by name."""
+    graphs, found = mapping.get("graphs"), {}
     if isinstance(graphs, Mapping):
+        found = {name: graph for name, graph in graphs.items() if _is_networkx(graph)}
         made = {name: {"adjacency": graph} if _is_array(graph) else graph for name, graph in graphs.items()}
-        mapping = {**mapping, "graphs": made}
-    return {key: plain(each) for key, each in mapping.items()}
+        mapping = {**mapping, "graphs": made | {name: {"edges": []} for name in found}}
+    return {key: plain(each) for key, each in mapping.items()}, found
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,10 @@ class ForeignGraph:
 
 
 class GraphError(Exception):
-    """One mistake in a graph from elsewhere; the text is a line of ``problems.problem``."""
+    """One mistake in a graph from elsewhere: key, value, what was expected and what to do, as of ``problem``."""
+
+    def __init__(self, key: str, value: object, wanted: str, remedy: str) -> None:
+        super().__init__(problem(key, value, wanted, remedy))
 
 
 def read_graphml(key: str, file: Path) -> ForeignGraph:
@@ -80,25 +83,16 @@ def read_graphml(key: str, file: Path) -> ForeignGraph:
 
     try:
         graph = nx.read_graphml(io.BytesIO(_content(key, file)))
-    except (
-        ParseError,
-        nx.NetworkXError,
-        ValueError,
-        KeyError,
-        StopIteration,
-        AttributeError,
-        TypeError,
-    ) as error:
+    except (ParseError, nx.NetworkXError, ValueError, KeyError, StopIteration, AttributeError, TypeError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise GraphError(problem(key, str(file), f"expected a GraphML file ({reason})", "export it again")) from error
+        raise GraphError(key, str(file), f"expected a GraphML file ({reason})", "export it again") from error
     if not graph:
-        raise GraphError(problem(key, str(file), "expected a graph with nodes", "export it again"))
+        raise GraphError(key, str(file), "expected a graph with nodes", "export it again")
     return _of_networkx(key, graph)
 
 
-def is_networkx(value: object) -> bool:
-    """Whether it is a graph of networkx; without its import, which takes long."""
-    networkx = sys.modules.get("networkx")
+def _is_networkx(value: object) -> bool:
+    networkx = sys.modules.get("networkx")  # without its import, which takes long
     return networkx is not None and isinstance(value, networkx.Graph)
 
 
@@ -106,35 +100,31 @@ def from_networkx(key: str, graph: Any) -> ForeignGraph:
     """A graph of networkx; ``key`` is for the GraphError."""
     if graph.is_multigraph():
         wanted, kind = "expected a networkx.Graph or networkx.DiGraph", type(graph).__name__
-        raise GraphError(problem(key, f"a {kind}", wanted, "convert it, for example networkx.Graph(graph)"))
+        raise GraphError(key, f"a {kind}", wanted, "convert it, for example networkx.Graph(graph)")
     if not graph:
-        raise GraphError(problem(key, "a graph without nodes", "expected a graph with nodes", "add nodes"))
+        raise GraphError(key, "a graph without nodes", "expected a graph with nodes", "add nodes")
     return _of_networkx(key, graph)
 
 
 def _of_networkx(key: str, graph: Any) -> ForeignGraph:
     nodes = {node: _node(key, node) for node in graph.nodes}
-    twice = sorted({name for name in nodes.values() if list(nodes.values()).count(name) > 1}) if _repeat(nodes) else []
+    twice = [name for name, count in Counter(nodes.values()).items() if count > 1]
     if twice:
-        raise GraphError(problem(key, f"node {show(twice[0])} twice", "expected different names", "rename one"))
+        raise GraphError(key, f"node {show(min(twice))} twice", "expected different names", "rename one")
     links = []
     for source, target, weight in graph.edges(data="weight", default=1.0):
         plain = weight.item() if isinstance(weight, np.generic) else weight
         if not is_number(plain) or plain <= 0:
             place = f"weight {show(plain)} of {source} - {target}"
-            raise GraphError(problem(key, place, "expected a weight > 0", "correct it in the file"))
+            raise GraphError(key, place, "expected a weight > 0", "correct it in the file")
         links.append((nodes[source], nodes[target], float(plain)))
     return ForeignGraph(list(nodes.values()), links, graph.is_directed())
-
-
-def _repeat(nodes: Mapping[Any, str]) -> bool:
-    return len(set(nodes.values())) < len(nodes)
 
 
 def _node(key: str, node: object) -> str:
     name = str(node).strip()
     if not re.match(NAME_PATTERN, name):
-        raise GraphError(problem(key, f"node {show(str(node))}", _NODE, "rename it"))
+        raise GraphError(key, f"node {show(str(node))}", _NODE, "rename it")
     return name
 
 
@@ -142,39 +132,33 @@ def _content(key: str, file: Path) -> bytes:
     try:
         return read_bytes(file)
     except FileNotFoundError as error:
-        line = problem(key, str(file), "no such file", "the path is relative to the experiment file")
-        raise GraphError(line) from error
+        raise GraphError(key, str(file), "no such file", "the path is relative to the experiment file") from error
     except OSError as error:
-        raise GraphError(problem(key, str(file), "cannot be read", str(error.strerror))) from error
+        raise GraphError(key, str(file), "cannot be read", str(error.strerror)) from error
 
 
 def read_csv(key: str, file: Path) -> ForeignGraph:
-    """The edge list of a CSV file with a header; ``key`` is for the GraphError.
-
-    A row is an arc to the ``target``, which listens to the ``source``; with ``undirected`` in ``type``, an edge.
-    """
+    """The edge list of a CSV file with a header, rows are arcs or edges; ``key`` is for the GraphError."""
     wanted = "expected the columns source,target[,weight][,type], separated by commas"
     try:
         rows = csv.reader(io.StringIO(_content(key, file).decode("utf-8-sig"), newline=""), skipinitialspace=True)
         table = [(rows.line_num, [cell.strip() for cell in row]) for row in rows]
     except (UnicodeDecodeError, csv.Error) as error:
-        raise GraphError(
-            problem(key, str(file), f"expected a CSV file in UTF-8 ({error})", "export it again")
-        ) from error
+        raise GraphError(key, str(file), f"expected a CSV file in UTF-8 ({error})", "export it again") from error
     table = [(line, row) for line, row in table if any(row)]
     if not table:
-        raise GraphError(problem(key, str(file), f"empty: {wanted}", "write them into its first line"))
+        raise GraphError(key, str(file), f"empty: {wanted}", "write them into its first line")
     head = [name.lower() for name in table[0][1]]
     if not {"source", "target"} <= set(head) <= set(_COLUMNS) or len(set(head)) < len(head):
         place = f"{file}, line {table[0][0]}: {show(','.join(table[0][1]))}"
-        raise GraphError(problem(key, place, wanted, "correct the header"))
+        raise GraphError(key, place, wanted, "correct the header")
     found, edges = [], []
     for line, row in table[1:]:
         source, target, weight, undirected = _csv_row(key, f"{file}, line {line}", head, row)
         found.append((source, target, weight))
         edges.append(undirected)
     if not found:
-        raise GraphError(problem(key, str(file), "expected rows below the header", "add one for each link"))
+        raise GraphError(key, str(file), "expected rows below the header", "add one for each link")
     nodes = list(dict.fromkeys(node for source, target, _ in found for node in (source, target)))
     if all(edges):
         return ForeignGraph(nodes, found, directed=False)
@@ -186,22 +170,22 @@ def _csv_row(key: str, place: str, head: Sequence[str], row: Sequence[str]) -> t
     """Source, target, weight, and whether the row is an edge without direction."""
     if len(row) != len(head):
         shown = f"{place}: {show(','.join(row))}"
-        raise GraphError(problem(key, shown, f"expected {len(head)} values as in the header", "correct the line"))
+        raise GraphError(key, shown, f"expected {len(head)} values as in the header", "correct the line")
     cells = dict(zip(head, row, strict=True))
     for end in ("source", "target"):
         if not re.match(NAME_PATTERN, cells[end]):
-            raise GraphError(problem(key, f"{place}: {end} {show(cells[end])}", _NODE, "correct the line"))
+            raise GraphError(key, f"{place}: {end} {show(cells[end])}", _NODE, "correct the line")
     text = cells.get("weight") or "1"
     try:
         weight = float(text)
     except ValueError:
         weight = 0.0
     if not is_number(weight) or not weight > 0:
-        raise GraphError(problem(key, f"{place}: weight {show(text)}", "expected a number > 0", "correct the line"))
+        raise GraphError(key, f"{place}: weight {show(text)}", "expected a number > 0", "correct the line")
     kind = cells.get("type", "").lower() or "directed"
     if kind not in ("directed", "undirected"):
         shown = f"{place}: type {show(cells['type'])}"
-        raise GraphError(problem(key, shown, "expected directed or undirected", "correct the line"))
+        raise GraphError(key, shown, "expected directed or undirected", "correct the line")
     return cells["source"], cells["target"], weight, kind == "undirected"
 
 
@@ -216,11 +200,11 @@ def read_matrix(key: str, file: Path) -> list[list[float]]:
         matrix = np.asarray(matrix, dtype=float)
     except (ValueError, TypeError, EOFError) as error:
         reason = " ".join(str(error).split())
-        raise GraphError(problem(key, str(file), f"expected a matrix of numbers ({reason})", "correct it")) from None
+        raise GraphError(key, str(file), f"expected a matrix of numbers ({reason})", "correct it") from None
     if matrix.ndim != 2 or len(matrix) < 2 or not np.isfinite(matrix).all() or matrix.min() < 0.0:
         shape = " x ".join(map(str, matrix.shape))
         wanted = "expected a square matrix of finite numbers >= 0"
-        raise GraphError(problem(key, f"{file}: {shape}", wanted, "row i has the weights with which agent i listens"))
+        raise GraphError(key, f"{file}: {shape}", wanted, "row i has the weights with which agent i listens")
     rows: list[list[float]] = matrix.tolist()
     return rows
 
@@ -230,11 +214,11 @@ def from_adjacency(key: str, rows: Sequence[Sequence[float]]) -> GraphSpec:
     if any(len(row) != len(rows) for row in rows):
         shape = f"{len(rows)} rows of {' or '.join(sorted({str(len(row)) for row in rows}))} entries"
         wanted = "expected a square matrix"
-        raise GraphError(problem(key, shape, wanted, "give one row and one column for each agent"))
+        raise GraphError(key, shape, wanted, "give one row and one column for each agent")
     matrix = np.array(rows, dtype=float)
     for i in np.flatnonzero(np.diag(matrix)).tolist():
         wanted = "expected 0 on the diagonal, since no agent listens to itself"
-        raise GraphError(problem(f"{key}[{i + 1}][{i + 1}]", float(matrix[i, i]), wanted, "set it to 0"))
+        raise GraphError(f"{key}[{i + 1}][{i + 1}]", float(matrix[i, i]), wanted, "set it to 0")
     directed = not np.array_equal(matrix, matrix.T)
     listeners, sources = np.nonzero(matrix if directed else np.tril(matrix))
     links = [
@@ -250,11 +234,9 @@ def _spec(found: Iterable[Link], *, directed: bool) -> GraphSpec:
 
 
 def numbered(graphs: Iterable[ForeignGraph], names: Sequence[str] | None) -> tuple[dict[str, int], list[str] | None]:
-    """The number of every node of these graphs together, and the names of the agents; None where they have none.
-
-    Nodes that are all whole numbers are the agents' numbers, counted from 1, or from 0 if one of them is 0. Others are
-    numbered in the order in which they first appear, or by ``names``, which raise a KeyError where a node is not there.
-    """
+    """The number of every node of these graphs together, and the names of the agents; None where they have none."""
+    # Nodes that are all whole numbers are the agents' numbers, from 1, or from 0 if one of them is 0. Others are
+    # numbered as they first appear, or by names, which raise a KeyError where a node is not there.
     nodes = list(dict.fromkeys(node for graph in graphs for node in graph.nodes))
     if all(node.isascii() and node.isdigit() for node in nodes) and not set(nodes) <= set(names or []):
         first = min(map(int, nodes), default=1)
@@ -336,9 +318,7 @@ def link_problems(key: str, spec: GraphSpec, agents: int, names: Sequence[str] |
     kind = spec.kinds[0]
     largest = largest_label(spec)
     if largest > agents:
-        return [
-            problem(key, f"agent {largest}", f"expected agents 1 to {agents}", "correct it, or raise `agents`"),
-        ]
+        return [problem(key, f"agent {largest}", f"expected agents 1 to {agents}", "correct it, or raise `agents`")]
     found = []
     seen: set[tuple[int, int]] = set()
     for i, j, _ in links(spec, agents):

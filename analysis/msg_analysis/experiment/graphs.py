@@ -14,10 +14,8 @@ from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 
 
 def hops(leads: BoolArray, sources: Collection[int]) -> IntArray:
-    """(v,) least number of arcs from any source to each vertex; -1 if unreachable. ``leads[i, j]``: arc from i to j.
-
-    Not by networkx: every process of a run needs this, and importing networkx takes longer than all its other imports.
-    """
+    """(v,) least number of arcs from any source to each vertex; -1 if unreachable. ``leads[i, j]``: arc from i to j."""
+    # Not by networkx: every process of a run needs this, and importing it takes longer than all its other imports.
     level = np.full(len(leads), -1)
     front, distance = np.array(sorted(sources), dtype=int), 0
     while front.size:
@@ -27,10 +25,7 @@ def hops(leads: BoolArray, sources: Collection[int]) -> IntArray:
 
 
 def widest_reaching(leads: BoolArray) -> list[int]:
-    """The vertices from which the most others are reached, of one strongly connected component only.
-
-    ``leads[i, j]`` (v, v): an arc leads from i to j.
-    """
+    """The vertices from which the most others are reached, of one component only; ``leads`` (v, v) as in ``hops``."""
     known = np.zeros(len(leads), dtype=bool)
     widest, reached = 0, known.copy()
     for vertex in range(len(leads)):
@@ -76,11 +71,7 @@ class Graph:
     @property
     def arcs(self) -> list[tuple[int, int, float]]:
         """(source, target, weight) of every arc, agents from 1: target listens to source. Sorted by target, source."""
-        targets, sources = np.nonzero(self.adjacency)
-        return [
-            (int(source) + 1, int(target) + 1, float(self.adjacency[target, source]))
-            for target, source in zip(targets, sources, strict=True)
-        ]
+        return [(s + 1, t + 1, float(self.adjacency[t, s])) for t, s in np.argwhere(self.adjacency).tolist()]
 
     @property
     def edges(self) -> list[tuple[int, int, float]]:

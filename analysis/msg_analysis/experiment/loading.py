@@ -20,13 +20,12 @@ from msg_analysis.common.files import SAFE_LOADER, load_yaml, read_text
 from msg_analysis.common.text import listed
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import graph_sources, protocols, validation
-from msg_analysis.experiment.graph_sources import ForeignGraph, GraphError, is_networkx
+from msg_analysis.experiment.graph_sources import ForeignGraph, GraphError
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
-from msg_analysis.experiment.network_spec import GraphSpec, NoiseSpec
 from msg_analysis.experiment.problems import WEIGHT, problem, show, translate
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
-from msg_analysis.experiment.spec import ExperimentSpec, RunSpec
+from msg_analysis.experiment.spec import ExperimentSpec, GraphSpec, NoiseSpec, RunSpec
 
 
 class _StrictLoader(SAFE_LOADER):  # type: ignore[misc]  # one of two classes: see there
@@ -39,9 +38,8 @@ class _StrictLoader(SAFE_LOADER):  # type: ignore[misc]  # one of two classes: s
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
                 if key.value in seen:
-                    raise yaml.constructor.ConstructorError(
-                        None, None, f"key '{key.value}' appears twice: remove one", key.start_mark
-                    )
+                    text = f"key '{key.value}' appears twice: remove one"
+                    raise yaml.constructor.ConstructorError(None, None, text, key.start_mark)
                 seen.add(key.value)
         return dict(super().construct_mapping(node, deep))
 
@@ -121,11 +119,7 @@ def other_kind(mapping: Mapping[Any, Any], wanted: str) -> str | None:
 
 
 def read_yaml(path: Path) -> Any:
-    """The content of a YAML (or JSON) file in UTF-8.
-
-    InputError, with file and (if known) line: the file cannot be read, is not YAML in UTF-8, is too large or too deep,
-    or has a key twice.
-    """
+    """The content of a YAML (or JSON) file in UTF-8. InputError: it cannot be read, or is something else."""
     if is_bag(path):
         raise InputError(f"{path}: is a bag: {_NOT_A_BAG}")
     try:
@@ -159,10 +153,8 @@ _MATRICES_PER_GRAPH = 8  # adjacency, W, its coupling, F, B, N, the variance of 
 def memory_needed(
     agents: int, modes: int, steps: int, replicas: int, delay: int = 0, truth: bool = False
 ) -> tuple[int, int]:
-    """Bytes for the states of a run, and for the matrices of all graphs; ``replicas``: numbers in an agent's state.
-
-    A delay [steps] makes the matrices larger. With ``truth``, states are kept twice: as they are and as published.
-    """
+    """Bytes for the states of a run, and for the matrices of all graphs; ``replicas``: numbers in an agent's state."""
+    # A delay [steps] makes the matrices larger. With truth, states are kept twice: as they are and as published.
     states = (steps + 1) * agents * replicas * 8 * (2 if truth else 1)
     return states, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
 
@@ -197,11 +189,11 @@ def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: i
 
 def amount(size: float) -> str:
     """A number of bytes as text with a unit: ``1.5 GB``."""
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if size < 1000 or unit == "TB":
-            return f"{size:.3g} {unit}"
+    units = ["B", "kB", "MB", "GB", "TB"]
+    while size >= 1000 and len(units) > 1:
         size /= 1000
-    raise AssertionError
+        units.pop(0)
+    return f"{size:.3g} {units[0]}"
 
 
 @functools.cache
@@ -221,37 +213,23 @@ def _section(key: str, mapping: Mapping[Any, Any]) -> Any:
 _OWN_WEIGHTS = ("path", "cycle", "star", "grid", "complete")  # kinds of graphs that a ``weight`` may stand beside
 
 
-def _graphs_of_networkx(mapping: Mapping[Any, Any]) -> tuple[dict[str, Any], Mapping[Any, Any]]:
-    """The graphs of networkx in a document, by name, and the document with empty graphs in their places."""
-    graphs = mapping.get("graphs")
-    if not isinstance(graphs, Mapping):
-        return {}, mapping
-    found = {name: graph for name, graph in graphs.items() if is_networkx(graph)}
-    if not found:
-        return {}, mapping
-    return found, {**mapping, "graphs": {**graphs, **{name: {"edges": []} for name in found}}}
-
-
 class Sections:
-    """A document that is being checked: a section is None as long as it is not known to be valid.
-
-    ``recorded``: protocol of a recorded run, which need not be installed.
-    """
+    """A document that is being checked: a section is None as long as it is not known to be valid."""
 
     def __init__(self, mapping: Mapping[Any, Any], recorded: ProtocolInfo | None = None) -> None:
         self.problems: list[str] = []
-        self._networkx, mapping = _graphs_of_networkx(graph_sources.plain_document(mapping))
+        document, self._networkx = graph_sources.plain_document(mapping)
         self._foreign: dict[str, ForeignGraph] = {}  # read, but not numbered yet
         self._named_by_files = False
         self.keys: dict[str, str] = {}  # of the graphs, for messages
         bad: set[str] = set()
         try:
-            spec = ExperimentSpec.model_validate(dict(mapping))
+            spec = ExperimentSpec.model_validate(document)
             self.values = {key: getattr(spec, key) for key in ExperimentSpec.model_fields}
         except ValidationError as error:
             self.problems += [translate(detail) for detail in error.errors(include_url=False)]
             bad = {str(detail["loc"][0]) for detail in error.errors(include_url=False)}
-            self.values = {key: None if key in bad else _section(key, mapping) for key in ExperimentSpec.model_fields}
+            self.values = {key: None if key in bad else _section(key, document) for key in ExperimentSpec.model_fields}
         self.known = set(self.values) - bad
         run = self.values["run"]
         if run is not None and self.values["time"] == "discrete" and "dt" not in run.model_fields_set:
@@ -261,7 +239,7 @@ class Sections:
         self.chain: MarkovChain | None = None
         self.noise_gain: FloatArray | None = None
         self.loss: FloatArray | None = None
-        self._recorded = recorded
+        self._recorded = recorded  # the protocol of a recorded run need not be installed
         self.protocol: ChosenProtocol | None = None
 
     def resolve(self, directory: Path) -> None:
@@ -396,11 +374,9 @@ class Sections:
         try:
             numbers, names = graph_sources.numbered(sources.values(), given)
         except KeyError as error:
-            wanted = f"expected one of the names {listed(given or [])}"
-            place = next(self.keys[name] for name, graph in sources.items() if error.args[0] in graph.nodes)
-            self.problems.append(
-                problem(place, f"node {show(error.args[0])}", wanted, "correct it, or add it to `names`")
-            )
+            node, wanted = error.args[0], f"expected one of the names {listed(given or [])}"
+            place = next(self.keys[name] for name, graph in sources.items() if node in graph.nodes)
+            self.problems.append(problem(place, f"node {show(node)}", wanted, "correct it, or add it to `names`"))
             return False
         graphs |= {name: graph_sources.as_spec(graph, numbers) for name, graph in self._foreign.items()}
         graphs |= {name: graph_sources.with_numbers(graphs[name], numbers) for name in named}
@@ -410,19 +386,14 @@ class Sections:
 
     def _name_leaders(self) -> None:
         """Numbers instead of names in ``leaders``; what is not a name of an agent is a mistake."""
-        leaders = self.values["leaders"]
-        if leaders is None or not any(isinstance(agent, str) for agent in leaders.agents):
+        leaders, names = self.values["leaders"], self.values["names"] or []
+        if leaders is None:
             return
-        names: list[str] = self.values["names"] or []
         numbers = [names.index(agent) + 1 if agent in names else agent for agent in leaders.agents]
         unknown = [agent for agent in numbers if isinstance(agent, str)]
-        if unknown and self.agents is not None:
-            wanted = (
-                f"expected one of the names {listed(names)}" if names else "expected a number, since no agent is named"
-            )
-            self.problems += [problem("leaders.agents", show(agent), wanted, "correct it") for agent in unknown]
-        known = [agent for agent in numbers if not isinstance(agent, str)]
-        self.values["leaders"] = leaders.model_copy(update={"agents": known})
+        if self.agents is not None:
+            self.problems += [validation.unknown_name("leaders.agents", agent, names) for agent in unknown]
+        self.values["leaders"] = leaders.model_copy(update={"agents": [a for a in numbers if a not in unknown]})
         if unknown:
             self.known.discard("leaders")
 
@@ -435,10 +406,8 @@ class Sections:
         for agent, value in run.start.items():
             number = names.index(agent) + 1 if agent in names else agent
             if isinstance(number, str) or number > self.agents:
-                wanted = (
-                    f"expected one of the names {listed(names)}" if names else f"expected agents 1 to {self.agents}"
-                )
-                self.problems.append(problem("run.start", show(agent), wanted, "correct it"))
+                others = f"expected agents 1 to {self.agents}"
+                self.problems.append(validation.unknown_name("run.start", agent, names, others))
             else:
                 values[number - 1] = value
         self.values["run"] = run.model_copy(update={"start": values})
@@ -446,7 +415,7 @@ class Sections:
     def _resolve_losses(self, noise: NoiseSpec, time: Time) -> None:
         """Numbers instead of names in ``noise.loss``, and the probability of every link."""
         names: list[str] | None = self.values["names"]
-        loss, found = validation.numbered_losses(noise.loss, names)
+        loss, found = validation.numbered_losses(noise.loss, names or [])
         if not found:
             self.values["noise"] = noise.model_copy(update={"loss": loss})
             self.loss, found = validation.loss_matrix(loss, self.graphs, time, names)
@@ -456,24 +425,19 @@ class Sections:
 
     def _fits(self, run: RunSpec | None) -> bool:
         assert self.agents is not None
-        steps = run.steps if run else 1
-        replicas = run.replicas if run else 1
-        noise = self.values["noise"]
+        steps, replicas = (run.steps, run.replicas) if run else (1, 1)
+        noise: NoiseSpec | None = self.values["noise"]
         delay, truth = (noise.delay, noise.broadcast > 0) if noise else (0, False)
-        modes = len(self.values["graphs"])
-        found = memory_problems(self.agents, modes, steps, replicas, delay, truth)
+        found = memory_problems(self.agents, len(self.values["graphs"]), steps, replicas, delay, truth)
         self.problems += found
         return not found
 
     def _build_graphs(self) -> None:
         assert self.agents is not None
         graphs: dict[str, GraphSpec] = self.values["graphs"]
-        names: list[str] | None = self.values["names"]
-        found = [
-            line
-            for name, spec in graphs.items()
-            for line in graph_sources.link_problems(self.keys[name], spec, self.agents, names)
-        ]
+        found: list[str] = []
+        for name, spec in graphs.items():
+            found += graph_sources.link_problems(self.keys[name], spec, self.agents, self.values["names"])
         self.problems += found
         if not found:
             self.graphs = tuple(graph_sources.build_graph(name, spec, self.agents) for name, spec in graphs.items())

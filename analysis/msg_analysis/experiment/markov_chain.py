@@ -38,18 +38,10 @@ def stationary_law(matrix: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarkovChain:
-    """An ergodic chain on the n graphs.
-
-    Attributes
-    ----------
-    time
-        "continuous" (matrix is the generator Gamma [1 / unit of time]) or "discrete" (matrix is P, one jump a step)
-    matrix
-        (n, n)
-    """
+    """An ergodic chain on the n graphs."""
 
     time: Time
-    matrix: FloatArray
+    matrix: FloatArray  # (n, n) generator Gamma [1 / unit of time], or P, one jump a step
 
     @property
     def modes(self) -> int:
@@ -93,13 +85,7 @@ class MarkovChain:
         return MarkovChain(self.time, self.matrix.T * law / law[:, None])
 
     def transition(self, dt: float) -> FloatArray:
-        """(n, n) law of the graph one step later: expm(Gamma dt), or P itself in discrete time.
-
-        Parameters
-        ----------
-        dt
-            length of a step [units of simulated time]; without meaning in discrete time
-        """
+        """(n, n) law of the graph a step of dt later: expm(Gamma dt), or P itself in discrete time."""
         if self.time == "discrete":
             return self.matrix.copy()
         import scipy.linalg  # here, since every agent's process would wait for it
@@ -108,18 +94,8 @@ class MarkovChain:
         return np.asarray(transition / transition.sum(axis=1, keepdims=True))
 
     def sojourns(self, initial: FloatArray, random: np.random.Generator) -> Iterator[tuple[int, float]]:
-        """Exact path of the chain, without end: (mode from 0, time spent in it).
-
-        Holding times are exponential [units of time] in continuous time, geometric [steps] in discrete time; the
-        next graph is drawn from the jump chain.
-
-        Parameters
-        ----------
-        initial
-            (n,) law of the first graph
-        random
-            the stream to draw from; equal streams give equal paths
-        """
+        """Exact path of the chain, without end: (mode from 0, time spent in it); ``initial`` (n,): law of the first."""
+        # Holding times are exponential, or geometric in steps; the next graph is drawn from the jump chain.
         off_diagonal = self.matrix - np.diag(np.diag(self.matrix))
         leaving = off_diagonal.sum(axis=1).tolist()
         jumps = [_cumulative(law / rate) if rate > 0.0 else [] for law, rate in zip(off_diagonal, leaving, strict=True)]

@@ -15,8 +15,7 @@ from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.network_spec import GraphSpec
-from msg_analysis.experiment.spec import ExperimentSpec
+from msg_analysis.experiment.spec import ExperimentSpec, GraphSpec
 
 _LONGEST_VALUE = 60
 _MOST_LINES = 100  # problems shown; a file with more mostly repeats one of them
@@ -36,15 +35,11 @@ class ExperimentError(InputError):
     def __init__(self, source: str, problems: Sequence[str]) -> None:
         self.source = source
         self.problems = list(problems)
-        if len(self.problems) == 1:
-            text = f"{source}: {self.problems[0]}"
-        else:
-            text = f"{source}: {len(self.problems)} problems" + "".join(
-                f"\n  {line}" for line in self.problems[:_MOST_LINES]
-            )
-            if len(self.problems) > _MOST_LINES:
-                text += f"\n  and {len(self.problems) - _MOST_LINES} more"
-        super().__init__(text)
+        count = len(self.problems)
+        lines = [f"{count} problems", *self.problems[:_MOST_LINES]] if count != 1 else self.problems
+        if count > _MOST_LINES:
+            lines.append(f"and {count - _MOST_LINES} more")
+        super().__init__("\n  ".join([f"{source}: {lines[0]}", *lines[1:]]))
 
 
 def problem(key: str, value: object, wanted: str, remedy: str) -> str:
@@ -95,10 +90,7 @@ _EXPECTED = {
 
 
 def translate(error: ErrorDetails, root: type[BaseModel] = ExperimentSpec, section: str = "") -> str:
-    """One of pydantic's errors in the style of this module.
-
-    ``root`` is the model that was validated: of the whole document, or of a section with the key ``section``.
-    """
+    """One of pydantic's errors in the style of this module; ``root``: the model validated, or of a ``section``."""
     kind, location, value = error["type"], error["loc"], error["input"]
     if not location:
         location = (section or "experiment",)

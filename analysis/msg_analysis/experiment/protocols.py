@@ -11,7 +11,7 @@ from __future__ import annotations
 import difflib
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
@@ -58,8 +58,10 @@ class ProtocolInfo:
         return asdict(self)
 
     @classmethod
-    def from_json(cls, document: Any) -> ProtocolInfo:
-        """Read what ``to_json`` gave; ValueError, KeyError or TypeError if it is something else."""
+    def from_json(cls, document: Any) -> ProtocolInfo | None:
+        """Read what ``to_json`` gave, or None; ValueError, KeyError or TypeError if it is something else."""
+        if document is None:
+            return None
         if int(document["states"]) < 1:
             raise ValueError(f"protocol: states {document['states']}, expected a number >= 1")
         return cls(
@@ -95,7 +97,7 @@ class ChosenProtocol:
         return None if self.info.linear else f"{self.info} is not linear, and runs without a prediction"
 
     def unavailable(self, purpose: Purpose) -> list[str]:
-        """Why it cannot be used for a purpose, one line each: see ``Experiment.unavailable``."""
+        """Why it cannot be used for a purpose, one line each."""
         name, reason = show(self.info.name), self.unpredictable()
         if self.absent:
             remedy = f"install {self.info.package} {self.info.version}"
@@ -106,10 +108,7 @@ class ChosenProtocol:
         return [problem("protocol.name", name, wanted, "use `simulate` or `msg-agents run`")]
 
     def matrices(self) -> tuple[FloatArray, FloatArray]:
-        """W_g and B_g of a linear protocol, (n, m, m) each.
-
-        InputError if the protocol is not installed, not linear, fails, or returns something wrong.
-        """
+        """W_g and B_g, (n, m, m) each. InputError: not installed, not linear, fails, or returns something wrong."""
         reason = self.unpredictable()
         if reason:
             raise InputError(reason)
@@ -143,12 +142,9 @@ class ChosenProtocol:
             raise ProtocolError(f"{self.info}, {where}: weights: {row} sums to {total:.12g}, expected 1")
 
     def guard(self, where: str, call: Callable[[], Result]) -> Result:
-        """The result of a call of the protocol's code; what it raises becomes a ProtocolError that says ``where``.
-
-        Results are checked, so that numpy need not warn of an overflow, too.
-        """
+        """The result of a call of the protocol's code; what it raises becomes a ProtocolError that says ``where``."""
         try:
-            with np.errstate(all="ignore"), _KeptAlive():
+            with np.errstate(all="ignore"), _KeptAlive():  # results are checked: numpy need not warn of an overflow
                 return call()
         except (Exception, SystemExit) as error:  # of code that we know nothing about
             text = str(error) if isinstance(error, ValueError) and str(error) else f"{type(error).__name__}: {error}"
@@ -181,10 +177,7 @@ def _exit(status: int) -> NoReturn:
 
 
 class AgentProtocol:
-    """The nonlinear protocol of one agent (index from 0), with every result checked.
-
-    InputError if the protocol is not installed, or fails.
-    """
+    """The nonlinear protocol of one agent (from 0), with every result checked. InputError: not installed, or fails."""
 
     def __init__(self, chosen: ChosenProtocol, agent: int) -> None:
         if chosen.absent or chosen.network is None:
@@ -208,10 +201,8 @@ class AgentProtocol:
 
     def step(self, k: int, mode: int, state: FloatArray, heard: Heard, noise: FloatArray) -> FloatArray:
         """State (S, R) after step k: see ``Protocol.step``."""
-        return self._guard(
-            f"{self._agent}, step {k}",
-            lambda: _array(self._protocol.step(k, mode, state, heard, noise), state.shape),
-        )
+        step, place = self._protocol.step, f"{self._agent}, step {k}"
+        return self._guard(place, lambda: _array(step(k, mode, state, heard, noise), state.shape))
 
 
 def _states(protocol: Protocol) -> int:
@@ -259,13 +250,11 @@ def _changed(place: str) -> int:
 
 
 def find(spec: ProtocolSpec, recorded: ProtocolInfo | None = None) -> tuple[ChosenProtocol | None, list[str]]:
-    """The protocol of an experiment and its parameters (None if unusable), and what is wrong; ``bind`` checks the rest.
-
-    With ``recorded``, the protocol that a recorded run used, nothing is wrong: the protocol need not be installed.
-    """
+    """The protocol of an experiment and its parameters (None if unusable), and what is wrong, before ``bind``."""
     chosen, found = _find(spec)
     if recorded is None:
         return chosen, found
+    # The protocol that a recorded run used need not be installed.
     return (_absent(recorded, found), []) if chosen is None else (chosen, [])
 
 
@@ -373,8 +362,3 @@ def _problems(check: Callable[[], object]) -> list[str]:
     except ProtocolError as error:
         return [f"{error}: correct the parameters, or tell the authors of the package"]
     return []
-
-
-def info_of(document: Mapping[str, Any]) -> ProtocolInfo | None:
-    """The protocol in the document of a run record; None for the built-in law."""
-    return ProtocolInfo.from_json(document["protocol"]) if document.get("protocol") is not None else None

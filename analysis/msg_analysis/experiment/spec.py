@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The keys of the experiment file beside graphs and noise: every key, its type, its default and what it means.
+"""The keys of the experiment file: every key, its type, its default and what it means.
 
 Only what one value can tell by itself is checked here; ``validation`` checks what needs several keys.
 """
@@ -9,26 +9,328 @@ Only what one value can tell by itself is checked here; ``validation`` checks wh
 from __future__ import annotations
 
 import math
+import re
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, PlainSerializer, PlainValidator
-
-from msg_analysis.experiment.network_spec import (
-    Agent,
-    AgentName,
-    Count,
-    GraphName,
-    GraphSpec,
-    NoiseSpec,
-    Number,
-    Positive,
-    Section,
-    SwitchingSpec,
-    expected,
-    is_agent,
-    is_count,
-    is_number,
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
 )
+from pydantic_core import PydanticCustomError
+
+LARGEST_NUMBER = 1e100  # so that no sum or product of two numbers overflows
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
+Positive = Annotated[Number, Field(gt=0)]
+NonNegative = Annotated[Number, Field(ge=0)]
+LARGEST_COUNT = 2**32 - 1  # messages carry agents as uint32
+Count = Annotated[int, Field(strict=True, ge=1, le=LARGEST_COUNT)]
+Label = Count
+NAME_PATTERN = r"^\S(.{0,62}\S)?$"
+GraphName = Annotated[str, Field(pattern=NAME_PATTERN)]
+AgentName = Annotated[str, Field(pattern=NAME_PATTERN)]
+Probability = Annotated[Number, Field(ge=0, lt=1)]
+Matrix = list[list[Number]]
+
+
+def _agent(value: object, number: ValidatorFunctionWrapHandler) -> Any:
+    """A number, or the name of an agent, which becomes its number once the names are known."""
+    return value if isinstance(value, str) and re.match(NAME_PATTERN, value) else number(value)
+
+
+Agent = Annotated[Label, WrapValidator(_agent, json_schema_input_type=Label | AgentName)]
+
+
+def expected(text: str) -> PydanticCustomError:
+    """The error of a value that is not what ``text`` says, such as "a number > 0"."""
+    return PydanticCustomError("expected", "{text}", {"text": text})
+
+
+def is_number(value: object) -> bool:
+    """Whether a value is a number, not a boolean, of at most ``LARGEST_NUMBER``."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
+
+
+def is_count(value: object) -> bool:
+    """Whether a value is a whole number from 1 to ``LARGEST_COUNT``."""
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= LARGEST_COUNT
+
+
+class Section(BaseModel):
+    """A part of the file; a key that it does not have is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+Link = tuple[int, int, float]
+WrittenLink = tuple[int | str, int | str, float]  # with names of agents, too
+
+
+def is_agent(value: object) -> bool:
+    """Whether it is the number of an agent, or may be its name."""
+    return is_count(value) or (isinstance(value, str) and re.match(NAME_PATTERN, value) is not None)
+
+
+def _parts(value: object, counts: tuple[int, ...], wanted: str) -> list[Any]:
+    """A list of so many entries that begins with two agents; else ``wanted`` says what was expected."""
+    if not isinstance(value, list | tuple) or len(value) not in counts or not all(map(is_agent, value[:2])):
+        raise expected(wanted)
+    return list(value)
+
+
+def _link(value: object) -> WrittenLink:
+    wanted = "[agent, agent] or [agent, agent, weight], agents by number from 1 or name, the weight a number > 0"
+    first, second, weight = (*_parts(value, (2, 3), wanted), 1.0)[:3]
+    if not is_number(weight) or weight <= 0:
+        raise expected("a weight > 0 as the third entry")
+    return (first, second, float(weight))
+
+
+def _grid(value: object) -> object:
+    sizes = value if isinstance(value, list | tuple) else ()
+    if len(sizes) != 2 or not all(is_count(size) for size in sizes):
+        raise expected("[rows, columns], two whole numbers >= 1")
+    return value
+
+
+_End = Label | AgentName
+_WrittenLinks = tuple[_End, _End] | tuple[_End, _End, Positive]
+Links = list[Annotated[WrittenLink, BeforeValidator(_link, json_schema_input_type=_WrittenLinks)]]
+
+
+class Star(Section):
+    """A star: every agent is connected with the centre."""
+
+    center: Agent = Field(description="the agent in the middle", examples=[1])
+
+
+def _matrix(value: object, rows: ValidatorFunctionWrapHandler) -> Any:
+    """The rows of a matrix, or the name of a file with them."""
+    if isinstance(value, str):
+        if value.endswith(MATRIX_FILES):
+            return value
+        raise expected("a square matrix, or a file .csv or .npy with one")
+    return rows(value)
+
+
+MATRIX_FILES = (".csv", ".npy")
+Rows = Annotated[list[list[NonNegative]], Field(min_length=2)]
+
+
+class GraphSpec(Section):
+    """One graph, given in one of these ways. Agents are numbered from 1, or have names."""
+
+    model_config = ConfigDict(json_schema_extra={"minProperties": 1, "maxProperties": 2})
+
+    path: list[Agent] | None = Field(None, min_length=2, description="agents along a line", examples=[[1, 2, 3]])
+    cycle: list[Agent] | None = Field(None, min_length=3, description="agents around a ring", examples=[[1, 2, 3]])
+    edges: Links | None = Field(
+        None, description="undirected: [i, j] or [i, j, weight], weight 1 by default", examples=[[[1, 2], [2, 3, 0.5]]]
+    )
+    arcs: Links | None = Field(
+        None,
+        description="directed: [1, 2, 0.5] means that agent 2 listens to agent 1",
+        examples=[[[1, 2], [2, 3, 0.5]]],
+    )
+    star: Star | None = Field(None, description="a star with its centre", examples=[{"center": 1}])
+    complete: Literal[True] | None = Field(None, description="every agent with every other agent", examples=[True])
+    grid: Annotated[tuple[Count, Count], BeforeValidator(_grid)] | None = Field(
+        None, description="[rows, columns], agents row by row", examples=[[3, 4]]
+    )
+    graphml: str | None = Field(
+        None,
+        min_length=1,
+        description="a GraphML file, relative to the experiment file; node ids that are whole numbers are the agents' "
+        "numbers, others their names; edge attribute 'weight', default 1",
+        examples=["network.graphml"],
+    )
+    csv: str | None = Field(
+        None,
+        min_length=1,
+        description="a CSV file, relative to the experiment file, with the header source,target[,weight][,type]; "
+        "target listens to source; nodes as with graphml; type directed (default) or undirected",
+        examples=["edges.csv"],
+    )
+    adjacency: Annotated[Rows, WrapValidator(_matrix, json_schema_input_type=Rows | str)] | None = Field(
+        None,
+        description="square matrix: row i has the weights with which agent i listens to the others, 0: not at all; or "
+        "a file with it, .csv or .npy, relative to the experiment file",
+        examples=[[[0, 1], [1, 0]]],
+    )
+    weight: Positive | None = Field(
+        None, description="of all links of path, cycle, star, grid or complete; 1 by default", examples=[0.5]
+    )
+
+    @property
+    def kinds(self) -> list[str]:
+        """Ways in which this graph is given (one, in a valid file)."""
+        given = [key for key in type(self).model_fields if getattr(self, key) is not None]
+        return [key for key in given if key != "weight"]
+
+
+class SwitchingSpec(Section):
+    """The Markov chain that switches between the graphs. May be left out where there is one graph."""
+
+    generator: Matrix | None = Field(
+        None,
+        description="continuous time: rates between the graphs in file order; every row sums to 0",
+        examples=[[[-0.5, 0.5], [0.5, -0.5]]],
+    )
+    rates: dict[str, dict[str, NonNegative]] | None = Field(
+        None,
+        description="continuous time: rates by name, from: {to: rate}; left out = 0",
+        examples=[{"line": {"ring": 1.0}, "ring": {"line": 1.0}}],
+    )
+    scale: Positive = Field(1.0, description="multiplies the rates", examples=[0.5])
+    transition: Matrix | None = Field(
+        None,
+        description="discrete time: probabilities between the graphs in file order; every row sums to 1",
+        examples=[[[0.9, 0.1], [0.2, 0.8]]],
+    )
+    initial: str = Field("stationary", description="'stationary' or a graph's name", examples=["stationary"])
+
+
+LARGEST_BURST = 1e6  # messages: what an agent that restarts has to draw again grows with it
+NoiseGain = float | list[float] | list[list[float]]
+
+
+def _lossy_link(value: object) -> tuple[int | str, int | str, float]:
+    wanted = "[agent, agent, probability], agents by number or name, 0 <= probability < 1"
+    first, second, probability = _parts(value, (3,), wanted)
+    if not is_number(probability) or not 0 <= probability < 1:
+        raise expected(wanted)
+    return (first, second, float(probability))
+
+
+def _loss(value: object, section: ValidatorFunctionWrapHandler) -> Any:
+    """The section; a number stands for one with nothing but a default."""
+    if isinstance(value, dict | LossSpec):
+        return section(value)
+    if not is_number(value):
+        raise expected("a probability, or keys with probabilities: default, edges, arcs")
+    if not 0 <= value < 1:  # type: ignore[operator]
+        raise expected("a number >= 0" if value < 0 else "a number < 1")  # type: ignore[operator]
+    return section({"default": value})
+
+
+def _process(value: object) -> NoiseGain | dict[str, NoiseGain]:
+    if not isinstance(value, dict):
+        return _noise_gain(value)
+    gains, faults = {}, []
+    for name, gain in value.items():
+        try:
+            gains[str(name)] = _noise_gain(gain)
+        except PydanticCustomError as error:
+            faults.append(f"for graph {name} {error.message().removeprefix('expected ')}")
+    if faults:
+        raise expected(" and ".join(faults))
+    return gains
+
+
+def _noise_gain(value: object) -> NoiseGain:
+    if is_number(value):
+        if value < 0:  # type: ignore[operator]
+            raise expected("a standard deviation >= 0")
+        return float(value)  # type: ignore[arg-type]
+    if isinstance(value, list) and value and all(is_number(entry) for entry in value):
+        if min(value) < 0:
+            raise expected("standard deviations >= 0")
+        return [float(entry) for entry in value]
+    rows = value if isinstance(value, list) else []
+    if rows and all(isinstance(row, list) and all(is_number(entry) for entry in row) for row in rows):
+        return [[float(entry) for entry in row] for row in rows]
+    raise expected("a finite number, one per agent, or a square matrix F (Q = F F^T)")
+
+
+LossyLinks = list[
+    Annotated[
+        tuple[int | str, int | str, float],
+        BeforeValidator(_lossy_link, json_schema_input_type=tuple[_End, _End, Probability]),
+    ]
+]
+
+
+class LossSpec(Section):
+    """The probability that a message is lost, by link."""
+
+    default: Probability = Field(0.0, description="of all links that are not listed", examples=[0.1])
+    edges: LossyLinks = Field(
+        [], description="of links in both directions: [agent, agent, probability]", examples=[[[1, 2, 0.5]]]
+    )
+    arcs: LossyLinks = Field(
+        [],
+        description="of links in one direction: [1, 2, 0.5] means messages from agent 1 to agent 2",
+        examples=[[[1, 2, 0.5]]],
+    )
+
+    @property
+    def any(self) -> bool:
+        """Whether a message of some link can be lost."""
+        return self.default > 0 or any(probability > 0 for *_, probability in (*self.edges, *self.arcs))
+
+    def short(self) -> Any:
+        """What a file would have: the number alone where all links have the same."""
+        links = {key: found for key in ("edges", "arcs") if (found := getattr(self, key))}
+        return {"default": self.default, **links} if links else self.default
+
+
+_Gain = NonNegative | list[NonNegative] | Matrix
+
+
+class NoiseSpec(Section):
+    """What is random besides the graphs."""
+
+    process: Annotated[
+        NoiseGain | dict[str, NoiseGain],
+        PlainValidator(_process, json_schema_input_type=_Gain | dict[GraphName, _Gain]),
+    ] = Field(
+        1.0,
+        description="noise gain: a number, one per agent, or the matrix F with Q = F F^T; or one of these for every "
+        "graph by name",
+        examples=[1.0],
+    )
+    broadcast: NonNegative = Field(0.0, description="standard deviation added to each published value", examples=[0.0])
+    link: NonNegative = Field(0.0, description="standard deviation added by each receiver", examples=[0.0])
+    loss: Annotated[
+        LossSpec,
+        WrapValidator(_loss, json_schema_input_type=Probability | LossSpec),
+        PlainSerializer(LossSpec.short, return_type=Any),
+    ] = Field(
+        LossSpec(), description="probability that a directed message is lost; a number, or by link", examples=[0.0]
+    )
+    on_loss: Literal["own", "hold"] = Field(
+        "own",
+        description="what an agent uses in place of a lost value: its own, or the last value that it heard",
+        examples=["hold"],
+    )
+    burst: Annotated[Number, Field(ge=1, le=LARGEST_BURST)] | None = Field(
+        None,
+        description="mean number of messages of a link that are lost in a row; by default losses are independent",
+        examples=[5],
+    )
+    delay: Annotated[int, Field(strict=True, ge=0, le=LARGEST_COUNT)] = Field(
+        0, description="age, in steps, of the values of others that a step uses", examples=[0]
+    )
+
+    @property
+    def on_air(self) -> bool:
+        """Whether there is broadcast noise, link noise or loss between the agents."""
+        return bool(self.broadcast or self.link or self.loss.any)
+
+    @property
+    def holds(self) -> bool:
+        """Whether messages can be lost, and the last value heard takes the place of a lost one."""
+        return self.loss.any and self.on_loss == "hold"
+
+    @property
+    def steps_only(self) -> bool:
+        """Whether there is noise on the air, loss or delay, which only steps can have."""
+        return self.on_air or self.delay > 0
 
 
 def _start(value: object) -> str | list[float] | dict[int | str, float]:
@@ -81,9 +383,7 @@ class RunSpec(Section):
     """How long, how often and how to run."""
 
     dt: Positive = Field(
-        0.05,
-        description="simulated time of a step; 0.05 by default, always 1 in discrete time",
-        examples=[0.05],
+        0.05, description="simulated time of a step; 0.05 by default, always 1 in discrete time", examples=[0.05]
     )
     duration: Positive = Field(100.0, description="simulated time units, a whole number of steps", examples=[400.0])
     replicas: Count = Field(1, description="independent copies of every state under the same graphs", examples=[16])
@@ -113,8 +413,7 @@ class RunSpec(Section):
         examples=["best_effort"],
     )
     processes: Annotated[
-        str | int,
-        PlainValidator(_processes, json_schema_input_type=Literal["auto", "one_per_agent"] | Count),
+        str | int, PlainValidator(_processes, json_schema_input_type=Literal["auto", "one_per_agent"] | Count)
     ] = Field("auto", description="'auto', 'one_per_agent' or a number of processes", examples=["auto"])
 
     @property
@@ -130,9 +429,7 @@ class ExperimentSpec(Section):
     """A Markov switching network and a run of it."""
 
     name: str = Field(
-        pattern="^[a-z][a-z0-9_]*$",
-        description="a name for bags and topics, [a-z][a-z0-9_]*",
-        examples=["line_ring"],
+        pattern="^[a-z][a-z0-9_]*$", description="a name for bags and topics, [a-z][a-z0-9_]*", examples=["line_ring"]
     )
     problem: Literal["consensus", "tracking"] = Field(
         "consensus", description="agree with each other, or follow leaders", examples=["consensus"]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,9 +15,11 @@ from msg_analysis.common.arrays import BoolArray, FloatArray
 from msg_analysis.common.text import agent_name, agent_text, listed
 from msg_analysis.experiment.graphs import Graph, hops, widest_reaching
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
-from msg_analysis.experiment.network_spec import LossSpec, NoiseGain, NoiseSpec, SwitchingSpec
 from msg_analysis.experiment.problems import problem, show
-from msg_analysis.experiment.spec import LeadersSpec, RunSpec
+from msg_analysis.experiment.spec import LeadersSpec, LossSpec, NoiseGain, NoiseSpec, Purpose, RunSpec, SwitchingSpec
+
+if TYPE_CHECKING:
+    from msg_analysis.experiment.experiment import Experiment
 
 MOST_STATES = 512
 """Of graph and links together, in a prediction with losses in bursts."""
@@ -31,33 +34,24 @@ LONGEST_DURATION = 2**31 - 1
 
 
 def chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tuple[MarkovChain | None, list[str]]:
-    """The chain that the file describes, and what is wrong with it (then the chain is None).
-
-    Within the tolerance of the check, the diagonal of a generator is replaced by minus the sum of the other rates, and
-    rows of a transition matrix are divided by their sum.
-    """
-    found = _initial_problems(switching, names)
+    """The chain that the file describes, and what is wrong with it (then the chain is None)."""
+    found = []
+    if switching.initial not in ("stationary", *names):
+        wanted = f"expected 'stationary' or one of the graphs {', '.join(names)}"
+        found.append(problem("switching.initial", show(switching.initial), wanted, "use one of them"))
     given = [key for key in ("generator", "rates", "transition") if getattr(switching, key) is not None]
     wanted = "generator or rates" if time == "continuous" else "transition"
     if not given:
         if len(names) == 1:
             return MarkovChain(time, np.array([[0.0 if time == "continuous" else 1.0]])), found
-        line = problem(
-            "switching", "missing", f"expected {wanted}, since there are {len(names)} graphs", f"add {wanted}"
-        )
-        return None, [*found, line]
+        why = f"expected {wanted}, since there are {len(names)} graphs"
+        return None, [*found, problem("switching", "missing", why, f"add {wanted}")]
     if len(given) > 1:
-        line = problem("switching", " and ".join(given), "expected one of them", "remove the others")
-        return None, [*found, line]
+        return None, [*found, problem("switching", " and ".join(given), "expected one of them", "remove the others")]
     key = given[0]
     if (key == "transition") != (time == "discrete"):
-        line = problem(
-            f"switching.{key}",
-            f"given in {time} time",
-            f"expected {wanted}",
-            f"give {wanted}, or change `time`",
-        )
-        return None, [*found, line]
+        remedy = f"give {wanted}, or change `time`"
+        return None, [*found, problem(f"switching.{key}", f"given in {time} time", f"expected {wanted}", remedy)]
     if switching.scale != 1.0 and key != "rates":
         found.append(problem("switching.scale", switching.scale, "expected with rates only", "remove it"))
     if switching.rates is not None:
@@ -67,15 +61,8 @@ def chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tupl
     if matrix is None:
         return None, found + more
     chain = MarkovChain(time, matrix)
-    found += ergodicity_problems(chain, names, f"switching.{key}")
+    found += _ergodicity_problems(chain, names, f"switching.{key}")
     return (None if found else chain), found
-
-
-def _initial_problems(switching: SwitchingSpec, names: Sequence[str]) -> list[str]:
-    if switching.initial == "stationary" or switching.initial in names:
-        return []
-    wanted = f"expected 'stationary' or one of the graphs {', '.join(names)}"
-    return [problem("switching.initial", show(switching.initial), wanted, "use one of them")]
 
 
 def _from_rates(
@@ -85,10 +72,7 @@ def _from_rates(
     index = {name: mode for mode, name in enumerate(names)}
     matrix = np.zeros((len(names), len(names)))
     for source, row in rates.items():
-        for name, key in [
-            (source, "switching.rates"),
-            *((target, f"switching.rates.{source}") for target in row),
-        ]:
+        for name, key in [(source, "switching.rates"), *((target, f"switching.rates.{source}") for target in row)]:
             if name not in index:
                 wanted = f"expected one of the graphs {', '.join(names)}"
                 found.append(problem(f"{key}.{name}", "unknown graph", wanted, "correct the name"))
@@ -142,7 +126,7 @@ def wrong_sums(matrix: FloatArray, target: float) -> Iterator[tuple[int, float]]
             yield i, total
 
 
-def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> list[str]:
+def _ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> list[str]:
     """Graphs that cannot be reached, or a period of the chain (assumption 1 of the paper); ``key`` is for messages."""
     if chain.ergodic:
         return []
@@ -158,11 +142,9 @@ def ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> l
 def connection_problems(
     graphs: Sequence[Graph], leaders: LeadersSpec | None, names: Sequence[str] | None = None
 ) -> list[str]:
-    """Agents that are not connected in the union of all graphs; ``leaders`` is None in consensus.
-
-    Mean-square stability of the disagreement (tracking: of the deviation from the reference) needs a union in which
-    some agent (tracking: the leaders together) reaches every other one.
-    """
+    """Agents that are not connected in the union of all graphs; ``leaders`` is None in consensus."""
+    # Mean-square stability of the disagreement (tracking: of the deviation from the reference) needs a union in which
+    # some agent (tracking: the leaders together) reaches every other one.
     union = np.any([graph.adjacency.T > 0 for graph in graphs], axis=0)
     sources = widest_reaching(union) if leaders is None else [label - 1 for label in leaders.agents]
     lost = np.flatnonzero(hops(union, sources) < 0).tolist()
@@ -173,21 +155,18 @@ def connection_problems(
     return [problem("graphs", text, "expected a union that connects all agents", "add an edge, or lower `agents`")]
 
 
-def _list(agents: Sequence[int], names: Sequence[str] | None, longest: int = 8) -> str:
+def _list(agents: Sequence[int], names: Sequence[str] | None) -> str:
     """`` 3`` or ``s 1, 2, 3``: agents (from 0) as texts count or name them, after the word "agent"."""
-    shown = ", ".join(agent_name(agent + 1, names) for agent in agents[:longest])
-    more = f" and {len(agents) - longest} more" if len(agents) > longest else ""
+    shown = ", ".join(agent_name(agent + 1, names) for agent in agents[:8])
+    more = f" and {len(agents) - 8} more" if len(agents) > 8 else ""
     return ("s " if len(agents) > 1 else " ") + shown + more
 
 
 def noise_gain_of(noise: NoiseSpec, names: Sequence[str], agents: int) -> tuple[FloatArray, list[str]]:
-    """(n, m, m) F of every graph as ``noise.process`` has it, and what is wrong with it.
-
-    If all graphs have the same F it is stored once, in a read-only view.
-    """
+    """(n, m, m) F of every graph as ``noise.process`` has it, and what is wrong with it."""
     if not isinstance(noise.process, dict):
         gain, found = _gain_of("noise.process", noise.process, agents)
-        return np.broadcast_to(gain, (len(names), *gain.shape)), found
+        return np.broadcast_to(gain, (len(names), *gain.shape)), found  # stored once
     found = []
     for name in noise.process:
         if name not in names:
@@ -208,26 +187,20 @@ def noise_gain_of(noise: NoiseSpec, names: Sequence[str], agents: int) -> tuple[
 
 def _gain_of(key: str, value: NoiseGain, agents: int) -> tuple[FloatArray, list[str]]:
     """(m, m) F, and what is wrong with its shape."""
-    f = np.array(value, dtype=float) if not _ragged(value) else np.empty((0, 0))
+    rows = value if isinstance(value, list) else []
+    ragged = len({len(row) for row in rows if isinstance(row, list)}) > 1
+    f = np.empty((0, 0)) if ragged else np.array(value, dtype=float)
     if f.ndim == 0:
         return np.eye(agents) * f, []
     if f.shape == (agents,):
         return np.diag(f), []
     if f.shape == (agents, agents):
         return f, []
-    if f.ndim == 1:
-        shape = f"{len(f)} entries"
-    elif f.size:
-        shape = f"{f.shape[0]} x {f.shape[1]}"
-    else:
-        shape = "rows of different lengths"
+    shape = "rows of different lengths"
+    if f.size:
+        shape = f"{len(f)} entries" if f.ndim == 1 else f"{f.shape[0]} x {f.shape[1]}"
     wanted = f"expected a number, {agents} numbers or a {agents} x {agents} matrix F"
     return f, [problem(key, shape, wanted, f"there are {agents} agents")]
-
-
-def _ragged(value: object) -> bool:
-    rows = value if isinstance(value, list) else []
-    return len({len(row) for row in rows if isinstance(row, list)}) > 1
 
 
 def burst_problems(burst: float, loss: LossSpec) -> list[str]:
@@ -254,9 +227,8 @@ def leader_problems(
         return [problem("leaders", "missing", wanted, "for example leaders: {agents: [1], gain: 1.0}")]
     found = []
     for label in sorted(label for label in set(leaders.agents) if leaders.agents.count(label) > 1):
-        found.append(
-            problem("leaders.agents", f"{agent_text(label, names)} twice", "expected every leader once", "remove one")
-        )
+        who = agent_text(label, names)
+        found.append(problem("leaders.agents", f"{who} twice", "expected every leader once", "remove one"))
     if agents is None:
         return found
     for label in leaders.agents:
@@ -327,19 +299,28 @@ def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
     return gains
 
 
-def too_large_to_predict(
-    noise: NoiseSpec, graphs: Sequence[Graph], loss: FloatArray, gains: FloatArray, pace: str, time: Time
-) -> list[str]:
-    """What has no prediction because it would be too large; ``loss`` (m, m), ``gains`` (m,) kappa of the leaders."""
-    lines = []
-    links = heard_links(graphs, time) & np.isfinite(gains)[:, None]
-    lossy = int((links & (loss > 0.0)).sum())
+def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
+    """What the experiment asks for that this version cannot do, one line each."""
+    lines = _too_large_to_predict(experiment) if purpose == "predict" else []
+    return lines + (experiment.protocol.unavailable(purpose) if experiment.protocol else [])
+
+
+def unpredictable(experiment: Experiment) -> str | None:
+    """Why there is no prediction, as a part of a sentence; None where there is one."""
+    reason = experiment.protocol.unpredictable() if experiment.protocol else None
+    return reason or next(iter(_too_large_to_predict(experiment)), None)
+
+
+def _too_large_to_predict(experiment: Experiment) -> list[str]:
+    lines, noise, graphs, gains = [], experiment.noise, experiment.graph_list, experiment.leader_gains
+    links = heard_links(graphs, experiment.time) & np.isfinite(gains)[:, None]
+    lossy = int((links & (experiment.loss > 0.0)).sum())
     if noise.burst is not None and len(graphs) * 2.0**lossy > MOST_STATES:
         wanted = f"has no prediction: 2^{lossy} states of {lossy} links that lose messages, expected at most "
         wanted += f"{MOST_STATES} with those of the graph"
         lines.append(problem("noise.burst", noise.burst, wanted, "remove it, or give fewer links a loss"))
     kept = len(gains) * (noise.delay + 2) + lossy * (noise.delay + 1) * noise.holds
-    by_message = noise.holds or (pace == "realtime" and noise.steps_only)
+    by_message = noise.holds or (experiment.run.pace == "realtime" and noise.steps_only)
     if by_message and kept > MOST_VALUES:
         wanted = f"has no prediction: {kept} values are kept from step to step, expected at most {MOST_VALUES}"
         lines.append(problem("noise.on_loss", noise.on_loss, wanted, "use fewer agents or links, or own values"))
@@ -354,17 +335,22 @@ def heard_links(graphs: Sequence[Graph], time: Time) -> BoolArray:
     return np.asarray(heard)
 
 
-def numbered_losses(loss: LossSpec, names: Sequence[str] | None) -> tuple[LossSpec, list[str]]:
+def unknown_name(
+    key: str, agent: int | str, names: Sequence[str], others: str = "expected a number, since no agent is named"
+) -> str:
+    """The mistake of an agent that is not there; ``others``: what was expected where no agent has a name."""
+    return problem(key, show(agent), f"expected one of the names {listed(names)}" if names else others, "correct it")
+
+
+def numbered_losses(loss: LossSpec, names: Sequence[str]) -> tuple[LossSpec, list[str]]:
     """The same with numbers instead of names of agents, and the names that are unknown."""
     found: list[str] = []
 
     def number(key: str, agent: int | str) -> int | str:
-        if not isinstance(agent, str):
-            return agent
-        if agent in (names or []):
-            return (names or []).index(agent) + 1
-        wanted = f"expected one of the names {listed(names)}" if names else "expected a number, since no agent is named"
-        found.append(problem(key, show(agent), wanted, "correct it"))
+        if agent in names:
+            return names.index(str(agent)) + 1
+        if isinstance(agent, str):
+            found.append(unknown_name(key, agent, names))
         return agent
 
     numbers = {
@@ -377,10 +363,7 @@ def numbered_losses(loss: LossSpec, names: Sequence[str] | None) -> tuple[LossSp
 def loss_matrix(
     loss: LossSpec, graphs: Sequence[Graph], time: Time, names: Sequence[str] | None
 ) -> tuple[FloatArray, list[str]]:
-    """(m, m) probability that a message from agent j (column) to agent i (row) is lost, 0 on the diagonal.
-
-    Also the links in ``loss``, which has numbers of agents, that are in no graph or are repeated.
-    """
+    """(m, m) probability that a message from agent j (column) to agent i (row) is lost, and what is wrong with it."""
     agents, found = graphs[0].agents, []
     heard = heard_links(graphs, time)
     matrix = np.where(np.eye(agents, dtype=np.bool_), 0.0, loss.default)

@@ -15,6 +15,7 @@ import numpy as np
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import number_text
+from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.inference.estimates import Estimate, beside
 from msg_analysis.inference.observation import bounded
 from msg_analysis.inference.online_evidence import AnyTime, ReceivedEvidence, RunningEvidence, needs_log, supports
@@ -91,7 +92,7 @@ class LiveEstimate:
         experiment = record.experiment
         lockstep = experiment.run.pace == "lockstep"
         self.record = record
-        reason = experiment.unpredictable()
+        reason = unpredictable(experiment)
         prediction = None if reason else predict(experiment, record.step_model)
         self._errors = RunningErrors(record, prediction, nodes=nodes)
         self._plain: RunningEvidence | None = None

@@ -17,9 +17,9 @@ from msg_analysis.bags.states import own_layout
 from msg_analysis.common.arrays import AnyArray, FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.acceptance import Refusal
-from msg_analysis.model.phases import phases
 from msg_analysis.model.run import LoggedInputs
 from msg_analysis.model.run_record import RunRecord
+from msg_analysis.model.step_model import phases
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,6 +15,7 @@ import numpy as np
 
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.errors import InputError
+from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.inference.comparison import Comparison, Member, Pool, first_difference
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.observation import Observation
@@ -75,7 +76,7 @@ def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> C
         _require_another(members, name, run.record)
         experiment = run.record.experiment
         if prediction is None:
-            reason = experiment.unpredictable()
+            reason = unpredictable(experiment)
             if reason:
                 raise InputError(f"{name}: {reason}, so there is nothing to pool: compare one bag at a time")
             prediction, trajectory = predict(experiment, run.record.step_model), _without_data(run)

@@ -16,9 +16,8 @@ from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import percent
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.statistics import binomial_interval
-from msg_analysis.model.phases import phases
-from msg_analysis.model.reception import MessagesUsed, neighbour_tables
-from msg_analysis.model.step_model import ideal_uses
+from msg_analysis.model.reception import MessagesUsed, ideal_uses, neighbour_tables
+from msg_analysis.model.step_model import phases
 
 AT_ONCE = 2**21  # numbers that are sorted together
 QUANTILE_BINS = 2**14

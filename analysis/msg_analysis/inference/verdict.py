@@ -11,6 +11,7 @@ import numpy as np
 
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.resources import blas_threads
+from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.comparison import Comparison, trusted
 from msg_analysis.inference.counts import LossTally, Transitions, loss_test
@@ -152,7 +153,7 @@ MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
 
 def compare_run(trajectory: Run, *, level: float = 0.01) -> Comparison:
     """Compare a run, or its complete beginning, with what theory predicts for it, see ``pool.compare``."""
-    unpredicted = trajectory.record.experiment.unpredictable()
+    unpredicted = unpredictable(trajectory.record.experiment)
     if unpredicted:
         return _measured(trajectory, level, unpredicted)
     prediction = predict(trajectory.record.experiment, trajectory.record.step_model)

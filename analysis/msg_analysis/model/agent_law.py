@@ -6,24 +6,62 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
-from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK
-from msg_analysis.arithmetic.update_law import combine, from_payload, to_payload
+import numpy as np
+
+from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK, Stream, normals
+from msg_analysis.arithmetic.update_law import combine, from_payload, to_payload, weighted_sum
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.protocols import AgentProtocol
-from msg_analysis.model.process_noise import ProcessNoise
 from msg_analysis.model.reception import NOTHING, AgentAir
 from msg_analysis.model.run_record import RunRecord
-from msg_analysis.model.step_model import StepModel, Wiring
+from msg_analysis.model.step_model import StepModel, Wiring, step_noise_gain
 from msg_analysis.protocol import Heard
 
 
-class AgentLaw:
-    """The state x(k) of one agent (index from 0) as a payload, and its next states.
+class ProcessNoise:
+    """The process noise of any agent at any step: row i of B_g v(k), with B_g (n, m, m) = ``noise_gain``."""
 
-    ``heard`` of a step in lockstep has the steps of the values used in the step to x(k), or ``LOST``, by neighbour,
-    ascending; empty where none was lost.
-    """
+    # Correlated noise needs no communication: an agent draws the sources v_j that its rows use by itself. kept: all
+    # that was drawn stays in memory, for another pass over the same steps.
+
+    def __init__(self, seed: int, noise_gain: FloatArray, replicas: int, *, kept: bool = False) -> None:
+        self.replicas = replicas
+        agents = noise_gain.shape[1]
+        sources = int(np.count_nonzero(noise_gain.any(axis=0), axis=1).max(initial=1))
+
+        # An agent asks for its own row only, the twin for every row of a block: keep one block of every source.
+        @lru_cache(maxsize=None if kept else agents if sources > 1 else 1)
+        def source(agent: int, block: int, steps: int) -> FloatArray:
+            return normals(seed, Stream.PROCESS, agent, block, (steps, replicas))
+
+        self._source = source
+        self._rows = lru_cache(maxsize=None)(lambda agent: _different_rows(noise_gain[:, agent]))
+
+    def block(self, agent: int, block: int, steps: int = STEPS_PER_BLOCK) -> list[FloatArray]:
+        """For each mode, the noise of one agent (from 0) in the first steps of a block; equal ones share an array."""
+        rows, of_mode = self._rows(agent)
+        drawn = [
+            weighted_sum(weights, [self._source(j, block, steps) for j in used])
+            if used
+            else np.zeros((steps, self.replicas))
+            for used, weights in rows
+        ]
+        return [drawn[row] for row in of_mode]
+
+
+def _different_rows(rows: FloatArray) -> tuple[list[tuple[list[int], list[float]]], list[int]]:
+    """Sources (from 0) and weights of each different one of an agent's rows (n, m), and for each mode which it is."""
+    keys = [row.tobytes() for row in rows]
+    different = dict(zip(keys, rows, strict=True))
+    places = list(different)
+    used = [(np.flatnonzero(row).tolist(), row[row != 0.0].tolist()) for row in different.values()]
+    return used, [places.index(key) for key in keys]
+
+
+class AgentLaw:
+    """The state x(k) of one agent (index from 0) as a payload, and its next states."""
 
     air: AgentAir | None = None  # None where messages have no noise, none is lost, and none is old
 
@@ -31,6 +69,7 @@ class AgentLaw:
         self.agent = agent
         self.step = 0
         self.state = to_payload(record.start[agent])
+        # In lockstep, by neighbour, the step of the value used in the step to x(k), or LOST; empty where none was lost.
         self.heard: tuple[int, ...] = ()
         self._noise = ProcessNoise(record.experiment.run.seed, model.noise_gain, record.experiment.run.replicas)
         modes = range(model.modes)
@@ -54,11 +93,8 @@ class AgentLaw:
         return state
 
     def advance(self, mode: int, heard: list[bytes], steps: Sequence[int] | None = None) -> bytes:
-        """x(k+1) from x(k) under g(k) = ``mode`` (from 0).
-
-        ``heard`` has what the neighbours of this mode, ascending, published: in lockstep in the steps that ``air``
-        needs, or k; in real time in ``steps``, where NOTHING stands for the own value.
-        """
+        """x(k+1) from x(k) under g(k) = ``mode`` (from 0), and what its neighbours, ascending, published: ``heard``."""
+        # In lockstep in the steps that air needs, or k; in real time in steps, where NOTHING stands for the own value.
         if steps is not None:
             heard = [self.state if step == NOTHING else value for step, value in zip(steps, heard, strict=True)]
         before = self._own[mode]
@@ -95,10 +131,7 @@ class AgentLawOnAir(AgentLaw):
 
 
 class ProtocolLaw:
-    """The same for an agent with a nonlinear protocol; ``state`` is all of its state, row by row.
-
-    A lost message is not passed to the protocol.
-    """
+    """The same with a nonlinear protocol, without the lost messages; ``state`` is all of its state, row by row."""
 
     def __init__(self, record: RunRecord, model: Wiring, agent: int) -> None:
         experiment = record.experiment
@@ -112,7 +145,7 @@ class ProtocolLaw:
         modes = range(model.modes)
         self._neighbours = [model.neighbours(mode, agent) for mode in modes]
         self._weights = [experiment.graph_list[mode].adjacency[agent, self._neighbours[mode]] for mode in modes]
-        self._noise = ProcessNoise(experiment.run.seed, experiment.step_noise_gain, experiment.run.replicas)
+        self._noise = ProcessNoise(experiment.run.seed, step_noise_gain(experiment), experiment.run.replicas)
         for shared in (*self._neighbours, *self._weights):
             shared.flags.writeable = False
         self._noises = self._draw(0)

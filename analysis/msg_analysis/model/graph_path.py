@@ -32,11 +32,9 @@ class Sojourn:
 
 
 def sojourns(experiment: Experiment, initial: FloatArray) -> Iterator[Sojourn]:
-    """The graph path of a run of N steps, drawn from the experiment's seed; ``initial`` (n,) is the law of g(0).
-
-    Step k uses the graph of the chain at time k dt, so successive graphs are a Markov chain with P = expm(Gamma dt),
-    exactly. A sojourn between two sampling times, which no step uses, is left out.
-    """
+    """The graph path of a run, drawn from the experiment's seed; ``initial`` (n,) is the law of g(0)."""
+    # Step k uses the graph of the chain at time k dt, so successive graphs are a Markov chain with P = expm(Gamma dt),
+    # exactly. A sojourn between two sampling times, which no step uses, is left out.
     random = generator(experiment.run.seed, Stream.SWITCHING)
     return _sampled(experiment.chain, initial, random, experiment.steps, experiment.step_length)
 
@@ -98,11 +96,9 @@ def mode_path(experiment: Experiment, initial: FloatArray) -> IntArray:
 
 
 def past_modes(experiment: Experiment, first_mode: int, steps: int) -> IntArray:
-    """(steps,) g(-steps), ..., g(-1): the graphs before a run, given that it begins with g(0) = ``first_mode``.
-
-    Drawn backwards by the reversed chain, so that the graphs before and after time 0 are one stationary path. A longer
-    past ends with the same graphs as a shorter one.
-    """
+    """(steps,) g(-steps), ..., g(-1): the graphs before a run, given that it begins with g(0) = ``first_mode``."""
+    # By the reversed chain, so that the graphs before and after time 0 are one stationary path; from time 0 backwards,
+    # so that a longer past ends with the same graphs as a shorter one.
     chain = experiment.chain.reversed
     start = np.eye(chain.modes)[first_mode]
     random = generator(experiment.run.seed, Stream.PAST)

@@ -22,8 +22,7 @@ from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK, Stream, link_n
 from msg_analysis.arithmetic.update_law import Reception, from_payload, to_payload
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.model.phases import phases
-from msg_analysis.model.step_model import Wiring
+from msg_analysis.model.step_model import Wiring, phases
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,6 +31,11 @@ class Neighbours:
 
     senders: IntArray  # (n, m, D) the d-th neighbour, ascending; the agent itself beyond their number
     count: IntArray  # (n, m) their number
+
+    @property
+    def there(self) -> BoolArray:
+        """(n, m, D) whether there is a d-th neighbour."""
+        return np.asarray(np.arange(self.senders.shape[2]) < self.count[:, :, None])
 
 
 @lru_cache(maxsize=4)
@@ -46,6 +50,12 @@ def neighbour_tables(wiring: Wiring) -> Neighbours:
             count[mode, i] = len(neighbours)
             senders[mode, i, : len(neighbours)] = neighbours
     return Neighbours(senders, count)
+
+
+def ideal_uses(wiring: Wiring, phase: FloatArray) -> IntArray:
+    """(n, m, D) 1 for neighbours that are due earlier in a period than the agent, 0 for others; -1: no d-th one."""
+    tables = neighbour_tables(wiring)
+    return np.where(tables.there, phase[tables.senders] < phase[:, None], -1)
 
 
 _WITHIN = np.arange(STEPS_PER_BLOCK)
@@ -119,17 +129,15 @@ NOTHING = -1
 
 
 class Air:
-    """The random numbers of noise and loss on the air, block after block of steps.
+    """The random numbers of noise and loss on the air, block after block of steps."""
 
-    They do not depend on the graph: they are drawn for a link and a step whether that step uses the link or not.
-    ``start``: step of the first messages; negative for a past before the run.
-    """
+    # They do not depend on the graph: they are drawn for a link and a step whether that step uses the link or not.
 
     def __init__(self, experiment: Experiment, start: int = 0) -> None:
         noise = experiment.noise
         self.broadcast, self.link, self.loss = noise.broadcast, noise.link, noise.loss.any
         self.delay, self.holds = noise.delay, noise.holds
-        self.start = start
+        self.start = start  # step of the first messages; negative for a past before the run
         self._seed = experiment.run.seed
         self._replicas = experiment.run.replicas
         self._losses = Losses(experiment)
@@ -139,10 +147,7 @@ class Air:
         self._broadcast_block = lru_cache(maxsize=2)(self.broadcast_noise)
 
     def broadcast_noise(self, agent: int, block: int, until: int | None = None) -> FloatArray:
-        """(STEPS_PER_BLOCK, replicas): b of an agent (index from 0) in a block of steps (number from 0).
-
-        Where steps from ``until`` on do not matter, only those before.
-        """
+        """(STEPS_PER_BLOCK, replicas): b of an agent (from 0) in a block of steps, or in those before ``until``."""
         return self.broadcast * normals(self._seed, Stream.BROADCAST, agent, block, self._shape(block, until))
 
     def link_noise(self, receiver: int, sender: int, block: int, until: int | None = None) -> FloatArray:
@@ -162,10 +167,7 @@ class Air:
         return lost
 
     def sources(self, receiver: int, sender: int, block: int) -> IntArray:
-        """(STEPS_PER_BLOCK,) of a run: the step of the message that is used where that of each step should be.
-
-        NOTHING where the receiver uses its own value.
-        """
+        """(STEPS_PER_BLOCK,): step of the message used where that of each step should be; NOTHING: the own value."""
         steps = block * STEPS_PER_BLOCK + np.arange(STEPS_PER_BLOCK)
         came = np.where(self.losses(receiver, sender, block), NOTHING, steps)
         if not self.holds:
@@ -184,10 +186,7 @@ class Air:
         return found
 
     def published(self, agent: int, step: int, state: FloatArray) -> FloatArray:
-        """What an agent (index from 0) publishes of its state (replicas,) of a step.
-
-        Two blocks of noise are cached, which makes consecutive steps of one agent fast.
-        """
+        """What an agent (index from 0) publishes of its state (replicas,) of a step."""
         block, within = divmod(step, STEPS_PER_BLOCK)
         return np.asarray(state + self._broadcast_block(agent, block)[within])
 
@@ -274,10 +273,7 @@ def add_broadcast_noise(air: Air, states: FloatArray, first: int) -> FloatArray:
 
 
 def by_sender_and_block(senders: IntArray, used: IntArray) -> Iterator[tuple[int, int, BoolArray, IntArray]]:
-    """Of messages from ``senders`` with the steps ``used`` (NOTHING: none), arrays of one shape: each sender and block.
-
-    With each, which entries are its messages, and the places of their steps in the block.
-    """
+    """Each sender and block of messages with the steps ``used``; which entries these are, and their places in it."""
     block, within = np.divmod(used, STEPS_PER_BLOCK)
     heard = used != NOTHING
     for sender, number in {*zip(senders[heard].tolist(), block[heard].tolist(), strict=True)}:
@@ -293,7 +289,7 @@ class MessagesUsed:
         self._pairs: list[tuple[int, int]] = [(i, j) for i, j in np.argwhere(model.listens()).tolist()]
         # (n, m, D) number of the link from each neighbour in each graph; L beyond the last neighbour.
         self._links = np.full(self._tables.senders.shape, len(self._pairs))
-        there = np.arange(model.most_neighbours) < self._tables.count[:, :, None]
+        there = self._tables.there
         numbers = np.zeros((model.agents, model.agents), dtype=np.int64)
         for number, link in enumerate(self._pairs):
             numbers[link] = number
@@ -328,7 +324,8 @@ class AgentAir:
 
         @lru_cache(maxsize=links)
         def sources(sender: int, block: int) -> list[int]:
-            return air.sources(agent, sender, block).tolist() if air.loss else _own_steps(block)
+            steps = range(block * STEPS_PER_BLOCK, (block + 1) * STEPS_PER_BLOCK)
+            return air.sources(agent, sender, block).tolist() if air.loss else list(steps)
 
         @lru_cache(maxsize=links)
         def noise(sender: int, block: int) -> FloatArray:
@@ -366,10 +363,7 @@ class AgentAir:
     def receive(
         self, senders: Sequence[int], step: int, heard: Sequence[bytes], steps: Sequence[int] | None
     ) -> tuple[list[bytes | None], tuple[int, ...]]:
-        """What is received of these senders in a step, None where the own value is used; and ``AgentLaw.heard``.
-
-        ``heard`` and ``steps`` as in ``AgentLaw.advance``. Hot path.
-        """
+        """What is received of these senders in a step, None where the own value is used; and ``AgentLaw.heard``."""
         logged: tuple[int, ...] = ()
         if steps is None:
             newest = max(0, step - self.delay)
@@ -393,7 +387,3 @@ class AgentAir:
     def published(self, step: int, value: FloatArray) -> bytes:
         """The payload that is published of a value (replicas,)."""
         return to_payload(self._air.published(self._agent, step, value) if self.broadcast else value)
-
-
-def _own_steps(block: int) -> list[int]:
-    return list(range(block * STEPS_PER_BLOCK, (block + 1) * STEPS_PER_BLOCK))

@@ -282,10 +282,9 @@ class Run:
 
 
 class LoggedInputs:
-    """What ``heard`` can be in a run, and what it says. Agents count from 0, graphs as sent: from 1, 0 at step 0.
+    """What ``heard`` can be in a run, and what it says. Agents count from 0, graphs as sent: from 1, 0 at step 0."""
 
-    ``heard`` (states, D) uint64 has 0 beyond its end, after ``count`` (states,) entries.
-    """
+    # heard (states, D) uint64 has 0 beyond its end, after count (states,) entries.
 
     def __init__(self, model: Wiring, experiment: Experiment) -> None:
         noise, self.realtime = experiment.noise, experiment.run.pace == "realtime"
@@ -306,11 +305,8 @@ class LoggedInputs:
         return np.maximum(0, step - 1 - self._delay)
 
     def fit(self, step: IntArray, mode: IntArray, agent: IntArray, heard: AnyArray, count: IntArray) -> BoolArray:
-        """Whether ``heard`` is possible: one entry per neighbour in their graph, each a step that can be.
-
-        In lockstep that is the newest one, and an empty ``heard`` says so of all; where the last value heard takes the
-        place of a lost one (``holds``) an earlier one, too; else ``LOST``, if messages can be lost.
-        """
+        """Whether ``heard`` is possible: one entry per neighbour in their graph, each a step that can be."""
+        # In lockstep the newest one, and an empty heard says so of all; with ``holds`` an earlier one, too, else LOST.
         newest = self.newest(step).astype(np.uint64)[:, None]
         possible = heard == newest
         if self.realtime or self.holds:

@@ -24,8 +24,15 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.resources import __version__, ros_distribution
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.experiment.protocols import info_of
-from msg_analysis.model.step_model import StepMatrices, StepModel, Wiring, build_model, build_step_model
+from msg_analysis.experiment.protocols import ProtocolInfo
+from msg_analysis.model.step_model import (
+    StepMatrices,
+    StepModel,
+    Wiring,
+    build_model,
+    build_step_model,
+    step_noise_gain,
+)
 
 DECIDED = "decided"
 DECIDED_PRECISION = 0.05
@@ -81,44 +88,20 @@ def _now() -> datetime.datetime:
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """One run of an experiment.
+    """One run of an experiment."""
 
-    Start and matrices are computed once, when the record is made: every process, the twin and the check use the same
-    numbers, whatever their machines.
-
-    Attributes
-    ----------
-    run
-        run id
-    experiment
-        what is run
-    start
-        (m, width) x(0)
-    versions
-        versions of the software that started the run, and the machine that it was started on
-    matrices
-        of a step, in discrete time or of a linear protocol; else None: they follow from the experiment
-    key
-        with which the nodes sign what steers the run: see ``wire.signatures``; None where it is not known, in bags for
-        example, or not used
-    started
-        when the record was made
-    until
-        when the run may end before its duration; None: it does not
-    planned
-        number of steps that were planned, of a run that has ended before: ``experiment`` has those that it made. None
-        otherwise
-    """
+    # Start and matrices are computed once, when the record is made: every process, the twin and the check use the same
+    # numbers, whatever their machines.
 
     run: uuid.UUID
     experiment: Experiment
-    start: FloatArray
-    versions: dict[str, str] = field(default_factory=software_versions)
-    matrices: StepMatrices | None = None
-    key: bytes | None = field(default=None, repr=False)
+    start: FloatArray  # (m, width) x(0)
+    versions: dict[str, str] = field(default_factory=software_versions)  # of the software that started the run
+    matrices: StepMatrices | None = None  # in discrete time or of a linear protocol; else the experiment gives them
+    key: bytes | None = field(default=None, repr=False)  # with which nodes sign what steers the run; not in bags
     started: datetime.datetime = field(default_factory=_now)
-    until: Until | None = None
-    planned: int | None = None
+    until: Until | None = None  # when the run may end before its duration
+    planned: int | None = None  # steps that were planned, of a run that has ended before: ``experiment`` has those made
 
     @cached_property
     def model(self) -> Wiring:
@@ -127,13 +110,7 @@ class RunRecord:
 
     @property
     def step_model(self) -> StepModel:
-        """What a step of this run does, if its law is linear.
-
-        Raises
-        ------
-        InputError
-            the experiment has a protocol that is not linear, or not here
-        """
+        """What a step of this run does. InputError: it has a protocol that is not linear, or not here."""
         return self.model if isinstance(self.model, StepModel) else build_step_model(self.experiment)
 
     @property
@@ -176,20 +153,7 @@ class RunRecord:
 
     @classmethod
     def from_json(cls, text: str, source: str) -> RunRecord:
-        """Read a run record.
-
-        Parameters
-        ----------
-        text
-            what ``to_json`` wrote
-        source
-            where it came from, for messages
-
-        Raises
-        ------
-        InputError
-            not a run record, of another format, or with an invalid experiment in it
-        """
+        """Read what ``to_json`` wrote; ``source`` is for messages. InputError: it is something else, or not valid."""
         try:
             document: Any = json.loads(text)
             if document["format"] != FORMAT:
@@ -197,7 +161,8 @@ class RunRecord:
                     f"{source}: run record of format {document['format']}, expected {FORMAT}: "
                     "read it with the version of msg_analysis that wrote it"
                 )
-            experiment = Experiment.parse(document["experiment"], source=source, recorded=info_of(document))
+            protocol = ProtocolInfo.from_json(document.get("protocol"))
+            experiment = Experiment.parse(document["experiment"], source=source, recorded=protocol)
             start = np.array(document["start"], dtype=float)
             step = document.get("step")
             matrices = None if step is None else _matrices(step, experiment, source)
@@ -231,7 +196,7 @@ def _entries(matrix: FloatArray) -> list[list[float]]:
 
 
 def _matrices(document: Any, experiment: Experiment, source: str) -> StepMatrices:
-    stacks = {"noise_gain": experiment.step_noise_gain}
+    stacks = {"noise_gain": step_noise_gain(experiment)}
     for key in ("weights", "noise_gain")[: 2 if experiment.protocol else 1]:
         stack = np.zeros((len(experiment.graph_list), experiment.agents, experiment.agents))
         if len(document[key]) != len(stack):

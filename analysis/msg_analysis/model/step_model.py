@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Agents that step one after the other: what a period of a run in real time does when no agent is late.
+"""What one step of all agents does: in lockstep all at once, in real time one after the other if no agent is late.
 
-With g the graph of the period, an agent uses the new states of the agents that are due before it and the old states of
-the others. Row by row, in the order of the phases,
+In real time, with g the graph of the period, an agent uses the new states of the agents that are due before it and the
+old states of the others. Row by row, in the order of the phases,
 
     A_i = W_ii e_i + sum_earlier W_ij A_j + sum_later W_ij e_j,    B_i = F_i + sum_earlier W_ij B_j,
 
@@ -20,11 +20,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from msg_analysis.arithmetic.reproducible import exponential
+from msg_analysis.arithmetic.reproducible import Stream, exponential, generator
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.common.resources import one_blas_thread
 from msg_analysis.experiment.markov_chain import MarkovChain
-from msg_analysis.model.phases import phases
 
 if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
@@ -32,10 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Wiring:
-    """Which agent uses the values of which agents in which graph, and the law of the graphs: all that any law has.
-
-    Modes and agents count from 0.
-    """
+    """Which agent uses the values of which agents in which graph, and the law of the graphs; all count from 0."""
 
     links: BoolArray  # (n, m, m) whether agent i uses what agent j publishes; the diagonal has no meaning
     chain: MarkovChain  # switches between the graphs
@@ -83,7 +79,7 @@ class Wiring:
     @property
     def most_neighbours(self) -> int:
         """Largest number D of neighbours that any agent has in any graph."""
-        return _most_neighbours(self)
+        return int(self.links.sum(axis=2, where=~np.eye(self.agents, dtype=bool)).max())
 
     def listens(self) -> BoolArray:
         """(m, m): whether agent i uses the state of agent j != i in any graph."""
@@ -94,12 +90,11 @@ class Wiring:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepModel(Wiring):
-    """x(k+1) = W_g(k) x(k) + offset_g(k) + noise, then g jumps with P: "what the network actually does".
+    """x(k+1) = W_g(k) x(k) + offset_g(k) + noise, then g jumps with P."""
 
-    Convention: the step k -> k+1 uses g(k). With a delay d, the entries of W_g(k) off the diagonal take x(k - d)
-    instead of x(k), and x(k) = x(0) before the start. ``weights``, ``noise`` and ``loss_variance`` are for agents that
-    step all at once and lose messages independently, each replaced by the agent's own value.
-    """
+    # The step k -> k+1 uses g(k). With a delay d, the entries of W_g(k) off the diagonal take x(k - d) instead of x(k),
+    # and x(k) = x(0) before the start. weights, noise and loss_variance are for agents that step all at once and lose
+    # messages independently, each replaced by the agent's own value.
 
     # (n, m, m) W_g with its mean over lost messages: where one is lost, its weight falls to the agent itself
     weights: FloatArray
@@ -130,19 +125,10 @@ class StepModel(Wiring):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepMatrices:
-    """The numbers of a linear step.
-
-    In discrete time and with a protocol they are results of linear algebra, whose last bits may depend on processor and
-    libraries. So a run computes them once, and its record carries them.
-    """
+    """The numbers of a linear step, which the record of a run carries where linear algebra made them."""
 
     weights: FloatArray  # (n, m, m) W_g when nothing is lost: ``StepModel.nominal``
     noise_gain: FloatArray  # (n, m, m) B_g
-
-
-@lru_cache(maxsize=4)
-def _most_neighbours(wiring: Wiring) -> int:
-    return int(wiring.links.sum(axis=2, where=~np.eye(wiring.agents, dtype=bool)).max())
 
 
 @lru_cache(maxsize=16)
@@ -168,10 +154,7 @@ def build_model(experiment: Experiment, matrices: StepMatrices | None = None) ->
 
 
 def step_matrices(experiment: Experiment) -> StepMatrices:
-    """Compute the matrices of a step.
-
-    InputError: the experiment has a protocol that is not linear, is not available, or fails.
-    """
+    """Compute the matrices of a step. InputError: a protocol that is not linear, is not available, or fails."""
     agents, dt = experiment.agents, experiment.step_length
     grounded = np.isinf(experiment.leader_gains)
     if experiment.protocol:
@@ -179,17 +162,14 @@ def step_matrices(experiment: Experiment) -> StepMatrices:
         weights[:, range(agents), range(agents)] -= dt * np.where(grounded, 0.0, experiment.leader_gains)
         weights[:, grounded] = 0.0
     else:
-        weights, gain = _built_in(experiment), experiment.step_noise_gain
+        weights, gain = _built_in(experiment), step_noise_gain(experiment)
     if experiment.time == "continuous":
         gain[:, grounded] = 0.0  # a leader held at the reference has no noise either
     return StepMatrices(weights, gain)
 
 
 def build_step_model(experiment: Experiment, matrices: StepMatrices | None = None) -> StepModel:
-    """What one step of an experiment does; ``matrices`` are those of the run record, computed if not given.
-
-    InputError: as of ``step_matrices``.
-    """
+    """What one step of an experiment does; ``matrices`` are those of the run record, or of ``step_matrices``."""
     if matrices is None:
         matrices = step_matrices(experiment)
     weights, gain = matrices.weights, matrices.noise_gain
@@ -231,6 +211,11 @@ def build_step_model(experiment: Experiment, matrices: StepMatrices | None = Non
     )
 
 
+def step_noise_gain(experiment: Experiment) -> FloatArray:
+    """(n, m, m) sqrt(dt) F_i: the noise that a step of the built-in law adds is this times N(0, I)."""
+    return np.asarray(np.sqrt(experiment.step_length) * experiment.noise_gain)
+
+
 def _built_in(experiment: Experiment) -> FloatArray:
     """(n, m, m): W_g of the law that the agents have by themselves, with its leaders."""
     gains, agents = experiment.leader_gains, experiment.agents
@@ -270,26 +255,28 @@ def step_law(experiment: Experiment) -> StepLaw:
     return "sequential" if experiment.run.pace == "realtime" else "synchronous"
 
 
-def build_run_model(experiment: Experiment, step: StepModel | None = None) -> StepModel:
-    """What a step of all agents of a run with a linear law does to x(k), as one jump linear system.
+def phases(experiment: Experiment) -> FloatArray:
+    """(m,) phi_i = (rank_i + 1/2) / m in real time: agent i steps from x(k) to x(k+1) at (k + phi_i) dt.
 
-    In real time the law is sequential: noise of an agent reaches those that are due later. With messages that are
-    noisy, late or lost, the micro-steps stay apart (``turns``). ``step``: the model of the experiment, if it is known.
+    Those of unsynchronised timers of equal period: spread evenly over it, in an order drawn from the seed.
     """
+    ranks = generator(experiment.run.seed, Stream.PHASE).permutation(experiment.agents)
+    return np.asarray((ranks + 0.5) / experiment.agents)
+
+
+def build_run_model(experiment: Experiment, step: StepModel | None = None) -> StepModel:
+    """What a step of all agents of a run does to x(k); ``step``: the model of the experiment, if it is known."""
     step = step or build_step_model(experiment)
     if step_law(experiment) == "synchronous":
         return step
     phase = phases(experiment)
-    if experiment.noise.steps_only:
+    if experiment.noise.steps_only:  # with messages that are noisy, late or lost, the micro-steps stay apart
         return dataclasses.replace(step, turns=np.argsort(phase))
     return sequential(step, phase)
 
 
 def sequential(step: StepModel, phase: FloatArray) -> StepModel:
-    """The agents' micro-steps of one period, in the order of their phases (m,), all different, as one step.
-
-    ``step`` is the synchronous step, without loss, delay or noise on the air.
-    """
+    """The agents' micro-steps of a period, in the order of their phases (m,), as one step; no noise on the air."""
     weights, offsets, gain = np.empty_like(step.weights), np.empty_like(step.offsets), np.empty_like(step.noise_gain)
     done = np.zeros(step.agents, dtype=bool)
     for i in np.argsort(phase).tolist():
@@ -300,23 +287,5 @@ def sequential(step: StepModel, phase: FloatArray) -> StepModel:
         offsets[:, i] = step.offsets[:, i] + np.einsum("nj,nj->n", new[:, done], offsets[:, done])
         done[i] = True
     return dataclasses.replace(
-        step,
-        weights=weights,
-        nominal=weights,
-        offsets=offsets,
-        noise_gain=gain,
-        noise=gain @ gain.transpose(0, 2, 1),
+        step, weights=weights, nominal=weights, offsets=offsets, noise_gain=gain, noise=gain @ gain.transpose(0, 2, 1)
     )
-
-
-def ideal_uses(model: StepModel, phase: FloatArray) -> IntArray:
-    """(n, m, D) how many steps after x_i(k) the value of the d-th neighbour of agent i is, with ideal timers.
-
-    1 for neighbours that are due earlier in the period, 0 for others; -1 where there is no d-th neighbour.
-    """
-    ahead = np.full((model.modes, model.agents, model.most_neighbours), -1, dtype=np.int64)
-    for mode in range(model.modes):
-        for i in range(model.agents):
-            neighbours = model.neighbours(mode, i)
-            ahead[mode, i, : len(neighbours)] = phase[neighbours] < phase[i]
-    return ahead

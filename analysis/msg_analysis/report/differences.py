@@ -40,7 +40,7 @@ from msg_analysis.model.run import Run
 from msg_analysis.report.comparison_text import agent_errors
 from msg_analysis.report.tables import fact_table, first_rows, number_table, print_table
 from msg_analysis.runs import read_document, result_row, tested_error
-from msg_analysis.theory.leader_search import SearchProgress, ignore
+from msg_analysis.theory.leader_search import SearchProgress
 from msg_analysis.theory.leaders import AUTO_SETS, select_leaders
 from msg_analysis.theory.prediction import LAW_NAMES, Moments, Prediction, predict
 from msg_analysis.theory.settling import asymptotic_rates
@@ -168,7 +168,7 @@ MOST_AGENTS = 100  # with which leaders are searched: each set takes up to half 
 _RATES = ("mean", "second_moment", "graph")
 
 
-def experiment_difference(a: Experiment, b: Experiment, watch: SearchProgress = ignore) -> dict[str, Any]:
+def experiment_difference(a: Experiment, b: Experiment, watch: SearchProgress | None = None) -> dict[str, Any]:
     """The document of ``msg-analysis diff`` of two experiments; keys in docs/commands.md.
 
     An experiment without a prediction has the reason instead. ``watch``: of the search of leaders.
@@ -231,7 +231,7 @@ def _rates(prediction: Prediction) -> dict[str, float | None]:
 
 
 def _leaders(
-    a: Experiment, b: Experiment, found: list[Prediction | str], watch: SearchProgress
+    a: Experiment, b: Experiment, found: list[Prediction | str], watch: SearchProgress | None
 ) -> list[dict[str, Any]]:
     """Leaders of each, and the best set of as many; one without leaders gets as many, and the gain, of the other."""
     sides = []

@@ -31,13 +31,12 @@ from msg_analysis.inference.autocovariance import (
 from msg_analysis.inference.observation import Observation
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.facts import check_facts
-from msg_analysis.theory.graph_indices import algebraic_connectivity, error_bounds, graph_indices
+from msg_analysis.theory.graph_indices import algebraic_connectivity, error_bounds, graph_indices, two_topology
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.prediction import predict
 from msg_analysis.theory.settling import asymptotic_rates, settling_time
 from msg_analysis.theory.spectrum import Spectrum, spectrum
 from msg_analysis.theory.transient import TransientLaw, point_start, solve_transient, start_of
-from msg_analysis.theory.two_graphs import two_topology
 
 if TYPE_CHECKING:
     from msg_analysis.bags.files import FileInventory, Inventory
@@ -261,7 +260,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
         "stability_limit": min((limit for limit in limits if limit is not None), default=None),
         "predicted_system_error": _predicted_system_error(experiment),
         "memory": {"states": states, "matrices": matrices},
-        "unavailable": experiment.unavailable(),
+        "unavailable": validation.unavailable(experiment),
     }
 
 

@@ -15,8 +15,8 @@ from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, PlainText, Ra
 from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray, pieces
 from msg_analysis.common.text import agent_text, counted
-from msg_analysis.model.phases import phases
 from msg_analysis.model.run import Run
+from msg_analysis.model.step_model import phases
 from msg_analysis.report.look import shorten
 from msg_analysis.report.plot_style import (
     BLACK,

@@ -25,8 +25,9 @@ from msg_analysis.errors import InputError
 from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import other_kind, read_yaml
-from msg_analysis.experiment.network_spec import Count, expected, is_number
 from msg_analysis.experiment.problems import ExperimentError, problem, show, translate
+from msg_analysis.experiment.spec import Count, expected, is_number
+from msg_analysis.experiment.validation import unavailable
 from msg_analysis.model.run_record import Until
 from msg_analysis.sweeps.points import Job, JobKind
 
@@ -341,7 +342,7 @@ def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: P
             for key, value in values.items():
                 document = put(document, key, value)
             experiment = Experiment.parse(document, source=str(path), directory=directory)
-            lines = experiment.unavailable("predict" if spec.kind == "predict" else "run")
+            lines = unavailable(experiment, "predict" if spec.kind == "predict" else "run")
         except KeyProblemError as error:
             lines = [str(error)]
         except ExperimentError as error:

@@ -17,8 +17,8 @@ from pydantic import ValidationError
 from msg_analysis.common.text import markdown_table
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graph_sources import plain
-from msg_analysis.experiment.network_spec import is_number
 from msg_analysis.experiment.problems import ExperimentError, translate
+from msg_analysis.experiment.spec import is_number
 from msg_analysis.sweeps import grid
 from msg_analysis.sweeps.grid import SweepSpec
 from msg_analysis.sweeps.points import JobKind, evaluate, options

@@ -92,12 +92,16 @@ class CoupledEquations:
     alone fails for fast switching, the second alone for slow. Groups of graphs that switch among themselves much
     faster than they are left get averaged equations of their own, smaller groups first.
 
-    ``forward``: the equations of C_i / pi_i, to get their adjoint; None to get these themselves. InputError: D,
-    averaged over all graphs, is singular up to rounding.
+    ``forward``: the equations of C_i / pi_i, to get their adjoint (of Y_i, or sum_j P_ij Y_j in discrete time: see
+    ``MomentSolver.dual``); None to get these themselves. InputError: D, averaged over all graphs, is nearly singular.
     """
 
-    def __init__(self, system: JumpSystem, forward: CoupledEquations | None = None) -> None:
+    def __init__(
+        self, system: JumpSystem, forward: CoupledEquations | None = None, *, single_from: int = SINGLE_FROM
+    ) -> None:
         self.system, self.weights, self._forward = system, system.stationary, forward  # weights: (n,) pi
+        # Whether single precision is faster.
+        self.large: bool = forward.large if forward else system.dimension >= single_from
         flow = system.stationary[:, None] * system.chain  # of probability, between graphs
         # drift: (n, d, d) D; rates: (n, n) T off the diagonal, 0 on it; leaving: (n,) its row sums
         if forward is None:
@@ -117,13 +121,8 @@ class CoupledEquations:
         flow = flow - np.diag(np.diag(flow))
         self.reversible = bool((np.abs(flow - flow.T) <= 1e-13 * (flow + flow.T)).all())
         # In the inner product with the weights; ``inner.definite`` checks that every graph is symmetric, too.
-        self.definite = (
-            system.time == "continuous" and self.reversible and len(self._levels) == 1 and self.whole.definite
-        )
-
-    def adjoint(self) -> CoupledEquations:
-        """The equations of Y_i (continuous time), or of sum_j P_ij Y_j (discrete time); see ``MomentSolver.dual``."""
-        return CoupledEquations(self.system, self)
+        symmetric = system.time == "continuous" and self.reversible
+        self.definite = symmetric and len(self._levels) == 1 and self.whole.definite
 
     @cached_property
     def modes(self) -> LocalSolves:
@@ -142,20 +141,13 @@ class CoupledEquations:
             return other
         other.modes = self.modes.single()
         other.drift, other.rates, other.leaving = other.modes.drift, single(self.rates), single(self.leaving)
-        other._levels = [
-            Level(single(level.average), single(level.members), level.solves.single()) for level in self._levels
-        ]
+        other._levels = [Level(single(law), single(members), solves.single()) for law, members, solves in self._levels]
         return other
 
     @property
-    def large(self) -> bool:
-        """Whether single precision is faster."""
-        return self.system.dimension >= SINGLE_FROM
-
-    @property
-    def one_level(self) -> bool:
-        """Whether the only average is the one of all graphs."""
-        return len(self._levels) == 1
+    def levels(self) -> int:
+        """Number of averages; 1: only that of all graphs."""
+        return len(self._levels)
 
     @property
     def decay(self) -> FloatArray:
@@ -317,18 +309,20 @@ LARGEST_INVERSE = 100.0  # largest norm of the inverse of the transition matrix 
 NEGLIGIBLE = 3.0  # d_i X d_i is left out where the error allowed is this many times its usual contribution
 
 
-def suitable(equations: CoupledEquations) -> bool:
-    """Whether M is positive, single precision suffices, and every graph is left fast enough for this to pay."""
+def averaged_equations(equations: CoupledEquations) -> AveragedEquations | None:
+    """The cheaper preconditioner, where it promises to be better; None elsewhere."""
+    # M must be positive, single precision suffice, and every graph be left fast enough for this to pay.
     whole = equations.whole
-    if not (equations.symmetric and whole.mild and equations.leaving.min() >= SLOWEST * equations.decay.mean()):
-        return False
-    if (
-        whole.time == "discrete"
-        and not np.linalg.svd(_transition(equations), compute_uv=False)[-1] * LARGEST_INVERSE > 1.0
-    ):
-        return False
+    if not (equations.levels == 1 and equations.large and equations.symmetric) or equations.system.lossy:
+        return None
+    if not (whole.mild and whole.definite and equations.leaving.min() >= SLOWEST * equations.decay.mean()):
+        return None
+    if whole.time == "discrete":
+        smallest = np.linalg.svd(_transition(equations), compute_uv=False)[-1]
+        if not smallest * LARGEST_INVERSE > 1.0:
+            return None
     rates = np.linalg.eigvalsh(_flow(equations)[0])
-    return whole.definite and bool(rates[0] >= -1e-10 * rates[-1])
+    return AveragedEquations(equations) if rates[0] >= -1e-10 * rates[-1] else None
 
 
 class AveragedEquations:
@@ -430,10 +424,8 @@ class AveragedEquations:
         return right, self.apply(right)
 
     def _second(self, half: FloatArray, out: FloatArray, accuracy: float) -> FloatArray:
-        """G from ``half`` = d_i X, up to an antisymmetric part. Discrete time.
-
-        d_i X d_i is symmetric, so its upper right block is not computed: the lower left one counts twice.
-        """
+        """G from ``half`` = d_i X, up to an antisymmetric part. Discrete time."""
+        # d_i X d_i is symmetric, so its upper right block is not computed: the lower left one counts twice.
         if accuracy > NEGLIGIBLE * self._usual:
             return np.multiply(half, self._kept, out=out)
         k = half.shape[-1] // 2

@@ -9,7 +9,7 @@ They are used for nothing else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,50 +31,21 @@ _BLURRED = 1e-13, 1e-10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fact:
-    """One matrix of the paper and what a lemma says about its eigenvalues.
+    """One matrix of the paper and what a lemma says about its eigenvalues."""
 
-    Attributes
-    ----------
-    name
-        the matrix, as in the paper
-    statement
-        what the lemma says, corrected where the paper is wrong (docs/errata.md)
-    holds
-        whether it is true of this network
-    target
-        the special eigenvalue: 0 in continuous time, 1 in discrete time
-    expected, multiplicity, nullity
-        number of eigenvalues at the target: by the lemma, counted, and counted as null vectors
-    others
-        least real part of the other eigenvalues (continuous time, must be > 0), or largest modulus (discrete time, must
-        be < 1)
-    residual
-        largest entry of (matrix - target) @ v over the null vectors v of the lemma, relative to that of the matrix
-    """
-
-    name: str
-    statement: str
-    holds: bool
-    target: float
-    expected: int
-    multiplicity: int
-    nullity: int
-    others: float
-    residual: float
+    name: str  # the matrix, as in the paper
+    statement: str  # what the lemma says, corrected where the paper is wrong (docs/errata.md)
+    holds: bool  # whether it is true of this network
+    target: float  # the special eigenvalue: 0 in continuous time, 1 in discrete time
+    expected: int  # number of eigenvalues at the target, by the lemma
+    multiplicity: int  # the same counted,
+    nullity: int  # and counted as null vectors
+    others: float  # least real part of the others (continuous time, must be > 0), or largest modulus (must be < 1)
+    residual: float  # largest entry of (matrix - target) @ v, v the null vectors of the lemma, over that of the matrix
 
     def to_json(self) -> dict[str, Any]:
         """The document of one fact."""
-        return {
-            "name": self.name,
-            "statement": self.statement,
-            "holds": self.holds,
-            "target": self.target,
-            "expected": self.expected,
-            "multiplicity": self.multiplicity,
-            "nullity": self.nullity,
-            "others": self.others,
-            "residual": self.residual,
-        }
+        return asdict(self)
 
 
 def check_facts(experiment: Experiment) -> list[Fact]:

@@ -49,28 +49,9 @@ class RandomSteps:
     # (k, d) with orthonormal columns: z = embedding @ y before, y = embedding^T z after; None: z is y
     embedding: FloatArray | None
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Modes n, and dimension d."""
-        k = len(self.stages[0][0].matrix)
-        return len(self.chain), k if self.embedding is None else self.embedding.shape[1]
-
 
 def random_steps(step: StepModel, system: JumpSystem) -> RandomSteps:
-    """The steps of ``system``, which ``jump_system.emulated`` made of ``step``.
-
-    Parameters
-    ----------
-    step
-        in real time that of the sequential law
-    system
-        its reduced system, whose coordinates y are used
-
-    Raises
-    ------
-    InputError
-        as of ``message_steps``
-    """
+    """The steps of ``system``, made of ``step`` by ``jump_system.emulated``, in its coordinates y."""
     if step.by_message:
         whole = message_steps(step)
         embedding = np.zeros((whole.entries, system.dimension))
@@ -109,22 +90,12 @@ ROUNDING = 1e-12  # of sums of rows
 
 @dataclass(frozen=True, slots=True)
 class FourthMoment:
-    """Spectral radius of the map of the fourth moments over a step, and what follows from it; None: not known.
+    """Spectral radius of the map of the fourth moments over a step, and what follows from it; None: not known."""
 
-    Attributes
-    ----------
-    radius
-        exact
-    lower, upper
-        bounds of it, equal to ``radius`` where that is known
-    finite
-        whether the fourth moments of the states are finite in the steady state
-    """
-
-    radius: float | None
-    lower: float | None
+    radius: float | None  # exact
+    lower: float | None  # bounds of it, equal to ``radius`` where that is known
     upper: float | None
-    finite: bool | None
+    finite: bool | None  # whether the fourth moments of the states are finite in the steady state
 
     @classmethod
     def between(cls, lower: float | None, upper: float | None) -> FourthMoment:
@@ -147,14 +118,7 @@ def fourth_moment(step: StepModel, system: JumpSystem) -> FourthMoment:
     Otherwise bounded: from below by r^2, r the radius of the second moments, since E[a^4] >= E[a^2]^2. From above by r
     where every agent takes a mean with weights that are not negative: then no step, whatever is lost, makes the largest
     difference between agents (or deviation from the reference) larger, so that E[a(k)^4] <= a(0)^2 E[a(k)^2]. Without
-    losses also by ``lyapunov_bound``.
-
-    Parameters
-    ----------
-    step
-        in real time that of the sequential law
-    system
-        its reduced system, with finite second moments
+    losses also by ``lyapunov_bound``. ``step``: in real time that of the sequential law; ``system``: reduced.
     """
     means = bool((step.nominal >= 0.0).all() and (step.nominal.sum(axis=2) <= 1.0 + ROUNDING).all())
     steps = _affordable(step, system, SMALL_WORK if means else MAX_WORK)
@@ -169,30 +133,21 @@ def fourth_moment(step: StepModel, system: JumpSystem) -> FourthMoment:
 
 
 def fourth_radius(steps: RandomSteps) -> float | None:
-    """Spectral radius of the map of the fourth moments, by Arnoldi on tensors (n, d, d, d, d); None: not found.
-
-    The map is positive, so no other eigenvalue is larger in size.
-    """
-    n, d = steps.shape
-    form = np.eye(d)
-    start = _symmetric(np.multiply.outer(form, form))
+    """Spectral radius of the map of the fourth moments, by Arnoldi on tensors (n, d, d, d, d); None: not found."""
+    n, k = len(steps.chain), len(steps.stages[0][0].matrix)
+    d = k if steps.embedding is None else steps.embedding.shape[1]
+    start = _symmetric(np.multiply.outer(np.eye(d), np.eye(d)))
     return _positive_radius(lambda stack: advance(steps, stack), np.broadcast_to(start, (n, d, d, d, d)))
 
 
 def second_radius(system: JumpSystem) -> float | None:
     """Spectral radius of the second moments, C_j -> sum_i P_ij K_i[C_i]; None: not found."""
-
-    def after(stack: FloatArray) -> FloatArray:
-        return np.asarray(np.tensordot(system.chain, system.propagate(stack), axes=(0, 0)))
-
-    return _positive_radius(after, np.broadcast_to(np.eye(system.dimension), system.matrices.shape))
+    start = np.broadcast_to(np.eye(system.dimension), system.matrices.shape)
+    return _positive_radius(lambda stack: np.tensordot(system.chain, system.propagate(stack), axes=(0, 0)), start)
 
 
 def advance(steps: RandomSteps, stack: FloatArray) -> FloatArray:
-    """(n, d, d, d, d): the symmetric tensors S_j one step later, without noise.
-
-    ``stack`` are S_i (n, d, d, d, d) = E[y y y y; mode i].
-    """
+    """(n, d, d, d, d): the symmetric tensors S_i = E[y y y y; mode i], ``stack``, one step later, without noise."""
     after = np.empty_like(stack)
     embedding = steps.embedding
     for mode, stages in enumerate(steps.stages):
@@ -240,11 +195,8 @@ def lyapunov_bound(system: JumpSystem) -> float:
     best = math.inf
     for _ in range(BOUND_FORMS):
         inverse = np.linalg.inv(np.linalg.cholesky(forms))
-        grown = (
-            inverse[:, None]
-            @ (transposed[:, None] @ forms[None] @ system.matrices[:, None])
-            @ (inverse.transpose(0, 2, 1)[:, None])
-        )
+        after = transposed[:, None] @ forms[None] @ system.matrices[:, None]
+        grown = inverse[:, None] @ after @ inverse.transpose(0, 2, 1)[:, None]
         largest = np.linalg.eigvalsh(grown)[..., -1]  # (n, n) of i and j
         best = min(best, float((system.chain * largest**2).sum(axis=1).max()))
         forms = transposed @ np.tensordot(system.chain, forms, axes=1) @ system.matrices
@@ -282,18 +234,18 @@ def _symmetric(tensor: FloatArray) -> FloatArray:
 
 def _positive_radius(after: Callable[[FloatArray], FloatArray], start: FloatArray) -> float | None:
     """Largest eigenvalue in size of a positive map of stacks of this shape; None: not found."""
-    size = start.size
+    size = start.size  # since the map is positive, no other eigenvalue is larger
     if not np.any(after(start)):
         return 0.0
     if size <= 4:
         return float(np.abs(np.linalg.eigvals([after(one.reshape(start.shape)).ravel() for one in np.eye(size)])).max())
-    operator = scipy.sparse.linalg.LinearOperator(
-        (size, size), matvec=lambda packed: after(packed.reshape(start.shape)).ravel(), dtype=float
-    )
+
+    def step(packed: FloatArray) -> FloatArray:
+        return after(packed.reshape(start.shape)).ravel()
+
+    operator, begin = scipy.sparse.linalg.LinearOperator((size, size), matvec=step, dtype=float), start.ravel()
     try:
-        values = scipy.sparse.linalg.eigs(
-            operator, k=1, v0=start.ravel(), tol=1e-9, maxiter=1000, return_eigenvectors=False
-        )
+        values = scipy.sparse.linalg.eigs(operator, k=1, v0=begin, tol=1e-9, maxiter=1000, return_eigenvectors=False)
     except scipy.sparse.linalg.ArpackError:  # also where it does not converge
         return None
     return float(np.abs(values).max())

@@ -9,7 +9,6 @@ docs/theory.md.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -17,10 +16,9 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse.csgraph
 
-from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.experiment.markov_chain import Time
-from msg_analysis.theory.message_losses import LossEvents, lost, lost_adjoint
-from msg_analysis.theory.message_steps import message_steps
+from msg_analysis.theory.message_steps import LossEvents, message_steps
 
 if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
@@ -94,10 +92,8 @@ class JumpSystem:
         return np.asarray(self.output @ moments @ self.output.T)
 
     def reduced(self, deviations: FloatArray) -> FloatArray:
-        """(..., d) reduced coordinates of the deviations of the agents (..., m); in consensus, of their states.
-
-        With a delay, the earlier states are taken to be the same; so is what was heard, without its noise.
-        """
+        """(..., d) reduced coordinates of the deviations of the agents (..., m); in consensus, of their states."""
+        # With a delay, the earlier states are taken to be the same; so is what was heard, without its noise.
         if self.messages is not None:
             return np.asarray(deviations[..., self.messages.copies] @ self.lift)
         lift = self.lift.reshape(-1, deviations.shape[-1], self.dimension).sum(axis=0)
@@ -109,18 +105,28 @@ class JumpSystem:
         return self.loss_variance is not None or self.losses is not None
 
     def lost(self, moments: FloatArray) -> FloatArray:
-        """(..., n, d, d): what lost messages add to W C W^T, for moments C (..., n, d, d)."""
+        """(..., n, d, d): what lost messages add to W C W^T, for symmetric moments C (..., n, d, d).
+
+        Without kept values, sum_ij variance_ij <(e_i - e_j)(e_i - e_j)^T, C> e_i e_i^T.
+        """
         if self.losses is not None:
             return self.losses.lost(moments)
         assert self.loss_variance is not None
-        return lost(self.lift, self.loss_variance, moments)
+        full = self.lift @ moments @ self.lift.T
+        own = np.diagonal(full, axis1=-2, axis2=-1)
+        squares = own[..., :, None] + own[..., None, :] - 2.0 * full
+        spread = (self.loss_variance * squares).sum(axis=-1)
+        return np.asarray(self.lift.T @ (spread[..., None] * self.lift))
 
     def lost_adjoint(self, forms: FloatArray) -> FloatArray:
-        """(..., n, d, d): the adjoint of ``lost``, for forms Y (..., n, d, d)."""
+        """(..., n, d, d): the adjoint of ``lost``, for symmetric forms Y: <e_i e_i^T, Y> (e_i - e_j)(e_i - e_j)^T."""
         if self.losses is not None:
             return self.losses.adjoint(forms)
         assert self.loss_variance is not None
-        return lost_adjoint(self.lift, self.loss_variance, forms)
+        seen = self.loss_variance * ((self.lift @ forms) * self.lift).sum(axis=-1)[..., None]
+        laplacian = -(seen + seen.swapaxes(-1, -2))
+        laplacian += np.eye(len(self.lift)) * (seen.sum(axis=-1) + seen.sum(axis=-2))[..., None]
+        return np.asarray(self.lift.T @ laplacian @ self.lift)
 
     def of_modes(self, law: FloatArray) -> FloatArray:
         """(n,) law of the modes from that of the graphs; channels are in their stationary state."""
@@ -146,10 +152,8 @@ class JumpSystem:
         return np.asarray(law[:, None, None] * moment)
 
     def started_steady(self, steady: FloatArray, law: FloatArray) -> FloatArray:
-        """(n, d, d) second moments at the start, of agents that are as in the steady state (n, d, d) given the mode.
-
-        What they have heard is x(0), while in the steady state it may be older.
-        """
+        """(n, d, d) second moments at the start, of agents that are as in the steady state (n, d, d) given the mode."""
+        # What they have heard is x(0), while in the steady state it may be older.
         shares = (law / self.stationary)[:, None, None]
         if self.messages is None:
             return np.asarray(shares * steady)
@@ -183,14 +187,13 @@ def emulated(step: StepModel, problem: str) -> JumpSystem:
     common to all of them, not one for each x(k - s): the agents' mean moves, and this acts on agents of unequal degree,
     because they compare their own new values with old ones of others.
     """
-    if step.by_message:
-        return _by_message(step, problem)
-    m, delay = step.agents, step.delay
-    size = m * (delay + 1)
-    consensus = problem == "consensus"
-    lift = scipy.linalg.helmert(size).T if consensus else np.eye(size)
-    weights, noise, loss_variance, readout = step.weights, step.noise, step.loss_variance, None
-    if delay:
+    m, consensus = step.agents, problem == "consensus"
+    whole = message_steps(step) if step.by_message else None
+    weights, noise, loss_variance = step.weights, step.noise, step.loss_variance
+    if whole:
+        weights, noise = whole.matrices, whole.noise
+    elif step.delay:
+        size = m * (step.delay + 1)
         own, old = slice(m), slice(size - m, size)
         inner = weights * np.eye(m)
         weights, noise, loss_variance = (np.zeros((step.modes, size, size)) for _ in range(3))
@@ -199,38 +202,21 @@ def emulated(step: StepModel, problem: str) -> JumpSystem:
         weights[:, m:, :-m] = np.eye(size - m)
         noise[:, own, own] = step.noise
         loss_variance[:, own, old] = step.loss_variance
-        readout = lift[:m] - (lift[:m].mean(axis=0) if consensus else 0.0)
+    lift = scipy.linalg.helmert(weights.shape[1]).T if consensus else np.eye(weights.shape[1])
+    losses = whole.losses if whole else None
     return JumpSystem(
         time="discrete",
         matrices=lift.T @ weights @ lift,
         noise=_reduced_noise(noise, lift),
-        chain=step.transition,
-        stationary=step.stationary,
+        chain=whole.chain if whole else step.transition,
+        stationary=whole.stationary if whole else step.stationary,
         lift=lift,
-        loss_variance=loss_variance if step.loss else None,
-        readout=readout,
+        loss_variance=loss_variance if step.loss and not whole else None,
+        readout=lift[:m] - (lift[:m].mean(axis=0) if consensus else 0.0) if whole or step.delay else None,
         unreduced=weights if consensus else None,
-    )
-
-
-def _by_message(step: StepModel, problem: str) -> JumpSystem:
-    """The same where values are kept from step to step, or agents step one after the other."""
-    whole = message_steps(step)
-    size, m = whole.matrices.shape[1], step.agents
-    consensus = problem == "consensus"
-    lift = scipy.linalg.helmert(size).T if consensus else np.eye(size)
-    return JumpSystem(
-        time="discrete",
-        matrices=lift.T @ whole.matrices @ lift,
-        noise=_reduced_noise(whole.noise, lift),
-        chain=whole.chain,
-        stationary=whole.stationary,
-        lift=lift,
-        readout=lift[:m] - (lift[:m].mean(axis=0) if consensus else 0.0),
-        unreduced=whole.matrices if consensus else None,
-        losses=whole.losses and whole.losses.projected(lift),
-        unreduced_losses=whole.losses if consensus else None,
-        messages=Messages(whole.graphs, whole.copies, lift.T @ whole.start_noise @ lift),
+        losses=losses and losses.projected(lift),
+        unreduced_losses=losses if consensus else None,
+        messages=Messages(whole.graphs, whole.copies, lift.T @ whole.start_noise @ lift) if whole else None,
     )
 
 
@@ -259,16 +245,15 @@ def continuous(experiment: Experiment) -> JumpSystem:
 
 def held(system: JumpSystem, mode: int) -> JumpSystem:
     """The same system, in continuous or discrete time, with one graph (``mode``, from 0) held fixed."""
-    return JumpSystem(
-        time=system.time,
-        matrices=system.matrices[mode : mode + 1],
-        noise=system.noise[mode : mode + 1],
+    one = slice(mode, mode + 1)
+    return replace(
+        system,
+        matrices=system.matrices[one],
+        noise=system.noise[one],
         chain=np.zeros((1, 1)) if system.time == "continuous" else np.ones((1, 1)),
         stationary=np.ones(1),
-        lift=system.lift,
-        loss_variance=None if system.loss_variance is None else system.loss_variance[mode : mode + 1],
-        readout=system.readout,
-        unreduced=None if system.unreduced is None else system.unreduced[mode : mode + 1],
+        loss_variance=None if system.loss_variance is None else system.loss_variance[one],
+        unreduced=None if system.unreduced is None else system.unreduced[one],
         losses=system.losses and system.losses.of_mode(mode),
         unreduced_losses=system.unreduced_losses and system.unreduced_losses.of_mode(mode),
         messages=system.messages and replace(system.messages, graphs=np.zeros(1, np.int64)),
@@ -343,13 +328,8 @@ def components(system: JumpSystem) -> list[Component]:
     losses = system.unreduced_losses if consensus else system.losses
     if losses is not None:
         hears |= losses.uses()
-    return list(_found(matrices, variance, losses, hears, consensus=consensus))
-
-
-def _found(
-    matrices: FloatArray, variance: FloatArray | None, losses: LossEvents | None, hears: BoolArray, *, consensus: bool
-) -> Iterator[Component]:
     count, labels = scipy.sparse.csgraph.connected_components(hears, connection="strong")
+    found = []
     for label in range(count):
         inside, outside = np.flatnonzero(labels == label), np.flatnonzero(labels != label)
         alone = consensus and not hears[np.ix_(inside, outside)].any()
@@ -360,4 +340,5 @@ def _found(
             from_outside = variance[:, inside][:, :, outside].sum(axis=2, keepdims=True)
             lost = np.concatenate([variance[:, inside][:, :, inside], from_outside], axis=2)
         events = losses and losses.projected(np.eye(len(labels))[:, inside])
-        yield Component(matrices[:, inside][:, :, inside], alone, lost, events)
+        found.append(Component(matrices[:, inside][:, :, inside], alone, lost, events))
+    return found

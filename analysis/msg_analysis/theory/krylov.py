@@ -41,10 +41,9 @@ class Equations(Preconditioned, Protocol):
 def conjugate_gradients(
     equations: Equations, right: FloatArray, goal: FloatArray, tolerance: float, most: int
 ) -> tuple[FloatArray, int]:
-    """(X, iterations) for A X = B (q, n, d, d), ``definite``, with preconditioned conjugate gradients.
+    """(X, iterations) for A X = B (q, n, d, d), ``definite``, with conjugate gradients in the product with the weights.
 
-    In the inner product with the weights. It ends when, for every right-hand side, the norm of the preconditioned
-    residual is at most ``goal`` (q,), or at most ``tolerance`` relative to X.
+    It ends when the norms of the preconditioned residuals are at most ``goal`` (q,), or ``tolerance`` relative to X.
     """
     weights = equations.weights
     x, moved = equations.average(right)  # the preconditioner is symmetric where the residual has mean zero
@@ -71,11 +70,10 @@ def conjugate_gradients(
 def plain_conjugate_gradients(
     apply: Callable[[FloatArray, float], FloatArray], right: FloatArray, tolerance: FloatArray, most: int
 ) -> tuple[FloatArray, int]:
-    """(X, iterations) for A X = B (q, n, d, d) with conjugate gradients, without preconditioner or weights.
+    """(X, iterations) for A X = B (q, n, d, d) with conjugate gradients, without preconditioner; overwrites ``right``.
 
-    ``apply`` maps X and the relative error that is allowed to A X, for a symmetric and positive definite A: products
-    may become less accurate as the residual gets smaller (inexact Krylov methods: van den Eshof and Sleijpen 2004).
-    ``right`` is overwritten; ``tolerance``: (q,) norms of the residual, relative to B.
+    ``apply`` maps X and the relative error that is allowed to A X, for a positive definite A: products may become less
+    accurate as the residual gets smaller (van den Eshof and Sleijpen 2004). ``tolerance``: (q,), relative to B.
     """
     x, residual, p = np.zeros_like(right), right, right.copy()
     axpy = scipy.linalg.blas.get_blas_funcs("axpy", (right,))  # in place, in one pass
@@ -100,8 +98,7 @@ def plain_conjugate_gradients(
 def gmres(equations: Preconditioned, right: FloatArray, tolerance: FloatArray, most: int) -> tuple[FloatArray, int]:
     """(X, iterations) for A X = B (q, n, d, d) with GMRES, preconditioned from the right, without restart.
 
-    ``tolerance``: (q,) norms of the residual, relative to B. There are fewer than ``most`` iterations (but no less than
-    5) where ``MAX_BASIS`` or ``MAX_BASIS_BYTES`` requires it.
+    ``tolerance``: (q,) norms of the residual, relative to B; ``MAX_BASIS`` and ``MAX_BASIS_BYTES`` limit ``most``, too.
     """
     q, shape = len(right), right.shape
     length = right[0].size

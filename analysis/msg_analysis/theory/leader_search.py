@@ -25,39 +25,27 @@ _ROUNDING = 1e-10  # slack of every bound, relative to E: well above the error o
 
 
 class SetFunction(Protocol):
-    """The function of a set of leaders that is minimised.
-
-    It is supermodular if a leader is worth no more beside more leaders: E(A) - E(A + v) >= E(B) - E(B + v) for every A
-    inside B and every v outside B.
-    """
+    """The function of a set of leaders that is minimised."""
 
     @property
     def agents(self) -> int:
         """Number of agents m."""
-        ...
 
     @property
     def supermodular(self) -> bool:
-        """Whether E is known to be non-increasing and supermodular."""
-        ...
+        """Whether E(A) - E(A + v) >= E(B) - E(B + v) >= 0 is known for every A inside B and every v outside B."""
 
     def unreached(self, leaders: Leaders) -> int:
         """Number of agents that no leader reaches in the union of all graphs; E is finite only if it is 0."""
-        ...
 
     def system_error(self, leaders: Leaders) -> float:
         """E(S) of a set that reaches all agents."""
-        ...
-
-
-def ignore(_stage: str, _done: int, _total: int, _best: float) -> None:
-    """A ``SearchProgress`` that does nothing."""
 
 
 class LeaderSearch:
     """One search, which keeps the value of every set that it has evaluated; agents count from 0."""
 
-    def __init__(self, function: SetFunction, watch: SearchProgress = ignore) -> None:
+    def __init__(self, function: SetFunction, watch: SearchProgress | None = None) -> None:
         self._function = function
         self._watch = watch
         self._known: dict[Leaders, float] = {}
@@ -84,11 +72,8 @@ class LeaderSearch:
         return _ranked([(value, frozenset(members)) for value, members in best])[:top]
 
     def greedy(self, count: int, first: int | None = None) -> list[int]:
-        """Agents in the order in which they are chosen: each is the best one beside those before it.
-
-        ``first`` is the agent to begin with, by default the best one. As long as no agent makes E finite, the one that
-        leaves the fewest agents unreached is chosen: this finds a set that reaches all agents if there is one.
-        """
+        """Agents in the order in which they are chosen: each is the best one beside those before it, or ``first``."""
+        # As long as no agent makes E finite, the one that leaves the fewest unreached is chosen: see _best_addition.
         self._begin("greedy" if first is None else f"greedy after agent {first + 1}", count * self._function.agents)
         chosen = [] if first is None else [first]
         while len(chosen) < count:
@@ -99,11 +84,8 @@ class LeaderSearch:
         return chosen
 
     def swap(self, count: int) -> list[int]:
-        """The best of a few sets that no exchange of one leader improves, or one that reaches as many agents as it can.
-
-        Exchanges start from greedy sets, begun with each of the ``STARTS`` best single leaders: the agent that is best
-        alone is often not in a good set.
-        """
+        """The best of a few sets that no exchange of one leader improves; where none is found, the greedy one."""
+        # From greedy sets begun with each of the best single leaders: the best one alone is often not in a good set.
         best = self.greedy(count)
         if self._function.unreached(frozenset(best)):
             return best
@@ -137,14 +119,14 @@ class LeaderSearch:
     def bound(self, leaders: Leaders) -> float:
         """Lower bound of E over all sets of as many leaders as in the given result; valid only where E is supermodular.
 
-        For any set A, the best set T and the set V of all agents (+ joins sets; docs/leaders.md has the proof):
+        For any set A, the best set T and the set V of all agents (+ joins sets; docs/leader_theory.md has the proof):
 
             E(A + T) >= E(A) - sum over v in T, not in A, of (E(A) - E(A + v))
             E(T) >= E(A + T) + sum over a in A, not in T, of (E(V - a) - E(V))
 
         The worst T has the largest terms of the first sum and the smallest of the second. The result is the best bound
-        over all A that the search visited and over the given set, whose largest gains are evaluated here. It is at
-        least as good as the guarantee of the greedy choice.
+        over all A that the search visited and the given set. It is at least as good as the guarantee of the greedy
+        choice.
         """
         count = len(leaders)
         self._begin("bound", self._function.agents)
@@ -154,20 +136,16 @@ class LeaderSearch:
             agent: max(self._value(everybody - {agent}) - self._value(everybody), 0.0)
             for agent in sorted(frozenset().union(*self._bases))
         }
-        bounds = [self._bound_from(base, count, least_worth) for base in self._bases]
-        return min(max(0.0, *bounds), self._value(leaders))  # rounding must not lift it above
-
-    def _bound_from(self, base: Leaders, count: int, least_worth: dict[int, float]) -> float:
-        """The bound of ``bound`` from one set A."""
-        value = self._known[base]
-        gains = [max(value - self._least(base, v), 0.0) for v in range(self._function.agents) if v not in base]
-        gains.sort(reverse=True)
-        kept = sorted(least_worth[agent] for agent in base)
-        # shared: how many agents T has in common with A.
-        return min(
-            value - sum(gains[: count - shared]) + sum(kept[: len(base) - shared])
-            for shared in range(max(0, count - len(gains)), min(count, len(base)) + 1)
-        )
+        bounds = [0.0]
+        for base in self._bases:
+            value = self._known[base]
+            gains = [max(value - self._least(base, v), 0.0) for v in range(self._function.agents) if v not in base]
+            gains.sort(reverse=True)
+            kept = sorted(least_worth[agent] for agent in base)
+            # How many agents T may have in common with A.
+            shares = range(max(0, count - len(gains)), min(count, len(base)) + 1)
+            bounds.append(min(value - sum(gains[: count - s]) + sum(kept[: len(base) - s]) for s in shares))
+        return min(max(bounds), self._value(leaders))  # rounding must not lift it above
 
     def evaluated(self, count: int, top: int) -> list[tuple[float, Leaders]]:
         """The ``top`` best (E, set) of the sets of ``count`` agents that were evaluated and have finite E."""
@@ -222,19 +200,16 @@ class LeaderSearch:
 
     def _advance(self, done: int, best: float) -> None:
         self._done += done
-        self._watch(self._stage, min(self._done, self._total), self._total, best)
+        if self._watch:
+            self._watch(self._stage, min(self._done, self._total), self._total, best)
 
 
 def _ranked(sets: list[tuple[float, Leaders]]) -> list[tuple[float, Leaders]]:
     """Best first; among sets that are equal up to ``TIE``, the lower agents first."""
-    ordered = sorted(sets, key=lambda entry: (entry[0], sorted(entry[1])))
-    groups: list[int] = []
-    first = math.nan
-    for value, _ in ordered:
+    groups: list[tuple[float, list[int], tuple[float, Leaders]]] = []
+    first = math.nan  # the least E of the sets that are equal to the present one
+    for value, agents in sorted(sets, key=lambda entry: (entry[0], sorted(entry[1]))):
         if not value <= first * (1 + TIE):
             first = value
-            groups.append(groups[-1] + 1 if groups else 0)
-        else:
-            groups.append(groups[-1])
-    keyed = sorted(zip(groups, ordered, strict=True), key=lambda entry: (entry[0], sorted(entry[1][1])))
-    return [entry for _, entry in keyed]
+        groups.append((first, sorted(agents), (value, agents)))
+    return [entry for *_, entry in sorted(groups, key=lambda group: group[:2])]

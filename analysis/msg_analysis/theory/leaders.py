@@ -3,7 +3,7 @@
 
 """Leaders: what a set of them is worth (joint robustness centrality), and which set is best.
 
-After Section 4 of the paper, "Robustness and leadership indices"; docs/leaders.md has the proofs and bounds.
+After Section 4 of the paper, "Robustness and leadership indices"; docs/leader_theory.md has the proofs and bounds.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from msg_analysis.experiment.spec import LeadersSpec
 from msg_analysis.model.step_model import build_run_model
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.jump_system import JumpSystem
-from msg_analysis.theory.leader_search import Leaders, LeaderSearch, SearchProgress, ignore
+from msg_analysis.theory.leader_search import Leaders, LeaderSearch, SearchProgress
 from msg_analysis.theory.moments import MomentSolver
 
 SelectionLaw = Literal["continuous", "emulated", "discrete"]
@@ -57,7 +57,7 @@ class LeaderProblem:
 
     @cached_property
     def doubt(self) -> str | None:
-        """Why supermodularity is not known; None where it is (docs/leaders.md, "Supermodularity").
+        """Why supermodularity is not known; None where it is (docs/leader_theory.md, "Supermodularity").
 
         E(S) sums, over pairs of walkers that start at one agent and see the same graphs, the noise covariance between
         the agents where they are, until a leader absorbs one of them. With entries >= 0 in every factor this is a
@@ -88,24 +88,18 @@ class LeaderProblem:
         """Number of agents that no leader (from 0) reaches in the union of all graphs; E is finite only if it is 0."""
         return int((~self._reach[sorted(leaders)].any(axis=0)).sum())
 
-    def system(self, leaders: Leaders) -> JumpSystem:
-        """The reduced system with these leaders; infinite gain deletes them (continuous time) or zeroes their rows."""
-        return self._system(leaders, self.gain)
-
     def system_error(self, leaders: Leaders) -> float:
-        """E(S), the sum of the mean-square deviations from the reference; inf where S does not reach all agents.
-
-        1/E(S) at infinite gain is the joint robustness centrality of S (Section 4 of the paper).
-        """
+        """E(S), the sum of the mean-square deviations from the reference; inf where S does not reach all agents."""
         if not leaders or self.unreached(leaders):
             return math.inf
-        system = self.system(leaders)
+        system = self._system(leaders, self.gain)
         if system.dimension == 0:
             return 0.0
         steady = MomentSolver(system).steady()
         return float(np.trace(system.lifted(steady.sum(axis=0))))
 
     def _system(self, leaders: Leaders, gain: float) -> JumpSystem:
+        """The reduced system with these leaders; infinite gain deletes them (continuous time) or zeroes their rows."""
         spec = LeadersSpec.model_construct(agents=[agent + 1 for agent in sorted(leaders)], gain=gain, reference=0.0)
         changes = {"problem": "tracking", "leaders": spec}
         led = dataclasses.replace(self.experiment, spec=self.experiment.spec.model_copy(update=changes))
@@ -188,7 +182,7 @@ def resolve_law(experiment: Experiment, law: SelectionLaw | None = None) -> Sele
     """``law`` if the experiment has it, else InputError; None stands for the paper's law, or else that of the steps."""
     if experiment.time == "discrete":
         possible: list[SelectionLaw] = ["discrete"]
-    elif experiment.steps_only:
+    elif experiment.noise.steps_only or experiment.protocol:
         possible = ["emulated"]
     else:
         possible = ["continuous", "emulated"]
@@ -224,9 +218,8 @@ def system_error(
     InputError
         the experiment does not have this law, or E(S) cannot be computed
     """
-    return LeaderProblem(experiment, resolve_law(experiment, law), gain).system_error(
-        frozenset(experiment.indices(agents))
-    )
+    problem = LeaderProblem(experiment, resolve_law(experiment, law), gain)
+    return problem.system_error(frozenset(experiment.indices(agents)))
 
 
 def joint_robustness_centrality(
@@ -252,13 +245,9 @@ def select_leaders(
     law: SelectionLaw | None = None,
     gain: float | None = None,
     top: int = 10,
-    watch: SearchProgress = ignore,
+    watch: SearchProgress | None = None,
 ) -> Selection:
-    """The set of leaders with the least system error, or a good one; arguments as in ``Experiment.leaders``.
-
-    docs/leaders.md, "Search methods". InputError: impossible count, gain or law; too many sets, or none that reaches
-    all agents.
-    """
+    """The set of leaders with the least system error, or a good one; arguments and errors of ``Experiment.leaders``."""
     _check(method in get_args(SearchMethod), f"method {method}: expected one of {', '.join(get_args(SearchMethod))}")
     own = experiment.spec.leaders
     leading = tuple(int(agent) for agent in np.flatnonzero(experiment.leader_gains))
@@ -276,7 +265,7 @@ def select_leaders(
     problem = LeaderProblem(experiment, resolve_law(experiment, law), gain)
     sets = math.comb(experiment.agents, count)
     chosen_method = method if method != "auto" else "exhaustive" if sets <= AUTO_SETS else "swap"
-    search = LeaderSearch(problem, lambda stage, *rest: watch(with_names(stage, experiment.names), *rest))
+    search = LeaderSearch(problem, watch and (lambda stage, *rest: watch(with_names(stage, experiment.names), *rest)))
     order: list[int] = []
     bound: float | None = None
     if chosen_method == "exhaustive":
@@ -287,10 +276,8 @@ def select_leaders(
         if count > 1 and problem.supermodular and not problem.unreached(frozenset(order)):
             bound = search.bound(frozenset(order))
         found = search.evaluated(count, top)
-    _check(
-        bool(found),
-        f"count {count}: no set of {count} reaches all agents in the union of all graphs: use more leaders",
-    )
+    unreached = f"count {count}: no set of {count} reaches all agents in the union of all graphs: use more leaders"
+    _check(bool(found), unreached)
     if chosen_method == "exhaustive" or count == 1:  # a single leader: all of them were evaluated
         bound = found[0][0]
     result = [(error, _numbers(sorted(agents))) for error, agents in found]

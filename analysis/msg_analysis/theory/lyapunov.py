@@ -102,9 +102,7 @@ class LocalSolves:
         return other
 
     def __call__(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(X, Y) for symmetric F (..., k, d, d), with Y = X in continuous and W X W^T in discrete time, for the
-        coupling.
-        """
+        """(X, Y) for symmetric F (..., k, d, d); for the coupling, Y = X in continuous and W X W^T in discrete time."""
         if self.eigenvectors is None:
             return self._by_schur(right)
         _, vectors, inverse = self.eigenvectors
@@ -199,11 +197,7 @@ def _symmetric(matrices: FloatArray) -> FloatArray:
 
 
 def _triangular(time: Time, t: ComplexArray, leaving: float, right: ComplexArray) -> ComplexArray:
-    """(..., d, d): the solution X = X^H for the upper triangular matrix D = t, column after column from the last.
-
-    continuous: T X + X T^H + a X = F
-    discrete:   X - (1 - a) W X W^H = F with W = I - T
-    """
+    """(..., d, d): the solution X = X^H for the upper triangular matrix D = t, column after column from the last."""
     d = len(t)
     columns = np.moveaxis(right.reshape(-1, d, d), 0, 2).swapaxes(0, 1).copy().reshape(d, -1)  # (column, row and form)
     eye, step, stay = np.eye(d), np.eye(d) - t, 1.0 - leaving

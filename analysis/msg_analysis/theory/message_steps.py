@@ -12,8 +12,9 @@ together if all agents do, so in consensus one number drops out. See docs/theory
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise, product
 
 import numpy as np
 import scipy.linalg
@@ -22,7 +23,56 @@ from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.validation import MOST_STATES, MOST_VALUES
 from msg_analysis.model.step_model import StepModel
-from msg_analysis.theory.message_losses import LossEvents
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LossEvents:
+    """The losses of one step under each of n graphs, matrix-free; zeros where a graph has fewer than L.
+
+    A loss changes the stack z by xi u v^T z, with xi of mean 0 and variance 1, independent of all others: u is what it
+    acts on, at the end of the step, v the difference between what the message brings and what takes its place, for the
+    z at the beginning. A loss may act on the difference that a later one sees: with q_e = E[(v_e^T z)^2] at that time,
+
+        q_e = v_e^T C v_e + sum_(f before e) R_ef q_f,    L[C] = sum_e q_e u_e u_e^T is added to A C A^T
+    """
+
+    into: FloatArray  # (n, L, d) u
+    differences: FloatArray  # (n, L, d) v
+    chain: FloatArray | None  # (n, L, L) (I - R)^-1; None where no loss acts on what another one sees
+
+    def lost(self, moments: FloatArray) -> FloatArray:
+        """(..., n, d, d): L[C] of the moments C (..., n, d, d)."""
+        seen = ((self.differences @ moments) * self.differences).sum(axis=-1)
+        if self.chain is not None:
+            seen = (self.chain @ seen[..., None])[..., 0]
+        return np.asarray(self.into.swapaxes(-1, -2) @ (seen[..., None] * self.into))
+
+    def adjoint(self, forms: FloatArray) -> FloatArray:
+        """(..., n, d, d): the adjoint of ``lost``, of forms Y (..., n, d, d)."""
+        felt = ((self.into @ forms) * self.into).sum(axis=-1)
+        if self.chain is not None:
+            felt = (self.chain.swapaxes(-1, -2) @ felt[..., None])[..., 0]
+        return np.asarray(self.differences.swapaxes(-1, -2) @ (felt[..., None] * self.differences))
+
+    def uses(self) -> BoolArray:
+        """(d, d): whether a loss changes coordinate a by what it sees in b, in any graph; too often with a chain."""
+        found = np.zeros((self.into.shape[2],) * 2, dtype=np.bool_)
+        for changed, seen in zip(self.into != 0.0, self.differences != 0.0, strict=True):
+            if self.chain is None:
+                found |= (changed.T.astype(float) @ seen.astype(float)) > 0.0
+            else:
+                found |= np.outer(changed.any(axis=0), seen.any(axis=0))
+        return found
+
+    def of_mode(self, mode: int) -> LossEvents:
+        """Those of one graph, from 0."""
+        chain = None if self.chain is None else self.chain[mode : mode + 1]
+        return LossEvents(self.into[mode : mode + 1], self.differences[mode : mode + 1], chain)
+
+    def projected(self, basis: FloatArray) -> LossEvents:
+        """In the coordinates that the columns of ``basis`` (d, d') span."""
+        return LossEvents(self.into @ basis, self.differences @ basis, self.chain)
+
 
 _Loss = tuple[int, int, int, float, float]
 """Entry that it changes; the entries that the message brings, and that take its place; probability; weight."""
@@ -34,7 +84,7 @@ class Move:
 
     rows: list[int]
     matrix: FloatArray  # (r, K) mean over the losses
-    losses: list[_Loss]
+    losses: Sequence[_Loss]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,18 +105,7 @@ class MessageSteps:
 
 
 def message_steps(step: StepModel) -> MessageSteps:
-    """The period of a run, message by message.
-
-    Parameters
-    ----------
-    step
-        the synchronous step; its ``turns`` say which agent is due when
-
-    Raises
-    ------
-    InputError
-        too many links, or too many channels
-    """
+    """The period of a run with this synchronous step, message by message. InputError: too many links or channels."""
     stack = _Stack(step)
     channels = np.argwhere(stack.lossy) if step.burst is not None else np.empty((0, 2), np.int64)
     states = _channel_states(step, len(channels))
@@ -78,10 +117,9 @@ def message_steps(step: StepModel) -> MessageSteps:
         probability[channels[:, 0], channels[:, 1]] = states[state]
         periods.append(_period(step, stack, graph, probability))
     chain, stationary = step.transition, step.stationary
-    if len(channels):
-        for i, j in channels.tolist():
-            channel, shares = _gilbert(float(step.losses[i, j]), step.burst or 1.0)
-            chain, stationary = np.asarray(np.kron(chain, channel)), np.asarray(np.kron(stationary, shares))
+    for i, j in channels.tolist():
+        channel, shares = _gilbert(float(step.losses[i, j]), step.burst or 1.0)
+        chain, stationary = np.asarray(np.kron(chain, channel)), np.asarray(np.kron(stationary, shares))
     matrices = np.stack([period.matrix for period in periods])
     losses = _stacked(periods)
     kept = _read(matrices, losses, step.agents)
@@ -145,10 +183,7 @@ class _Stack:
     def start_noise(self) -> FloatArray:
         """(k, k), see ``MessageSteps``: all that was published or heard of x(0) was one message."""
         m, noise = self._step.agents, np.zeros((self.size, self.size))
-        links: dict[tuple[int, int], list[int]] = {}
-        for line in self.heard:
-            for link, entry in line.items():
-                links.setdefault(link, []).append(entry)
+        links = {link: [line[link] for line in self.heard] for link in self.heard[0]}
         heard = [entry for entries in links.values() for entry in entries]
         for j in range(m):
             same = [entry for entry in heard if self.copies[entry] == j]
@@ -165,15 +200,28 @@ class _Period:
     def __init__(self, size: int) -> None:
         self.matrix, self.noise = np.eye(size), np.zeros((size, size))
         self.into, self.differences = np.empty((0, size)), np.empty((0, size))
-        self.acts: list[FloatArray] = []  # row by row, R of ``loss_events``
+        self.acts: list[FloatArray] = []  # row by row, R of ``LossEvents``
         self.moves: list[Move] = []
 
-    def step(self, rows: list[int], matrix: FloatArray, noise: FloatArray, losses: Iterable[_Loss] = ()) -> None:
-        """The entries ``rows`` become matrix (r, k) @ z, with this noise (r, r), and with losses."""
-        known = list(losses)
-        self.moves.append(Move(rows, matrix, known))
-        entry, brings, instead = (np.array([loss[part] for loss in known], dtype=np.int64) for part in range(3))
-        variance = np.array([p * (1.0 - p) * weight**2 for *_, p, weight in known])
+    def step(
+        self,
+        rows: list[int],
+        matrix: FloatArray,
+        noise: FloatArray,
+        losses: Sequence[_Loss] = (),
+        older: Sequence[tuple[int, int]] = (),
+    ) -> None:
+        """The entries ``rows`` become matrix (r, k) @ z, with this noise (r, r), and with losses.
+
+        Of ``older``, the first entry becomes what the second was.
+        """
+        if older:
+            matrix = np.concatenate([matrix, _copies([before for _, before in older], len(self.noise))])
+            noise = scipy.linalg.block_diag(noise, np.zeros((len(older), len(older))))
+            rows = rows + [entry for entry, _ in older]
+        self.moves.append(Move(rows, matrix, losses))
+        entry, brings, instead = (np.array([loss[part] for loss in losses], dtype=np.int64) for part in range(3))
+        variance = np.array([p * (1.0 - p) * weight**2 for *_, p, weight in losses])
         differences = self.matrix[brings] - self.matrix[instead]
         acts = (self.into[:, brings] - self.into[:, instead]).T ** 2
         n = self.noise
@@ -186,8 +234,8 @@ class _Period:
         n[np.ix_(rows, rows)] = across @ matrix.T + noise
         np.add.at(n, (entry, entry), spread)
 
-        into = np.zeros((len(known), len(n)))
-        into[range(len(known)), entry] = np.sqrt(variance)
+        into = np.zeros((len(losses), len(n)))
+        into[range(len(losses)), entry] = np.sqrt(variance)
         self.into = np.concatenate([self.into, into])
         self.differences = np.concatenate([self.differences, differences])
         self.acts += list(acts)
@@ -230,13 +278,8 @@ def _move(
         matrix[:, stack.sources] = gain
     else:
         noise += gain @ gain.T
-    rows, older = list(agents), []
-    for line in range(1, step.delay + 1):
-        rows += [stack.published[line][j] for j in agents]
-        older += [stack.published[line - 1][j] for j in agents]
-    padded = np.zeros((len(rows), len(rows)))
-    padded[: len(agents), : len(agents)] = noise
-    period.step(rows, np.concatenate([matrix, _copies(older, stack.size)]), padded, losses)
+    older = [(new[j], before[j]) for before, new in pairwise(stack.published) for j in agents]
+    period.step(agents, matrix, noise, losses, older)
 
 
 def _hear(period: _Period, step: StepModel, stack: _Stack, probability: FloatArray, agents: list[int]) -> None:
@@ -252,12 +295,8 @@ def _hear(period: _Period, step: StepModel, stack: _Stack, probability: FloatArr
         noise[row] = (1.0 - p) * step.link**2
         if 0.0 < p < 1.0:
             losses.append((entry, newest, entry, p, 1.0))
-    rows, older = [entry for _, entry in links], []
-    for line in range(1, step.delay + 1):
-        rows += [stack.heard[line][link] for link, _ in links]
-        older += [stack.heard[line - 1][link] for link, _ in links]
-    padded = np.diag(np.concatenate([noise, np.zeros(len(older))]))
-    period.step(rows, np.concatenate([matrix, _copies(older, stack.size)]), padded, losses)
+    older = [(new[link], before[link]) for before, new in pairwise(stack.heard) for link, _ in links]
+    period.step([entry for _, entry in links], matrix, np.diag(noise), losses, older)
 
 
 def _copies(entries: list[int], size: int) -> FloatArray:
@@ -314,6 +353,4 @@ def _channel_states(step: StepModel, channels: int) -> FloatArray:
             f"2^{channels} states of the network; at most {MOST_STATES} are predicted: give a loss to fewer links "
             "(noise.loss: arcs), or leave noise.burst out"
         )
-    return np.array(
-        [[(state >> bit) & 1 for bit in range(channels)[::-1]] for state in range(2**channels)], dtype=float
-    )
+    return np.array(list(product([0.0, 1.0], repeat=channels)))

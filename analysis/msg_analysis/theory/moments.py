@@ -9,8 +9,8 @@ Systems (2005).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
@@ -33,121 +33,70 @@ class MomentSolver:
         discrete:   C_i - sum_j P_ji K_j[C_j] = sum_j P_ji pi_j N_j
 
     Matrix-free: time grows as n d^3, memory as n d^2. Equations that are small and do not converge are solved densely.
-
-    Parameters
-    ----------
-    system
-        whose second moments are sought
-    method
-        "auto"; "krylov" or "dense" for this one and no other
-    guess
-        (n, d, d) steady moments of a similar system (the last one of a sweep), to start from
-
-    Raises
-    ------
-    InputError
-        no steady second moments, or too ill-conditioned to be trusted
+    ``guess``: (n, d, d) steady moments of a similar system (the last one of a sweep), to start from. InputError, here
+    and from all methods: no steady second moments, or too ill-conditioned to be trusted.
     """
 
     def __init__(
         self,
         system: JumpSystem,
         *,
-        method: Literal["auto", "krylov", "dense"] = "auto",
         guess: FloatArray | None = None,
+        most_dense: int = MAX_FALLBACK,
+        most_kept: int = MAX_KEPT,
     ) -> None:
-        self._system = system
-        unknowns = system.modes * packed_symmetric.size(system.dimension)
-        self._dense_too = method == "auto" and 0 < unknowns <= MAX_FALLBACK
         if guess is not None and guess.shape != system.matrices.shape:
             raise InputError(
                 f"guess: shape {guess.shape}, but the second moments of this system have {system.matrices.shape}: "
                 "give those of a system with the same graphs and agents"
             )
-        self._report: SolverReport | None = None
-        self._duals: dict[bytes, FloatArray] = {}
+        self.system = system
+        self.report: SolverReport | None = None  # how the steady state was found
+        self._most_kept, self._duals = most_kept, dict[bytes, FloatArray]()
+        unknowns = system.modes * packed_symmetric.size(system.dimension)
+        self._dense_too = unknowns <= most_dense
         self._solver: DenseSolver | IterativeSolver
-        if method == "dense" or unknowns == 0:
-            self._solver = DenseSolver(system)
-        else:
-            self._solver = IterativeSolver(system, guess)
-
-    @property
-    def system(self) -> JumpSystem:
-        """The system whose equations these are."""
-        return self._system
-
-    @property
-    def report(self) -> SolverReport | None:
-        """How the steady state was found; None before that."""
-        return self._report
+        self._solver = IterativeSolver(system, guess) if unknowns else DenseSolver(system)
 
     def steady(self) -> FloatArray:
-        """(n, d, d): C_i = E[y y^T; mode i] in the steady state.
-
-        Raises
-        ------
-        InputError
-            no steady second moments, or too ill-conditioned to be trusted
-        """
-        try:
-            moments = self._solver.steady()
-        except InputError:
-            self._fall_back()
-            moments = self._solver.steady()
-        shift = MAX_RELATIVE_ERROR * np.abs(moments).max(initial=0.0) or 1.0
-        try:
-            np.linalg.cholesky(moments + shift * np.eye(self._system.dimension))
-        except np.linalg.LinAlgError:
+        """(n, d, d): C_i = E[y y^T; mode i] in the steady state."""
+        moments = self._solved(lambda solver: solver.steady())
+        least = np.linalg.eigvalsh(moments).min(initial=0.0)
+        # Not "<": NaN must be refused, too.
+        if not least >= -MAX_RELATIVE_ERROR * np.abs(moments).max(initial=0.0):
             raise InputError(
                 "second moments: the equations have no positive solution, so the errors grow without bound: "
                 "lower run.dt, or add edges until the union of the graphs connects all agents"
-            ) from None
+            )
         report = self._solver.report
         assert report is not None
-        self._report = replace(report, error=max(report.error, _rounding(self._system, moments)))
+        self.report = replace(report, error=max(report.error, _rounding(self.system, moments)))
         return moments
 
     def dual(self, forms: FloatArray) -> FloatArray:
-        """(q, n, d, d): the adjoint solutions Y of q quadratic forms H at once; read-only where they are kept.
+        """(q, n, d, d): the adjoint solutions Y of the symmetric forms H (q, d, d); read-only where they are kept.
 
-            continuous: Z_i^T Y_i + Y_i Z_i - sum_j Gamma_ij Y_j = H,     E[y^T H y] = sum_i pi_i tr(Y_i Q_i)
-            discrete:   Y_i = H + K_i^*[sum_j P_ij Y_j],                  E[y^T H y] = sum_ij pi_i P_ij tr(Y_j N_i)
-
-        Parameters
-        ----------
-        forms
-            (q, d, d) symmetric H
-
-        Raises
-        ------
-        InputError
-            as ``steady``
+        continuous: Z_i^T Y_i + Y_i Z_i - sum_j Gamma_ij Y_j = H,     E[y^T H y] = sum_i pi_i tr(Y_i Q_i)
+        discrete:   Y_i = H + K_i^*[sum_j P_ij Y_j],                  E[y^T H y] = sum_ij pi_i P_ij tr(Y_j N_i)
         """
-        size = forms.size * self._system.modes
-        if size > MAX_KEPT:
-            return self._new_dual(forms)
         key = forms.tobytes()
         found = self._duals.get(key)  # every comparison of a run with the same prediction asks for the same forms
         if found is None:
-            found = self._new_dual(forms)
-            if sum(kept.size for kept in self._duals.values()) + size <= MAX_KEPT:
+            found = self._solved(lambda solver: solver.dual(forms))
+            if sum(kept.size for kept in self._duals.values()) + found.size <= self._most_kept:
                 found.setflags(write=False)
                 self._duals[key] = found
         return found
 
-    def _new_dual(self, forms: FloatArray) -> FloatArray:
+    def _solved(self, solve: Callable[[DenseSolver | IterativeSolver], FloatArray]) -> FloatArray:
+        """By the solver, and if that fails for a small system, densely from then on."""
         try:
-            return self._solver.dual(forms)
+            return solve(self._solver)
         except InputError:
-            self._fall_back()
-            return self._solver.dual(forms)
-
-    def _fall_back(self) -> None:
-        """Change to the dense solver; called in an exception handler, raises again where that may not be tried."""
-        if not self._dense_too or isinstance(self._solver, DenseSolver):
-            raise
-        self._solver = DenseSolver(self._system)
+            if not self._dense_too or isinstance(self._solver, DenseSolver):
+                raise
+        self._solver = DenseSolver(self.system)
+        return solve(self._solver)
 
 
 def _rounding(system: JumpSystem, moments: FloatArray) -> float:
@@ -177,27 +126,17 @@ def transient_mean(
 ) -> FloatArray:
     """(d, d) exact mean over the steps 0..steps-1 of E[y(k) y(k)^T] from a known start. Discrete time.
 
-    The distance to the steady state is stepped (equations of Proposition 6), until nothing is left of it.
-
-    Parameters
-    ----------
-    system
-        discrete time
-    steady, initial
-        (n, d, d) steady moments, and E[y(0) y(0)^T; mode i]
-    law
-        (n,) of g(0)
-    steps
-        > 0
+    ``steady``, ``initial``: (n, d, d) steady moments, and E[y(0) y(0)^T; mode i]; ``law``: (n,) of g(0). The distance
+    to the steady state is stepped (equations of Proposition 6), until nothing is left of it.
     """
     away, law_away = initial - steady, law - system.stationary
     scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))
     total = np.zeros_like(steady)
-    for step in range(steps):
-        # Not looked at every time: a look takes as long as a step.
-        if step % 8 == 0 and np.abs(away).max(initial=0.0) <= 1e-17 * scale and np.abs(law_away).max() <= 1e-17:
+    for step in range(0, steps, 8):  # not looked at every time: a look takes as long as a step
+        if np.abs(away).max(initial=0.0) <= 1e-17 * scale and np.abs(law_away).max() <= 1e-17:
             break
-        total += away
-        away, law_away = system.advance(away, law_away)
-        law_away -= law_away.sum() * system.stationary  # the rounding of its sum, 0, would stay for ever
+        for _ in range(min(8, steps - step)):
+            total += away
+            away, law_away = system.advance(away, law_away)
+            law_away -= law_away.sum() * system.stationary  # the rounding of its sum, 0, would stay for ever
     return np.asarray(steady.sum(axis=0) + total.sum(axis=0) / steps)

@@ -182,10 +182,7 @@ class Prediction:
 
     @cached_property
     def static_moments(self) -> Moments | None:
-        """``static``, computed when it is first asked for.
-
-        None without ``paper``, or where one of the graphs cannot keep the agents together.
-        """
+        """``static``; None without ``paper``, or where one of the graphs cannot keep the agents together."""
         if self.paper is None or not all(_holds_together(self.experiment, mode) for mode in range(self.step.modes)):
             return None
         return _static(self.paper, self.experiment.names)
@@ -203,12 +200,10 @@ class Prediction:
     def _repr_markdown_(self) -> str:
         laws = self.laws()
         rows = [("**system**", *(number_text(law.system_error) for law in laws.values()))]
-        shown, names = min(self.experiment.agents, SHOWN_AGENTS), self.experiment.names
-        rows += [
-            (agent_text(i + 1, names), *(number_text(law.node_errors[i]) for law in laws.values()))
-            for i in range(shown)
-        ]
-        rows += [("...", *("" for _ in laws))] * (shown < self.experiment.agents)
+        agents, names = self.experiment.agents, self.experiment.names
+        for i in range(min(agents, SHOWN_AGENTS)):
+            rows.append((agent_text(i + 1, names), *(number_text(law.node_errors[i]) for law in laws.values())))
+        rows += [("...", *("" for _ in laws))] * (agents > SHOWN_AGENTS)
         return "Mean-square error in the steady state\n\n" + markdown_table(("", *laws), rows)
 
     def plot(self) -> Figure:
@@ -279,7 +274,7 @@ def predict(experiment: Experiment, step: StepModel | None = None) -> Prediction
     step = step or build_step_model(experiment)
     continuous = paper = None
     if not experiment.noise.steps_only:
-        if experiment.time == "continuous" and not experiment.steps_only:
+        if experiment.time == "continuous" and not experiment.protocol:
             paper = systems.continuous(experiment)
             exact = MomentSolver(paper)
             continuous = _moments(exact, exact.steady(), experiment.names)
@@ -291,14 +286,12 @@ def predict(experiment: Experiment, step: StepModel | None = None) -> Prediction
 
 
 def stationary_start_factor(experiment: Experiment, mode: int) -> FloatArray:
-    """(m, m) square root S of the law of x(0) given g(0) = mode in the steady state: S S^T = C_g0 / pi_g0.
+    """(m, m) square root S of the law of x(0) given g(0) = mode (from 0) in the steady state: S S^T = C_g0 / pi_g0.
 
-    C are the steady second moments of the experiment's steps, in real time those of the sequential law. S is the
-    symmetric positive semidefinite root, which is unique; ``mode`` counts from 0. It is computed in one thread, so that
-    its last bits do not depend on the number of threads.
+    C are the steady second moments of the run's steps; S is the symmetric positive semidefinite root, which is unique.
     """
     step = build_step_model(experiment)
-    with one_blas_thread():
+    with one_blas_thread():  # so that its last bits do not depend on the number of threads
         solver, steady = _steady(step, build_run_model(experiment, step), experiment.problem)
         system = solver.system
         moments = system.by_graph(steady)[mode] / step.stationary[mode]
@@ -328,14 +321,12 @@ def _steady(step: StepModel, run: StepModel, problem: str) -> tuple[MomentSolver
 
 
 def _require_stability(solver: MomentSolver) -> None:
-    """Refuse unstable steps that the noise does not show, because it does not reach what grows.
-
-    A positive solution of Y_i = I + K_i^*[sum_j P_ij Y_j] exists only where every second moment stays bounded.
-    """
+    """Refuse unstable steps that the noise does not show, because it does not reach what grows."""
     system = solver.system
     sizes = np.linalg.eigvalsh(system.noise)
     if not sizes.size or sizes.min() > WEAK_NOISE * sizes.max():
         return
+    # A positive solution of Y_i = I + K_i^*[sum_j P_ij Y_j] exists only where every second moment stays bounded.
     dual = solver.dual(np.eye(system.dimension)[None])[0]
     if np.linalg.eigvalsh(dual).min() < 0.0:
         raise InputError(

@@ -43,11 +43,10 @@ class Power:
 
 
 class Flow:
-    """Powers of one matrix A (N, N): y(t) = exp(A t) y(0), or y(k) = (1 + A)^k y(0) in discrete time.
+    """Powers of one matrix A (N, N): y(t) = exp(A t) y(0), or y(k) = (1 + A)^k y(0) in discrete time, t in steps."""
 
-    Powers are kept as what they change, E in z -> z + E z, as long as little of z dies out: the square is then 2 E +
-    E^2, and small changes are not lost beside 1. Times are in units of time, or in steps.
-    """
+    # Powers are kept as what they change, E in z -> z + E z, as long as little of z dies out: the square is then
+    # 2 E + E^2, and small changes are not lost beside 1.
 
     def __init__(self, time: Time, matrix: FloatArray) -> None:
         self._time, self._matrix = time, matrix

@@ -30,19 +30,20 @@ MAX_BYTES = 2e9
 
 
 class RationalFlow(Flow):
-    """The course of one start, reduced to a small matrix; InputError where it is too large, too stiff or not stable.
+    """The course of one start, reduced to a small matrix; InputError where it is too large, too stiff or not stable."""
 
-    ``start``: (n, p + 1) packed second moments and probability of every mode, or (``decays``) their distance from the
-    steady state, which dies out entirely. ``slow``: slowest rate of interest, or 1 / longest time [1 / unit of time].
-    The space grows until two checks in a row change the course by at most ``TOLERANCE`` of the start.
-    """
+    # start: (n, p + 1) packed second moments and probability of every mode, or (decays) their distance from the steady
+    # state, which dies out entirely. slow: slowest rate of interest, or 1 / longest time [1 / unit of time].
+    # The space grows until two checks in a row change the course by at most TOLERANCE of the start.
 
-    def __init__(self, system: JumpSystem, start: FloatArray, slow: float, *, decays: bool) -> None:
-        if 2 * MAX_RATIONAL_BASIS * start.nbytes > MAX_BYTES:
+    def __init__(
+        self, system: JumpSystem, start: FloatArray, slow: float, *, decays: bool, most_bytes: float = MAX_BYTES
+    ) -> None:
+        if (needed := 2 * MAX_RATIONAL_BASIS * start.nbytes) > most_bytes:
             raise InputError(
-                f"transient: {system.modes} graphs of {len(system.output)} agents need "
-                f"{2 * MAX_RATIONAL_BASIS * start.nbytes / 1e9:.1f} GB in continuous time, expected at most "
-                f"{MAX_BYTES / 1e9:.0f} GB: take the steps' law (emulated), or fewer agents"
+                f"transient: {system.modes} graphs of {len(system.output)} agents need {needed / 1e9:.1f} GB in "
+                f"continuous time, expected at most {most_bytes / 1e9:.0f} GB: take the steps' law (emulated), or "
+                "fewer agents"
             )
         self._system, self._decays = system, decays
         # Weighted with 1 / pi the equations are self-adjoint where the network is reversible and undirected.
@@ -59,9 +60,8 @@ class RationalFlow(Flow):
 
     def rotated(self, z: FloatArray) -> FloatArray:
         """(k,) of the start, the only z that is represented."""
-        return np.asarray(
-            self._basis @ self._joined(packed_symmetric.unpack(z[:, :-1], self._system.dimension), z[:, -1])
-        )
+        moments = packed_symmetric.unpack(z[:, :-1], self._system.dimension)
+        return np.asarray(self._basis @ self._joined(moments, z[:, -1]))
 
     def restored(self, y: FloatArray) -> FloatArray:
         """(n, p + 1) of (k,)."""
@@ -71,9 +71,8 @@ class RationalFlow(Flow):
     def _build(self, start: FloatArray, slow: float) -> None:
         """Extend the space until the course does not change any more."""
         system = self._system
-        fast = 2.0 * float(np.linalg.norm(system.matrices, 2, axis=(1, 2)).max()) + float(
-            -system.chain.diagonal().min()
-        )
+        largest = float(np.linalg.norm(system.matrices, 2, axis=(1, 2)).max())
+        fast = 2.0 * largest - float(system.chain.diagonal().min())
         basis = [start / np.linalg.norm(start)]
         images = [self._apply(basis[0])]
         before, calm = np.zeros((0, 0)), 0
@@ -164,11 +163,8 @@ def _course(matrix: FloatArray, first: float, last: float) -> FloatArray:
 
 
 def slowest_rate(system: JumpSystem, steady: FloatArray) -> float:
-    """Rate of the slowest part of second moments and graph [1 / unit of time]: an estimate by four inverse iterations.
-
-    They start from the steady second moments (n, d, d). Continuous time.
-    """
-    moments, rate = steady, math.inf
+    """Rate of the slowest part of second moments and graph [1 / unit of time], estimated. Continuous time."""
+    moments, rate = steady, math.inf  # four inverse iterations, from the steady second moments (n, d, d)
     for _ in range(4):
         before = np.linalg.norm(moments)
         noise = moments / system.stationary[:, None, None]

@@ -9,9 +9,8 @@ See docs/theory.md, "Transients".
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import scipy.sparse.linalg
@@ -33,11 +32,9 @@ MAX_ARNOLDI = 10_000  # unknowns in continuous time: each of some 50 iterations 
 
 @dataclass(frozen=True, slots=True)
 class Rates:
-    """Rates, like exp(-rate t), or exp(-rate k) in steps; infinite for what is gone in finitely many steps.
+    """Rates, like exp(-rate t), or exp(-rate k) in steps; infinite for what is gone in finitely many steps."""
 
-    None: not found, or so sensitive to the last digits of the matrices that rounding may have made it.
-    """
-
+    # None: not found, or so sensitive to the last digits of the matrices that rounding may have made it.
     mean: float | None  # of the means: least real part of the eigenvalues of N, or -log of the spectral radius of H
     second_moment: float | None  # the same of M, or A
     graph: float | None  # of the law of the graph; None for one graph
@@ -49,33 +46,40 @@ def asymptotic_rates(system: JumpSystem, *, most_unknowns: int = MAX_UNKNOWNS) -
     From the eigenvalues of the matrices of Propositions 1 and 6 of the paper, for each strongly connected component;
     where one is large, those of its second moments are found in a Krylov space.
     """
-    parts = components(system)
+
+    def of_means(_: JumpSystem) -> list[Method]:
+        return [lambda system, _: mean_propagator(system).slowest]
+
+    def of_second_moments(system: JumpSystem) -> list[Method]:
+        if unknowns(system) <= most_unknowns:
+            return [lambda system, _: homogeneous_propagator(system).slowest]
+        if system.time == "discrete":
+            return [_by_arnoldi]
+        return [_by_rational_krylov, _by_arnoldi] if unknowns(system) <= MAX_ARNOLDI else [_by_rational_krylov]
+
     graph = mean_propagator(system).slowest_jump if system.modes > 1 else None
-    of_second_moments = partial(_methods_of_second_moments, most_unknowns=most_unknowns)
-    return Rates(_slowest(system, parts, _methods_of_means), _slowest(system, parts, of_second_moments), graph)
+    return Rates(_slowest(system, of_means), _slowest(system, of_second_moments), graph)
 
 
 Method = Callable[[JumpSystem, np.random.Generator | None], float | None]
 """Gives a rate; by a chance of its own where it begins somewhere."""
 
 
-def _slowest(
-    system: JumpSystem, parts: list[Component], methods_of: Callable[[JumpSystem], Iterator[Method]]
-) -> float | None:
+def _slowest(system: JumpSystem, methods_of: Callable[[JumpSystem], list[Method]]) -> float | None:
     """Rate of the slowest component; None if one of them is not certain."""
     slowest = math.inf
-    for part in parts:
-        reduced = part.system(system)
-        rate = _certain(system, part, reduced, methods_of(reduced))
+    for part in components(system):
+        rate = _certain(system, part, methods_of)
         if rate is None:
             return None
         slowest = min(slowest, rate)
     return slowest
 
 
-def _certain(system: JumpSystem, part: Component, reduced: JumpSystem, methods: Iterator[Method]) -> float | None:
+def _certain(system: JumpSystem, part: Component, methods_of: Callable[[JumpSystem], list[Method]]) -> float | None:
     """The first rate that another rounding and another beginning would have given too."""
-    for method in methods:
+    reduced = part.system(system)
+    for method in methods_of(reduced):
         rate = method(reduced, None)
         if rate is None or part.normal:
             return rate
@@ -84,21 +88,6 @@ def _certain(system: JumpSystem, part: Component, reduced: JumpSystem, methods: 
         if other is not None and (rate == other or abs(other - rate) <= CERTAIN * abs(rate)):
             return rate
     return None
-
-
-def _methods_of_means(_: JumpSystem) -> Iterator[Method]:
-    yield lambda system, _: mean_propagator(system).slowest
-
-
-def _methods_of_second_moments(system: JumpSystem, most_unknowns: int) -> Iterator[Method]:
-    if unknowns(system) <= most_unknowns:
-        yield lambda system, _: homogeneous_propagator(system).slowest
-    elif system.time == "discrete":
-        yield _by_arnoldi
-    else:
-        yield _by_rational_krylov
-        if unknowns(system) <= MAX_ARNOLDI:
-            yield _by_arnoldi
 
 
 def _by_rational_krylov(system: JumpSystem, rng: np.random.Generator | None) -> float | None:
@@ -113,10 +102,8 @@ def _by_rational_krylov(system: JumpSystem, rng: np.random.Generator | None) -> 
 
 
 def _by_arnoldi(system: JumpSystem, _: np.random.Generator | None) -> float | None:
-    """From the largest eigenvalue of A, or of the inverse of M, which is that of the slowest part.
-
-    Both maps are positive, so no other eigenvalue is larger in size.
-    """
+    """From the largest eigenvalue of A, or of the inverse of M, which is that of the slowest part."""
+    # Both maps are positive, so no other eigenvalue is larger in size.
     shape = (system.modes, packed_symmetric.size(system.dimension))
 
     def forward(packed: FloatArray) -> FloatArray:
@@ -167,24 +154,8 @@ def settling_time(
     2005) and have (C, pi) as their fixed point. The result is exact (in continuous time, to 1e-9 of 1 / norm of the
     equations) where the error has no excursions shorter than 1/32 of the elapsed time; from zero (known place,
     stationary graph) it has none, because it only rises.
-
-    Parameters
-    ----------
-    system
-        with a steady state; continuous or discrete time
-    steady
-        (n, d, d) of ``MomentSolver(system).steady()``
-    start
-        at time 0
-    fraction
-        f, between 0 and 1
-    most_unknowns
-        up to which the joint equations are propagated as a whole
-
-    Raises
-    ------
-    InputError
-        fraction out of range; steady error 0 (no noise); too large in continuous time; too many steps, or never settles
+    ``steady``: (n, d, d); ``most_unknowns``: up to which the joint equations are propagated as a whole. InputError:
+    fraction out of range; steady error 0 (no noise); too large, or never settles.
     """
     if not 0.0 < fraction < 1.0:
         raise InputError(f"settling fraction: {fraction:g}, expected a number between 0 and 1: for example 0.05")

@@ -26,13 +26,14 @@ from msg_analysis.errors import InputError
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.coupled_equations import (
     MAX_RELATIVE_ERROR,
+    SINGLE_FROM,
     AveragedEquations,
     CoupledEquations,
     Method,
     Preconditioner,
     SolverReport,
+    averaged_equations,
     singular_message,
-    suitable,
 )
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.krylov import (
@@ -83,19 +84,18 @@ MAX_UNKNOWNS = 10_000  # largest system that is tried: 2.4 GB and about a minute
 
 
 class DenseSolver:
-    """The coupled equations of ``MomentSolver``, factorised. InputError: too large, singular or too ill-conditioned.
+    """The coupled equations of ``MomentSolver``, factorised. InputError: too large, singular or too ill-conditioned."""
 
-    The last block row is replaced by the sum of all of them, in which the chain cancels exactly, and rows are scaled
-    to largest entry 1: so the equations stay well conditioned however fast the graphs switch.
-    """
+    # The last block row is replaced by the sum of all of them, in which the chain cancels exactly, and rows are scaled
+    # to largest entry 1: so the equations stay well conditioned however fast the graphs switch.
 
-    def __init__(self, system: JumpSystem) -> None:
+    def __init__(self, system: JumpSystem, *, most_unknowns: int = MAX_UNKNOWNS) -> None:
         self._system = system
         n, p = system.modes, packed_symmetric.size(system.dimension)
-        if n * p > MAX_UNKNOWNS:
+        if n * p > most_unknowns:
             raise InputError(
                 f"second moments: {n} graphs of {len(system.lift)} agents give {n * p} coupled unknowns, for "
-                f"which a dense solve needs about {24e-9 * (n * p) ** 2:.1f} GB; at most {MAX_UNKNOWNS} are "
+                f"which a dense solve needs about {24e-9 * (n * p) ** 2:.1f} GB; at most {most_unknowns} are "
                 "solved: leave the choice of the method to the program, or use fewer agents or graphs"
             )
         local, flow = mode_operators(system), system.chain.T
@@ -115,8 +115,10 @@ class DenseSolver:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)  # the condition is judged below
             self._factors = scipy.linalg.lu_factor(self._matrix)
-        self._norm = float(np.linalg.norm(self._matrix, 1)) if self._matrix.size else 0.0
-        self._condition = _reciprocal_condition(self._factors[0], self._norm)
+        self._norm, self._condition = 0.0, 1.0
+        if self._matrix.size:
+            self._norm = float(np.linalg.norm(self._matrix, 1))
+            self._condition = float(scipy.linalg.lapack.dgecon(self._factors[0], self._norm)[0])
         self._shape = (n, p)
         self.report: SolverReport | None = None
         self._check(float(np.finfo(float).eps))
@@ -159,13 +161,6 @@ class DenseSolver:
             raise InputError(singular_message(f" (reciprocal condition {self._condition:.1e})"))
 
 
-def _reciprocal_condition(factors: FloatArray, norm: float) -> float:
-    if factors.size == 0:
-        return 1.0
-    reciprocal, _ = scipy.linalg.lapack.dgecon(factors, norm)
-    return float(reciprocal)
-
-
 TOLERANCE = 1e-12  # estimated relative error at which a solve stops
 MAX_ITERATIONS = 600
 MAX_CHEAP = 30  # most iterations of one cycle with the averaged preconditioner
@@ -177,9 +172,11 @@ CHUNK = 1_000_000  # numbers in a stack of right-hand sides that are solved toge
 class IterativeSolver:
     """Steady moments and duals of one system; starts from ``guess`` (n, d, d), steady moments of a similar one."""
 
-    def __init__(self, system: JumpSystem, guess: FloatArray | None = None) -> None:
-        self._equations = CoupledEquations(system)
-        self._averaged = _averaged(self._equations)
+    def __init__(
+        self, system: JumpSystem, guess: FloatArray | None = None, *, chunk: int = CHUNK, single_from: int = SINGLE_FROM
+    ) -> None:
+        self._chunk, self._equations = chunk, CoupledEquations(system, single_from=single_from)
+        self._averaged = averaged_equations(self._equations)
         self._adjoint: CoupledEquations | None = None
         self._averaged_adjoint: AveragedEquations | None = None
         self._guess = guess
@@ -200,10 +197,10 @@ class IterativeSolver:
         """See ``MomentSolver.dual``."""
         system = self._equations.system
         if self._adjoint is None:
-            self._adjoint = self._equations.adjoint()
-            self._averaged_adjoint = _averaged(self._adjoint)
+            self._adjoint = CoupledEquations(system, self._equations)
+            self._averaged_adjoint = averaged_equations(self._adjoint)
         result = np.empty((len(forms), *system.matrices.shape))
-        together = max(1, CHUNK // system.matrices.size)
+        together = max(1, self._chunk // system.matrices.size)
         for first in range(0, len(forms), together):
             chunk = forms[first : first + together, None]
             right = np.broadcast_to(chunk, (len(chunk), *system.matrices.shape)).copy()
@@ -212,13 +209,6 @@ class IterativeSolver:
                 y = right + self._adjoint.moved(y)
             result[first : first + together] = y
         return result
-
-
-def _averaged(equations: CoupledEquations) -> AveragedEquations | None:
-    """The cheaper preconditioner, where it promises to be better."""
-    if not (equations.one_level and equations.large) or equations.system.lossy:
-        return None
-    return AveragedEquations(equations) if suitable(equations) else None
 
 
 def _solve(
@@ -247,7 +237,8 @@ def _by_average(
     equations: CoupledEquations, averaged: AveragedEquations, right: FloatArray, guess: FloatArray | None
 ) -> tuple[FloatArray, SolverReport]:
     """With the averaged preconditioner, until the error is small or a cycle gains less than three digits."""
-    method, iterations, before = _method(definite=averaged.definite), 0, np.inf
+    method: Method = "cg" if averaged.definite else "gmres"
+    iterations, before = 0, np.inf
     x, known = np.zeros_like(right) if guess is None else guess, guess is not None
     while True:
         residual, left, backward = _residual(equations, right, x) if known else (right, 1.0, 1.0)
@@ -274,7 +265,7 @@ def _by_graphs(
 ) -> tuple[FloatArray, SolverReport]:
     """With the two-level preconditioner, until the error is small, a cycle hardly reduces it, or iterations run out."""
     inner = equations.inner
-    method: Method = "direct" if equations.direct else _method(definite=inner.definite)
+    method: Method = "direct" if equations.direct else "cg" if inner.definite else "gmres"
     preconditioner: Preconditioner = "none" if equations.direct else "two-level"
     known = x is not None
     x = np.zeros_like(right) if x is None else x
@@ -326,10 +317,6 @@ def _error(step: FloatArray, x: FloatArray, scale: FloatArray | float = 1.0) -> 
     size = norms(x)
     size = np.maximum(size, 1e-6 * size.max(axis=1, keepdims=True))
     return np.asarray(_ratio(norms(step), size).max(axis=1) * scale)
-
-
-def _method(*, definite: bool) -> Method:
-    return "cg" if definite else "gmres"
 
 
 def _scale(residual: FloatArray) -> FloatArray:

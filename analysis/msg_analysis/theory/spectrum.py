@@ -127,10 +127,7 @@ def spectrum(
     *,
     most_unknowns: int = MAX_SIZE,
 ) -> Spectrum:
-    """The spectrum of a prediction: arguments and errors as in ``Experiment.spectrum``.
-
-    ``most_unknowns``: graphs times coordinates of the resolvent, at most.
-    """
+    """The spectrum of a prediction: arguments and errors as in ``Experiment.spectrum``."""
     system, dt = prediction.system, prediction.step.dt
     if lags is not None and (not len(lags) or lags[0] < 0 or (np.diff(lags) <= 0).any()):
         raise InputError("lags: expected ascending whole numbers of steps, not below 0")

@@ -15,7 +15,6 @@ It has all fourth moments of y, for E[(y^T S y)^2 | M] = tr(S M)^2 + 2 tr(S M S 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -49,16 +48,6 @@ class MeanVariance:
         return self.path + self.replica / replicas
 
 
-class _Moments(Protocol):
-    """Second moments of M given the graph i, times pi_i."""
-
-    def product(self, mode: int, left: FloatArray, right: FloatArray) -> float:
-        """E[tr(A M) tr(B M); i] of symmetric A and B."""
-
-    def quartic(self, mode: int, form: FloatArray) -> float:
-        """E[tr(S M S M); i] of a symmetric S."""
-
-
 def mean_variance(prediction: Prediction, *, most_work: float = MAX_WORK) -> MeanVariance:
     """Asymptotic variance of the time mean of the system error, from its Poisson equation.
 
@@ -71,38 +60,22 @@ def mean_variance(prediction: Prediction, *, most_work: float = MAX_WORK) -> Mea
         jump:   sum_j P_ij ((tr(S M') + s)^2 + 2 tr(S M' S M') / R)
 
     Noise and jump are exact. Of a loss the first order is taken, which adds u v^T y to W y; noise on the air has its
-    mean over the losses. In a large system M is its mean given the graph; what following it changes is added for the
-    principal axes of the stationary covariance.
-
-    Parameters
-    ----------
-    prediction
-        of the experiment
-    most_work
-        n p^3 for p packed moments, up to which M is followed along the path
-
-    Raises
-    ------
-    InputError
-        the variance is not finite: fourth moments of the states do not exist
+    mean over the losses. In a large system (``most_work``) M is its mean given the graph; what following it changes is
+    added for the principal axes of the stationary covariance. InputError: the variance is not finite.
     """
     system, solver, losses = prediction.system, prediction.solver, prediction.step.losses
     if not system.dimension:
         return MeanVariance(0.0, 0.0, True)
-    rank = _most_followed(system.modes, most_work)
-    if system.dimension <= rank:
+    # The largest dimension whose M is followed along the path, with so many graphs.
+    largest = next(d for d in range(1, 1000) if system.modes * float(packed_symmetric.size(d + 1)) ** 3 > most_work)
+    if system.dimension <= largest:
         return MeanVariance(*_variance(solver, prediction.steady, losses, follow=True), followed=True)
     rough = _variance(solver, prediction.steady, losses, follow=False)
-    principal = MomentSolver(_principal(system, prediction.steady, rank))
+    principal = MomentSolver(_principal(system, prediction.steady, largest))
     steady = principal.steady()
     exact, near = (_variance(principal, steady, losses, follow=follow) for follow in (True, False))
     path, replica = (max(a + b - c, 0.0) for a, b, c in zip(rough, exact, near, strict=True))
     return MeanVariance(path, replica, followed=False)
-
-
-def _most_followed(modes: int, most_work: float) -> int:
-    """Largest dimension whose M is followed along the path, with so many graphs."""
-    return max(1, next(d for d in range(1, 1000) if modes * float(packed_symmetric.size(d + 1)) ** 3 > most_work))
 
 
 def _principal(system: JumpSystem, steady: FloatArray, rank: int) -> JumpSystem:
@@ -130,7 +103,11 @@ def _variance(solver: MomentSolver, steady: FloatArray, links: FloatArray, *, fo
     means, levels = np.einsum("ij,jab->iab", system.chain, values), system.chain @ kappa
     moved = system.propagate(steady)
     losses = [_losses(system, links, i) for i in range(system.modes)]
-    before, after = _moments_of_path(system, moved, losses) if follow else _mean_moments(system, steady, moved)
+    law = system.stationary
+    before: _Followed | _Averaged = _Averaged(steady, law)
+    after: _Followed | _Averaged = _Averaged(moved + law[:, None, None] * system.noise, law)
+    if follow:
+        before, after = _moments_of_path(system, moved, losses)
     path = replica = 0.0
     for i, share in enumerate(system.stationary.tolist()):
         mean, noise = means[i], system.noise[i]
@@ -218,20 +195,22 @@ class _LossSpread:
 
 
 class _Followed:
-    """X of ``m`` along the path."""
+    """Second moments of M given the graph i, times pi_i: X of ``m`` along the path."""
 
     def __init__(self, moments: FloatArray) -> None:
         self._moments = moments  # (n, p, p)
 
     def product(self, mode: int, left: FloatArray, right: FloatArray) -> float:
+        """E[tr(A M) tr(B M); i] of symmetric A and B."""
         return float(packed_symmetric.pack(left) @ self._moments[mode] @ packed_symmetric.pack(right))
 
     def quartic(self, mode: int, form: FloatArray) -> float:
+        """E[tr(S M S M); i] of a symmetric S."""
         return float((packed_symmetric.product(form, form) * self._moments[mode]).sum())
 
 
 class _Averaged:
-    """M is its mean given the graph."""
+    """The same where M is its mean given the graph."""
 
     def __init__(self, moments: FloatArray, law: FloatArray) -> None:
         self._moments, self._law = moments, law  # (n, d, d), (n,)
@@ -245,14 +224,8 @@ class _Averaged:
         return float((seen * seen.T).sum() / self._law[mode])
 
 
-def _mean_moments(system: JumpSystem, steady: FloatArray, moved: FloatArray) -> tuple[_Moments, _Moments]:
-    """Of M before the step and after it, before the jump, where M is its mean given the graph."""
-    law = system.stationary
-    return _Averaged(steady, law), _Averaged(moved + law[:, None, None] * system.noise, law)
-
-
-def _moments_of_path(system: JumpSystem, moved: FloatArray, losses: list[list[_Loss]]) -> tuple[_Moments, _Moments]:
-    """The same where M is followed along the path."""
+def _moments_of_path(system: JumpSystem, moved: FloatArray, losses: list[list[_Loss]]) -> tuple[_Followed, _Followed]:
+    """Of M before the step, and after it, before the jump."""
     law = system.stationary[:, None, None]
     n, p = system.modes, packed_symmetric.size(system.dimension)
     basis = packed_symmetric.unpack(np.eye(p), system.dimension)[:, None]  # (p, 1, d, d)
@@ -261,9 +234,8 @@ def _moments_of_path(system: JumpSystem, moved: FloatArray, losses: list[list[_L
     noise = packed_symmetric.pack(system.noise)  # (n, p)
     cross = packed_symmetric.pack(moved)[:, :, None] * noise[:, None, :]
     added = cross + cross.transpose(0, 2, 1) + law * noise[:, :, None] * noise[:, None, :]
-    spreads = (
-        [_LossSpread(step, some) for step, some in zip(system.matrices, losses, strict=True)] if system.lossy else []
-    )
+    pairs = zip(system.matrices, losses, strict=True) if system.lossy else ()
+    spreads = [_LossSpread(step, some) for step, some in pairs]
     moments, spread = np.zeros_like(added), np.zeros_like(added)
     for _ in range(MAX_ROUNDS):
         twice = JumpSystem(

@@ -18,7 +18,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.resources import few_blas_threads
 from msg_analysis.common.text import markdown_table, number_text
 from msg_analysis.errors import InputError
-from msg_analysis.model.step_model import build_run_model
+from msg_analysis.model.step_model import build_run_model, first_graph
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.jump_system import JumpSystem
@@ -111,24 +111,16 @@ class Transient:
 
 
 def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | None = None) -> Snapshot:
-    """Agents at a known place, independent of the graph.
-
-    ``deviation``: (m,) x(0) - (what x should be), in consensus x(0); ``law``: (n,) of g(0), by default stationary.
-    """
+    """Agents at a known place (m,), x(0) or its deviation from the reference; ``law``: (n,) of g(0), or stationary."""
     law = system.stationary if law is None else law
     return Snapshot(law, np.multiply.outer(law, system.reduced(deviation)), system.started(deviation[None], law))
 
 
 def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray) -> Snapshot:
-    """The start that ``run.start`` and ``switching.initial`` define, for one of the experiment's laws.
-
-    ``stationary``: (n, d, d) second moments for ``run.start: stationary``.
-    """
+    """The start that the experiment defines, for one of its laws; ``stationary``: (n, d, d) steady second moments."""
     law = system.stationary
     if experiment.switching.initial != "stationary":
-        law = system.of_modes(
-            np.array([float(graph.name == experiment.switching.initial) for graph in experiment.graph_list])
-        )
+        law = system.of_modes(first_graph(experiment))
     start = experiment.run.start
     if start == "stationary":
         return Snapshot(law, np.zeros((system.modes, system.dimension)), system.started_steady(stationary, law))
@@ -178,10 +170,7 @@ def solve_transient(
 
 
 def unreduced_consensus(experiment: Experiment) -> JumpSystem:
-    """Consensus in continuous time with the mean of the agents included: its second moments grow without bound.
-
-    Proposition 1 of the paper with Z_i = L_i. In steps, ``systems.emulated(step, "tracking")`` reduces nothing either.
-    """
+    """Consensus in continuous time with the mean of the agents, which grows: Proposition 1 of the paper, Z_i = L_i."""
     gain = experiment.noise_gain
     drift = np.stack([graph.laplacian for graph in experiment.graph_list])
     return JumpSystem(
@@ -208,24 +197,9 @@ def transient(
         discrete:   nu(k+1) = H nu(k), C_i(k+1) = sum_j P_ji (K_j[C_j] + pi_j(k) N_j),   pi(k+1) = P^T pi(k)
 
     With a steady state the distance to it is propagated, so that it is reached exactly, however long the time.
-
-    Parameters
-    ----------
-    system
-        continuous or discrete time
-    start
-        at time 0
-    times
-        (T,) >= 0, ascending; units of time, or whole numbers of steps
-    steady
-        (n, d, d) of ``MomentSolver(system).steady()``; None where there is no steady state
-    most_unknowns
-        up to which the joint equations are propagated as a whole
-
-    Raises
-    ------
-    InputError
-        times not usable, or too large
+    ``times``: (T,) >= 0, ascending; units of time, or whole numbers of steps. ``steady``: (n, d, d); None: there is
+    none. ``most_unknowns``: up to which the joint equations are propagated as a whole. InputError: wrong times, or too
+    large.
     """
     times = np.asarray(times, dtype=float)
     _check_times(system, times)
@@ -240,18 +214,10 @@ def unknowns(system: JumpSystem) -> int:
 
 
 def joint_flow(
-    system: JumpSystem,
-    stack: FloatArray,
-    slow: Callable[[], float],
-    *,
-    decays: bool,
-    most_unknowns: int = MAX_UNKNOWNS,
+    system: JumpSystem, stack: FloatArray, slow: Callable[[], float], *, decays: bool, most_unknowns: int = MAX_UNKNOWNS
 ) -> Flow:
-    """The flow of the joint equations for one ``joint_stack`` (n, p + 1): reduced for it where they are large.
-
-    ``slow`` gives the slowest rate of interest [1 / unit of time]; ``decays``: the stack is a distance from the steady
-    state.
-    """
+    """The flow of the joint equations for one ``joint_stack`` (n, p + 1): reduced for it where they are large."""
+    # slow gives the slowest rate of interest [1 / unit of time]; decays: the stack is a distance from the steady state.
     if unknowns(system) <= most_unknowns:
         return second_moment_propagator(system)
     return RationalFlow(system, stack, slow(), decays=decays)
@@ -325,15 +291,9 @@ def _stepped(system: JumpSystem, start: Snapshot, times: FloatArray, steady: Flo
 
 
 def _check_times(system: JumpSystem, times: FloatArray) -> None:
-    wrong = "numbers >= 0 in ascending order"
-    if (
-        times.ndim != 1
-        or not len(times)
-        or not np.isfinite(times).all()
-        or times[0] < 0.0
-        or (np.diff(times) < 0.0).any()
-    ):
-        raise InputError(f"times: {times.tolist()!r:.80}: expected {wrong}: give at least one")
+    if times.ndim != 1 or not times.size or not np.isfinite(times).all() or (np.diff(times, prepend=0.0) < 0.0).any():
+        wanted = "expected numbers >= 0 in ascending order"
+        raise InputError(f"times: {times.tolist()!r:.80}: {wanted}: give at least one")
     if system.time == "discrete":
         if (times != np.round(times)).any():
             raise InputError("times: expected whole numbers of steps in discrete time")
@@ -357,9 +317,8 @@ def _system(experiment: Experiment, law: TransientLaw) -> tuple[JumpSystem, floa
     if experiment.protocol:
         raise InputError(f"law continuous: {experiment.protocol.info} has steps only: leave it out")
     if noise.steps_only:
-        raise InputError(
-            "law continuous: noise.broadcast, link, loss and delay belong to steps, expected 0: leave it out"
-        )
+        belong = "noise.broadcast, link, loss and delay belong to steps, expected 0"
+        raise InputError(f"law continuous: {belong}: leave it out")
     return systems.continuous(experiment), None
 
 
@@ -370,7 +329,6 @@ def _steps(times: FloatArray, unit: float | None) -> FloatArray:
     steps = np.round(times / unit)
     wrong = np.abs(times - steps * unit) > 1e-9 * np.maximum(np.abs(times), unit)
     if wrong.any():
-        raise InputError(
-            f"times: {times[wrong][0]:g} is not a multiple of the step {unit:g}: correct it, or use the law continuous"
-        )
+        place = f"{times[wrong][0]:g} is not a multiple of the step {unit:g}"
+        raise InputError(f"times: {place}: correct it, or use the law continuous")
     return np.asarray(steps)

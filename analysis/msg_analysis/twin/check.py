@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.common.resources import tell
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.reception import Air, by_sender_and_block, neighbour_tables
@@ -21,22 +21,12 @@ from msg_analysis.twin.simulate import RunBlock, run_blocks
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of ``check``.
+    """Result of ``check``."""
 
-    Attributes
-    ----------
-    compared
-        states that were compared; where the run logs both exact and published states, both count
-    missing
-        what could not be compared: states that are not in the bag or, in real time, without all their inputs; steps
-        whose graph is not in the bag
-    difference
-        the first difference in words (lowest step, then lowest agent; agents from 1), or None
-    """
-
-    compared: int
+    compared: int  # states; where the run logs both exact and published states, both count
+    # States that are not in the bag or, in real time, without all their inputs; steps whose graph is not in the bag.
     missing: int
-    difference: str | None
+    difference: str | None  # the first one in words (lowest step, then lowest agent; agents from 1)
 
 
 def check(trajectory: Run) -> Check:
@@ -73,8 +63,7 @@ def _in_lockstep(trajectory: Run, path: IntArray) -> str | None:
     for block in _with_progress(trajectory, run_blocks(trajectory.record, path)):
         found = [
             *(_first_state(trajectory, block.first, *states) for states in _states(trajectory, block)),
-            _first_loss(trajectory, block, path),
-            _first_use(trajectory, block, path),
+            *_first_messages(trajectory, block, path),
             _first_graph(trajectory, block, path),
         ]
         if difference := _earliest(found):
@@ -154,46 +143,33 @@ def _first_graph(trajectory: Run, block: RunBlock, path: IntArray) -> _Found:
     )
 
 
-def _same_graph(trajectory: Run, block: RunBlock, path: IntArray) -> BoolArray:
-    """(K, m, 1) in which steps an agent used the graph of the seed: under another one the neighbours differ."""
-    assert trajectory.agent_modes is not None
-    return np.asarray(trajectory.agent_modes[1:][block.steps] == path[block.steps, None])[:, :, None]
+def _first_messages(trajectory: Run, block: RunBlock, path: IntArray) -> Iterable[_Found]:
+    """In lockstep: the first message that was lost, or used, otherwise than by the seed."""
+    if trajectory.agent_modes is None:
+        return
+    # Under another graph than that of the seed the neighbours differ.
+    same = np.asarray(trajectory.agent_modes[1:][block.steps] == path[block.steps, None])[:, :, None]
 
+    def differing(logged: AnyArray, law: AnyArray, words: str, value: Callable[[int], str]) -> _Found:
+        def describe(k: int, agent: int, which: int) -> str:
+            step = block.first + k
+            sender = int(trajectory.record.model.neighbours(int(path[step]), agent)[which]) + 1
+            mine, other = (value(int(of[k, agent, which])) for of in (logged, law))
+            return words.format(sender=sender, agent=agent + 1, step=step, logged=mine, law=other)
 
-def _first_loss(trajectory: Run, block: RunBlock, path: IntArray) -> _Found:
-    if trajectory.lost is None or block.lost is None or trajectory.agent_modes is None:
-        return None
-    logged, law = trajectory.lost[block.steps], block.lost
+        # After the graph of this step, before the states of the next one.
+        wrong = same & (logged >= 0) & (law >= 0) & (logged != law)
+        return _first(wrong, block.first + 0.5, describe)
 
-    def describe(k: int, agent: int, which: int) -> str:
-        step = block.first + k
-        sender = int(trajectory.record.model.neighbours(int(path[step]), agent)[which]) + 1
-        words = ("heard", "lost")
-        return (
-            f"the message of agent {sender} to agent {agent + 1} in step {step}: logged as "
-            f"{words[int(logged[k, agent, which])]}, the seed gives {words[int(law[k, agent, which])]}"
+    if trajectory.lost is not None and block.lost is not None:
+        words = (
+            "the message of agent {sender} to agent {agent} in step {step}: logged as {logged}, the seed gives {law}"
         )
-
-    # After the graph of this step, before the states of the next one.
-    return _first(_same_graph(trajectory, block, path) & (logged != law), block.first + 0.5, describe)
-
-
-def _first_use(trajectory: Run, block: RunBlock, path: IntArray) -> _Found:
-    """In lockstep, where values of several steps can be used: the first that is not the one which the seed gives."""
-    if trajectory.used is None or block.used is None or trajectory.agent_modes is None:
-        return None
-    logged, law = trajectory.used[block.steps], block.used
-
-    def describe(k: int, agent: int, which: int) -> str:
-        step = block.first + k
-        sender = int(trajectory.record.model.neighbours(int(path[step]), agent)[which]) + 1
-        return (
-            f"the value of agent {sender} that agent {agent + 1} used in step {step}: logged as that of step "
-            f"{logged[k, agent, which]}, the seed gives step {law[k, agent, which]}"
-        )
-
-    wrong = _same_graph(trajectory, block, path) & (logged >= 0) & (law >= 0) & (logged != law)
-    return _first(wrong, block.first + 0.5, describe)
+        yield differing(trajectory.lost[block.steps], block.lost, words, lambda lost: "lost" if lost else "heard")
+    if trajectory.used is not None and block.used is not None:
+        words = "the value of agent {sender} that agent {agent} used in step {step}: logged as that of {logged}, "
+        words += "the seed gives {law}"
+        yield differing(trajectory.used[block.steps], block.used, words, lambda used: f"step {used}")
 
 
 def _uses(trajectory: Run, block: RunBlock) -> tuple[int, IntArray, IntArray]:

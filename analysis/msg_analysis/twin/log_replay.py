@@ -21,11 +21,9 @@ from msg_analysis.twin.simulate import RunBlock, from_start, noise_of_all
 
 
 def replay(trajectory: Run) -> Iterator[RunBlock]:
-    """What the law gives from the logged inputs of every step: ``states`` and ``published``; NaN where inputs miss.
-
-    By induction, a log in real time that equals this from x(0) on is what the law gives for the start, the seed, and
-    the values that the agents used. ValueError: the log does not have these (a run in lockstep).
-    """
+    """What the law gives from the logged inputs of every step: ``states`` and ``published``; NaN where inputs miss."""
+    # By induction, a log in real time that equals this from x(0) on is what the law gives for the start, the seed, and
+    # the values that the agents used.
     if trajectory.used is None or trajectory.agent_modes is None or trajectory.made is None:
         raise ValueError("a run in lockstep: its twin is `simulate`")
     record, model = trajectory.record, trajectory.record.model
@@ -86,12 +84,9 @@ class _LinearReplay:
 
 
 def _terms(model: StepModel, i: int) -> tuple[IntArray, FloatArray]:
-    """(n, D + 1) place of every term of the sums of agent i among its own value and those of its neighbours; weights.
-
-    Padded with its own value, and weights of 0, which change no sum.
-    """
+    """(n, D + 1) place of every term of the sums of agent i among its value and those of its neighbours; weights."""
     places = np.zeros((model.modes, model.most_neighbours + 1), dtype=np.int64)
-    weights = np.zeros(places.shape)
+    weights = np.zeros(places.shape)  # of 0, which change no sum, beyond the last
     for mode in range(model.modes):
         inputs = model.inputs(mode, i)
         others = np.cumsum(inputs != i)

@@ -23,14 +23,13 @@ from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.problems import problem
 from msg_analysis.experiment.protocols import AgentProtocol
-from msg_analysis.model.agent_law import ProtocolLaw
+from msg_analysis.experiment.validation import unpredictable
+from msg_analysis.model.agent_law import ProcessNoise, ProtocolLaw
 from msg_analysis.model.graph_path import mode_path, past_modes, sojourns
-from msg_analysis.model.phases import phases
-from msg_analysis.model.process_noise import ProcessNoise
 from msg_analysis.model.reception import Air, AirReception, MessagesUsed, add_broadcast_noise, ahead
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
-from msg_analysis.model.step_model import StepMatrices, StepModel, Wiring, build_model
+from msg_analysis.model.step_model import StepMatrices, StepModel, Wiring, build_model, phases
 
 
 def ideal_log(experiment: Experiment, model: Wiring, modes: IntArray) -> tuple[IntArray, IntArray, IntArray]:
@@ -77,11 +76,8 @@ def states_of_all(
     law: ManySteps | None = None,
     noise: ProcessNoise | None = None,
 ) -> Iterator[FloatArray]:
-    """x(first + 1), x(first + 2), ..., from x(first) under the graphs ``modes`` from there on, in blocks (k, m, R).
-
-    ``first`` is a multiple of STEPS_PER_BLOCK; steps before a run are negative. ``law`` and ``noise``: as of
-    ``law_of_all`` and ``noise_of_all``.
-    """
+    """x(first + 1), x(first + 2), ..., from x(first) under the graphs ``modes`` from there on, in blocks (k, m, R)."""
+    # first is a multiple of STEPS_PER_BLOCK; steps before a run are negative.
     air = AirReception(experiment, model, start, first) if experiment.noise.steps_only else None
     law, noise = law or law_of_all(experiment, model), noise or noise_of_all(experiment, model)
     past = np.repeat(start[None], experiment.noise.delay + 1, axis=0)  # before the start the states are those of it
@@ -108,24 +104,18 @@ def _blocks(noise: ProcessNoise, model: StepModel, modes: IntArray, first: int) 
         yield first + begin, now, drives
 
 
-def _padded_inputs(model: StepModel, mode: int) -> tuple[IntArray, BoolArray]:
-    """(d, m) the d-th input of every agent (agents from 0, ascending), padded with 0; and which entries are inputs."""
-    inputs = [model.inputs(mode, i) for i in range(model.agents)]
-    columns = np.zeros((max(len(row) for row in inputs), model.agents), dtype=np.int64)
-    there = np.zeros(columns.shape, dtype=np.bool_)
-    for i, row in enumerate(inputs):
-        columns[: len(row), i] = row
-        there[: len(row), i] = True
-    return columns, there
-
-
 def _rounds(model: StepModel, mode: int, lead: BoolArray, heard: BoolArray | None) -> list[Round]:
     """The agents in rounds: each in the first one after those that step before it (``lead``) and that it uses.
 
     ``heard`` (m, m): whom it hears whatever the graph, and must wait for, too.
     """
     m, every = model.agents, np.arange(model.agents)
-    columns, there = _padded_inputs(model, mode)
+    inputs = [model.inputs(mode, i) for i in range(m)]
+    columns = np.zeros((max(len(row) for row in inputs), m), dtype=np.int64)  # the d-th input of every agent
+    there = np.zeros(columns.shape, dtype=np.bool_)
+    for i, row in enumerate(inputs):
+        columns[: len(row), i] = row
+        there[: len(row), i] = True
     weights = np.where(there, model.nominal[mode, every, columns], 0.0)  # 0 for padding changes no sum
     earlier = there & lead[every, columns]
     waits = np.zeros((m, m), dtype=np.bool_) if heard is None else heard & lead
@@ -243,7 +233,7 @@ def draw_start(experiment: Experiment, model: Wiring, first_mode: int) -> FloatA
         return np.repeat(np.array(start, dtype=float)[:, None], replicas, axis=1)
     assert isinstance(model, StepModel), "experiments without a prediction start from given values"
     found = _from_the_past(experiment, model, first_mode)
-    if found is None and (reason := experiment.unpredictable()):
+    if found is None and (reason := unpredictable(experiment)):
         wanted = f"expected 'zero' or one value per agent, since a past would take too long, and {reason}"
         raise InputError(f"{experiment.source}: {problem('run.start', 'stationary', wanted, 'give x(0)')}")
     return _gaussian(experiment, first_mode) if found is None else found
@@ -269,15 +259,12 @@ def _from_the_past(experiment: Experiment, model: StepModel, first_mode: int) ->
 def _end_of_the_past(
     experiment: Experiment, model: StepModel, law: ManySteps, noise: ProcessNoise, first_mode: int, steps: int
 ) -> tuple[FloatArray, float]:
-    """x(0) of a past of so many steps that begins at the reference, and the size of its rounding errors.
-
-    In consensus only differences between agents are stationary: their average is put to 0.
-    """
+    """x(0) of a past of so many steps that begins at the reference, and the size of its rounding errors."""
     state = np.full((experiment.agents, experiment.run.replicas), model.reference)
     for block in states_of_all(experiment, model, past_modes(experiment, first_mode, steps), state, -steps, law, noise):
         state = block[-1]
     rounding = 2.0**-40 * float(np.abs(state).max())
-    if experiment.problem == "consensus":
+    if experiment.problem == "consensus":  # only differences between agents are stationary
         state = state - weighted_sum([1.0 / len(state)] * len(state), list(state))
     return state, rounding
 
@@ -320,31 +307,18 @@ def new_record(experiment: Experiment, run: uuid.UUID | None = None) -> RunRecor
 
 
 def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Run:
-    """Run an experiment without ROS, or repeat the run of a record (then its experiment is used).
-
-    The states equal those of a network run to the last bit: in lockstep, or with ideal timers and no latency.
-    """
+    """Run an experiment without ROS, or repeat the run of a record (then its experiment is used)."""
     experiment = record.experiment if record else experiment
     experiment.require_available()
     record = record or new_record(experiment)
     modes = mode_path(experiment, record.model.initial)
     arrays = _whole(run_blocks(record, modes), len(modes))
-    states = arrays["states"]
     agent_modes = made = None
     if experiment.run.pace == "realtime":
         agent_modes, made = ideal_times(experiment, modes)
-    expected = states.shape[0] * states.shape[1] * (2 if experiment.truth else 1)
-    return Run(
-        record,
-        states,
-        modes,
-        Completeness(expected, expected, 0),
-        agent_modes,
-        published=arrays.get("published"),
-        lost=arrays.get("lost"),
-        used=arrays.get("used"),
-        made=made,
-    )
+    expected = (len(modes) + 1) * experiment.agents * (2 if experiment.truth else 1)
+    count = Completeness(expected, expected, 0)
+    return Run(record, modes=modes, completeness=count, agent_modes=agent_modes, made=made, **arrays)
 
 
 def _whole(blocks: Iterable[RunBlock], steps: int) -> dict[str, AnyArray]:

@@ -19,8 +19,8 @@ from msg_agents.process_layout import agent_numbers, assignment_problems, proces
 from msg_analysis.common.arrays import BoolArray, FloatArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import read_yaml
-from msg_analysis.experiment.network_spec import expected, is_number
 from msg_analysis.experiment.problems import ExperimentError, problem, translate
+from msg_analysis.experiment.spec import expected, is_number
 
 BASE = "base"
 """The host of recorder and switcher."""

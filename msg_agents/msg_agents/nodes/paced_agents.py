@@ -22,8 +22,8 @@ from msg_analysis.experiment.protocols import ProtocolError
 from msg_analysis.messages import topics
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.messages import ActiveGraph, stamp_ns
-from msg_analysis.model.phases import phases
 from msg_analysis.model.reception import LOST, AgentAir
+from msg_analysis.model.step_model import phases
 
 
 class LockstepAgent(Agent):

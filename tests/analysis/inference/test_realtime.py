@@ -16,7 +16,7 @@ from msg_analysis.inference.received_values import ReceivedValues, process_noise
 from msg_analysis.inference.regression import ReceivedRegression
 from msg_analysis.inference.residuals import ResidualSums, residuals
 from msg_analysis.inference.timing import measure_timing
-from msg_analysis.model.phases import phases
+from msg_analysis.model.step_model import phases
 
 
 def experiment(run=None, **changes):

@@ -13,7 +13,7 @@ from msg_analysis.inference.estimates import Estimate, estimates
 from msg_analysis.inference.online_errors import LiveEstimate, RunningErrors
 from msg_analysis.inference.online_steps import WINDOW, Lateness, RecentSteps, StepCollector
 from msg_analysis.inference.time_means import time_means
-from msg_analysis.model.phases import phases
+from msg_analysis.model.step_model import phases
 
 
 def experiment(**changes: Any) -> Experiment:

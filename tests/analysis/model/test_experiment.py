@@ -17,6 +17,7 @@ from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.problems import ExperimentError
 from msg_analysis.experiment.spec import ExperimentSpec, json_schema
+from msg_analysis.experiment.validation import unavailable, unpredictable
 
 ROOT = Path(__file__).parents[3]
 EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"
@@ -111,13 +112,6 @@ def test_graphml_is_read_and_becomes_part_of_the_document(tmp_path: Path, direct
     assert Experiment.parse(experiment.to_document()) == experiment
 
 
-def test_graphml_nodes_with_other_names_are_numbered_in_file_order(tmp_path: Path) -> None:
-    graph = nx.Graph([("carol", "alice"), ("alice", "bob")])
-    nx.write_graphml(graph, tmp_path / "net.graphml")
-    experiment = Experiment.parse(SMALL | {"graphs": {"net": {"graphml": "net.graphml"}}}, directory=tmp_path)
-    assert np.array_equal(experiment.graph_list[0].adjacency, nx.to_numpy_array(graph))
-
-
 @pytest.mark.parametrize(
     ("process", "expected"),
     [
@@ -201,18 +195,18 @@ def test_the_order_of_the_graphs_matters() -> None:
 
 
 def test_everything_runs_and_what_is_too_large_has_no_prediction() -> None:
-    assert small().unavailable() == []
+    assert unavailable(small()) == []
     noise = {"broadcast": 0.1, "link": 0.2, "loss": 0.3, "delay": 2, "on_loss": "hold", "burst": 5}
     for pace in ("lockstep", "realtime"):
         noisy = small(noise=noise, run={"pace": pace})
         noisy.require_available()
         noisy.require_available("predict")
-        assert noisy.unpredictable() is None
+        assert unpredictable(noisy) is None
     large = small(graphs={"all": {"complete": True}}, agents=5, noise=noise)
     large.require_available()
-    (line,) = large.unavailable("predict")
+    (line,) = unavailable(large, "predict")
     assert line.startswith("noise.burst: 5.0: has no prediction: 2^20 states of 20 links")
-    assert large.unpredictable() == line
+    assert unpredictable(large) == line
     with pytest.raises(NotAvailableError, match=r"noise\.burst: 5"):
         large.require_available("predict")
 

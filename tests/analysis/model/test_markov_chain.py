@@ -12,9 +12,9 @@ import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
+from experiments import Experiment, line_ring
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment import validation
-from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graphs import Graph, hops
 from msg_analysis.experiment.markov_chain import MarkovChain, stationary_law
 from msg_analysis.experiment.validation import connection_problems
@@ -86,15 +86,9 @@ def test_whom_nothing_connects_against_networkx(seed: int, agents: int, density:
 def setup(time: str, matrix: np.ndarray, steps: int, dt: float = 0.3, **switching: object) -> Experiment:
     n = len(matrix)
     key = "generator" if time == "continuous" else "transition"
-    return Experiment.parse(
-        {
-            "name": "chain",
-            "time": time,
-            "graphs": {f"g{i}": {"edges": [[1, 2, 0.1 + i]]} for i in range(n)},
-            "switching": {key: matrix.tolist()} | switching,
-            "run": {"dt": dt, "duration": steps * dt, "seed": 11},
-        }
-    )
+    graphs = {f"g{i}": {"edges": [[1, 2, 0.1 + i]]} for i in range(n)}
+    run = {"dt": dt, "duration": steps * dt, "seed": 11}
+    return line_ring(time=time, graphs=graphs, switching={key: matrix.tolist()} | switching, run=run)
 
 
 @pytest.mark.parametrize("time", ["continuous", "discrete"])
@@ -143,20 +137,13 @@ def test_first_graph_can_be_given_and_one_never_switches() -> None:
 
 def test_step_of_grounded_leaders() -> None:
     """Euler: the leader's row vanishes and the reference moves into the offset; discrete time: followers forget it."""
-    document = {
-        "name": "grounded",
-        "problem": "tracking",
-        "graphs": {"a": {"path": [1, 2, 3]}},
-        "leaders": {"agents": [1], "gain": float("inf"), "reference": 3.0},
-        "noise": {"process": 2.0},
-        "run": {"dt": 0.1, "duration": 1},
-    }
-    model = build_step_model(Experiment.parse(document))
+    changes = {"graphs": {"a": {"path": [1, 2, 3]}}, "switching": {}, "noise": {"process": 2.0}}
+    changes |= {"problem": "tracking", "leaders": {"agents": [1], "gain": math.inf, "reference": 3.0}}
+    model = build_step_model(line_ring(**changes, run={"dt": 0.1}))
     np.testing.assert_allclose(model.weights[0], [[0, 0, 0], [0.1, 0.8, 0.1], [0, 0.1, 0.9]])
     np.testing.assert_allclose(model.offsets[0], [3.0, 0.0, 0.0], atol=1e-15)
     np.testing.assert_allclose(model.noise[0], np.diag([0, 0.4, 0.4]))
-    document |= {"time": "discrete", "run": {"duration": 5}}
-    model = build_step_model(Experiment.parse(document))
+    model = build_step_model(line_ring(**changes, time="discrete"))
     followers = scipy.linalg.expm(-np.array([[2.0, -1.0], [-1.0, 1.0]]))
     np.testing.assert_allclose(model.weights[0][1:, 1:], followers)
     assert not model.weights[0][0].any()

@@ -55,14 +55,10 @@ class Rounding(Protocol):
 @pytest.mark.parametrize("laziness", [0.0, 0.3])
 def test_metropolis_against_networkx_and_scipy(laziness: float) -> None:
     """Weights from the textbook, and the steady error of one graph from scipy's Lyapunov solver."""
-    what = experiment(
-        {"name": "metropolis", "laziness": laziness},
-        graphs={"only": {"edges": [[1, 2], [2, 3], [3, 1], [3, 4], [4, 5]]}},
-        switching={"transition": [[1.0]]},
-        time="discrete",
-        noise={"process": 0.4},
-        run={"dt": 1, "start": "zero"},
-    )
+    graphs = {"only": {"edges": [[1, 2], [2, 3], [3, 1], [3, 4], [4, 5]]}}
+    changes = {"time": "discrete", "noise": {"process": 0.4}, "run": {"dt": 1, "start": "zero"}}
+    protocol = {"name": "metropolis", "laziness": laziness}
+    what = experiment(protocol, graphs=graphs, switching={"transition": [[1.0]]}, **changes)
     graph = nx.Graph([(0, 1), (1, 2), (2, 0), (2, 3), (3, 4)])
     expected = np.zeros((5, 5))
     for i, j in graph.edges:
@@ -151,14 +147,8 @@ def test_negative_weights_are_no_reason_to_trust(offer: Callable[..., None]) -> 
             return np.eye(3) + 0.1 * self.network.graphs[mode].laplacian
 
     offer(("repelled", Repelled))
-    what = experiment(
-        {"name": "repelled"},
-        graphs={"g": {"complete": True}},
-        agents=3,
-        switching={},
-        noise={"process": 0.0},
-        run={"start": "zero"},
-    )
+    changes = {"graphs": {"g": {"complete": True}}, "agents": 3, "switching": {}, "noise": {"process": 0.0}}
+    what = experiment({"name": "repelled"}, **changes, run={"start": "zero"})
     with pytest.raises(InputError, match="unstable"):
         predict(what)
 
@@ -207,11 +197,8 @@ def test_saturated_is_the_built_in_law_where_nothing_saturates() -> None:
 def test_integral_action_against_a_loop() -> None:
     """Without noise: explicit numbers; disturbances are made up for, which the built-in law cannot."""
     disturbance = [1.0, 0.5, 0.0, -0.5, -1.0]
-    what = experiment(
-        {"name": "integral_action", "gain": 0.8, "disturbance": disturbance},
-        noise={"process": 0.0},
-        run={"duration": 100},
-    )
+    protocol = {"name": "integral_action", "gain": 0.8, "disturbance": disturbance}
+    what = experiment(protocol, noise={"process": 0.0}, run={"duration": 100})
     trajectory = simulate(what)
     assert trajectory.states.shape == (1001, 5, 6)
     assert trajectory.published is not None

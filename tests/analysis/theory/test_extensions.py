@@ -18,6 +18,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.model.step_model import build_step_model
 from msg_analysis.theory.jump_system import emulated, held
 from msg_analysis.theory.moments import MomentSolver, transient_mean
+from msg_analysis.theory.solvers import DenseSolver
 
 MODELS = settings(max_examples=40, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
@@ -192,7 +193,7 @@ def test_steps_with_everything_are_those_of_brute_force(seed):
     scale = np.abs(expected).max()
     np.testing.assert_allclose(prediction.emulated.by_mode, expected, rtol=1e-7, atol=1e-8 * scale)
     np.testing.assert_allclose(prediction.emulated.covariance, expected.sum(axis=0), rtol=1e-7, atol=1e-8 * scale)
-    dense = MomentSolver(prediction.system, method="dense").steady()
+    dense = DenseSolver(prediction.system).steady()
     np.testing.assert_allclose(prediction.system.lifted(dense), expected, rtol=1e-7, atol=1e-8 * scale)
     json.dumps(prediction.to_json(), allow_nan=False)
 
@@ -262,23 +263,6 @@ def test_noise_by_graph_with_names_and_without_steps():
     assert prediction.static.system_error == pytest.approx(5 / 7 * 4.0 * 2.0 + 2 / 7 * 0.25 * 1.0, rel=1e-12)
 
 
-@pytest.mark.parametrize("delay", [1, 2, 5])
-def test_two_agents_late(delay):
-    """The difference of two agents goes its own way: z(k+1) = (1 - dt) z(k) - dt z(k - d) + noise; scipy solves it."""
-    dt = 0.2
-    given = {"name": "two", "graphs": {"a": {"path": [1, 2]}}, "noise": {"delay": delay}, "run": {"dt": dt}}
-    companion = np.eye(delay + 1, k=-1)
-    companion[0, 0] += 1.0 - dt
-    companion[0, -1] += -dt
-    entering = np.zeros_like(companion)
-    entering[0, 0] = 2.0 * dt  # variance of the noise of x_1 - x_2
-    difference = scipy.linalg.solve_discrete_lyapunov(companion, entering)[0, 0]
-    prediction = predict(Experiment.parse(given))
-    assert prediction.emulated.system_error == pytest.approx(difference / 2, rel=1e-11)
-    assert prediction.continuous_moments is None
-    assert prediction.static_moments is None
-
-
 def test_held_keeps_the_delay():
     experiment = fast(delay=2, process={"line": 1.0, "ring": 3.0})
     alone = held(emulated(build_step_model(experiment), "consensus"), 1)
@@ -289,43 +273,33 @@ def test_held_keeps_the_delay():
 
 def complete(dt, **noise):
     """Four agents who all hear each other: stable below dt = 0.5 without delay, and below 1/3 with one step of it."""
-    return {
-        "name": "complete",
-        "agents": 4,
-        "graphs": {"all": {"complete": True}},
-        "noise": noise,
-        "run": {"dt": dt, "duration": 10 * dt},
-    }
+    graphs, run = {"all": {"complete": True}}, {"dt": dt, "duration": 10 * dt}
+    return line_ring(agents=4, graphs=graphs, switching={}, noise=noise, run=run)
 
 
 def test_steps_that_delay_makes_unstable_are_refused():
-    assert predict(Experiment.parse(complete(0.4))).emulated.system_error > 0.0
-    assert predict(Experiment.parse(complete(0.33, delay=1))).emulated.system_error > 0.0
+    assert predict(complete(0.4)).emulated.system_error > 0.0
+    assert predict(complete(0.33, delay=1)).emulated.system_error > 0.0
     with pytest.raises(InputError, match=r"grow without bound.* every dt below 0\.3333 is stable"):
-        predict(Experiment.parse(complete(0.4, delay=1)))
+        predict(complete(0.4, delay=1))
 
 
 @pytest.mark.parametrize("process", [0.0, [[1.0] * 4] * 4])
 def test_noise_that_does_not_show_instability_hides_nothing(process):
     """Without noise, or with the same noise for everybody, nothing grows from agreement; from elsewhere it does."""
-    stable = predict(Experiment.parse(complete(0.4, process=process))).to_json()["emulated"]
+    stable = predict(complete(0.4, process=process)).to_json()["emulated"]
     assert stable["system_error"] == 0.0
     assert stable["system_certainty"] is None
     with pytest.raises(InputError, match="without bound"):
-        predict(Experiment.parse(complete(0.4, process=process, delay=1)))
+        predict(complete(0.4, process=process, delay=1))
 
 
 def test_agents_without_errors_have_no_certainty():
     """Noise at the end of a chain that nobody listens to: the others follow the leader exactly."""
-    given = {
-        "name": "chain",
-        "problem": "tracking",
-        "graphs": {"a": {"arcs": [[1, 2], [2, 3]]}, "b": {"arcs": [[1, 2], [1, 3]]}},
-        "switching": {"generator": [[-1.0, 1.0], [1.0, -1.0]]},
-        "leaders": {"agents": [1]},
-        "noise": {"process": [0.0, 0.0, 1.0], "delay": 2},
-    }
-    law = predict(Experiment.parse(given)).to_json()["emulated"]
+    graphs = {"a": {"arcs": [[1, 2], [2, 3]]}, "b": {"arcs": [[1, 2], [1, 3]]}}
+    noise = {"process": [0.0, 0.0, 1.0], "delay": 2}
+    chain = line_ring(problem="tracking", graphs=graphs, leaders={"agents": [1]}, noise=noise)
+    law = predict(chain).to_json()["emulated"]
     assert law["node_errors"][:2] == [0.0, 0.0]
     assert law["node_certainty"][:2] == [None, None]
     assert law["node_certainty"][2] > 0.0

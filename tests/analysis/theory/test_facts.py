@@ -103,14 +103,12 @@ def test_leaders_remove_the_special_eigenvalue(gain, time):
 
 
 def test_others_of_one_graph_are_its_own_eigenvalues():
-    network = experiment({"path": {"path": [1, 2, 3, 4]}}, agents=4, chain=[[0.0]])
-    found = by_name(check_facts(network))
+    path = {"path": {"path": [1, 2, 3, 4]}}
+    found = by_name(check_facts(experiment(path, agents=4, chain=[[0.0]])))
     connectivity = 2 - np.sqrt(2)
     assert found["N_c"].others == pytest.approx(connectivity)
     assert found["M_c"].others == pytest.approx(connectivity)  # 0 + lambda_2
-    discrete = by_name(
-        check_facts(experiment({"path": {"path": [1, 2, 3, 4]}}, agents=4, time="discrete", chain=[[1.0]]))
-    )
+    discrete = by_name(check_facts(experiment(path, agents=4, time="discrete", chain=[[1.0]])))
     assert discrete["Abar_c"].others == pytest.approx(np.exp(-2 * connectivity))
 
 

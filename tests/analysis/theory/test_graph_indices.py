@@ -5,26 +5,23 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from switching_systems import network
 
-from experiments import Experiment, predict
+from experiments import line_ring, predict
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.theory.graph_indices import error_bounds, graph_indices
 
 MODELS = settings(max_examples=30, deadline=None, derandomize=True)
 
 
-def connected(random, m, weighted):
-    graph = nx.random_labeled_tree(m, seed=int(random.integers(1000)))
-    graph.add_edges_from(nx.gnp_random_graph(m, 0.3, seed=int(random.integers(1000))).edges)
-    for a, b in graph.edges:
-        graph[a][b]["weight"] = float(random.uniform(0.2, 3.0)) if weighted else 1.0
-    return graph
-
-
 @MODELS
 @given(st.integers(0, 1000), st.integers(2, 7), st.booleans())
 def test_resistances_are_those_of_networkx(seed, m, weighted):
-    graph = connected(np.random.default_rng(seed), m, weighted)
+    random = np.random.default_rng(seed)
+    graph = nx.random_labeled_tree(m, seed=seed)
+    graph.add_edges_from(nx.gnp_random_graph(m, 0.3, seed=seed + 1).edges)
+    for a, b in graph.edges:
+        graph[a][b]["weight"] = float(random.uniform(0.2, 3.0)) if weighted else 1.0
     found = graph_indices(Graph("g", nx.to_numpy_array(graph, nodelist=range(m))))
     centrality = nx.information_centrality(graph, weight="weight")
     np.testing.assert_allclose(found.information_centrality, [centrality[i] for i in range(m)], rtol=1e-9)
@@ -38,35 +35,6 @@ def test_no_resistances_where_there_are_none():
     assert graph_indices(Graph("g", np.zeros((3, 3)))) is None
 
 
-def network(random, *, m, n, time, problem, directed=False, noise=1.0, rate=1.0):
-    graphs = {}
-    for i in range(n):
-        graph = connected(random, m, True)
-        links = [[a + 1, b + 1, w] for a, b, w in graph.edges(data="weight")]
-        if directed:
-            links += [[b, a, float(random.uniform(0.01, 3.0))] for a, b, _ in links]
-        graphs[f"g{i}"] = {"arcs" if directed else "edges": links}
-    chain = random.uniform(0.02, 1.0, (n, n)) ** 3 * rate
-    if time == "continuous":
-        np.fill_diagonal(chain, 0.0)
-        switching = {"generator": (chain - np.diag(chain.sum(axis=1))).tolist()}
-    else:
-        switching = {"transition": (chain / chain.sum(axis=1, keepdims=True)).tolist()}
-    document = {
-        "name": "bounds",
-        "problem": problem,
-        "time": time,
-        "agents": m,
-        "graphs": graphs,
-        "switching": switching,
-        "noise": {"process": noise},
-        "run": {"dt": 0.001, "duration": 1} if time == "continuous" else {"duration": 10},
-    }
-    if problem == "tracking":
-        document["leaders"] = {"agents": [1], "gain": float(random.choice([0.5, 5.0, np.inf]))}
-    return Experiment.parse(document)
-
-
 @MODELS
 @given(
     st.integers(0, 10_000),
@@ -77,9 +45,8 @@ def network(random, *, m, n, time, problem, directed=False, noise=1.0, rate=1.0)
     st.sampled_from([0.01, 1.0, 100.0]),
 )
 def test_bounds_hold_for_equal_noise(seed, m, n, time, problem, rate):
-    prediction = predict(
-        network(np.random.default_rng(seed), m=m, n=n, time=time, problem=problem, noise=0.7, rate=rate)
-    )
+    gain, shared = [0.5, 5.0, np.inf][seed % 3], {"directed": False, "noise": 0.7, "dt": 0.001}
+    prediction = predict(network(seed, m, n, time=time, problem=problem, rate=rate, gain=gain, **shared))
     bounds = error_bounds(prediction)
     law = prediction.continuous_moments or prediction.emulated
     assert law.system_error <= bounds.upper * (1 + 1e-10)
@@ -89,7 +56,7 @@ def test_bounds_hold_for_equal_noise(seed, m, n, time, problem, rate):
 
 
 def test_lower_bound_is_half_the_trace_of_the_averaged_graph():
-    experiment = network(np.random.default_rng(1), m=5, n=3, time="continuous", problem="consensus", noise=2.0)
+    experiment = network(1, 5, 3, directed=False, noise=2.0)
     laplacians = np.stack([graph.laplacian for graph in experiment.graph_list])
     averaged = np.tensordot(experiment.chain.stationary, laplacians, axes=1)
     expected = 4.0 * np.trace(np.linalg.pinv(averaged)) / 2.0
@@ -105,9 +72,7 @@ def test_lower_bound_is_half_the_trace_of_the_averaged_graph():
     ],
 )
 def test_no_bounds_where_they_do_not_hold(directed, noise, reason):
-    random = np.random.default_rng(2)
-    experiment = network(random, m=4, n=2, time="continuous", problem="consensus", directed=directed)
-    bounds = error_bounds(predict(Experiment.parse(experiment.to_document() | {"noise": noise})))
+    bounds = error_bounds(predict(network(2, 4, 2, directed=directed).with_noise(**noise)))
     assert (bounds.lower, bounds.upper) == (None, None)
     assert reason in bounds.note
 
@@ -115,15 +80,9 @@ def test_no_bounds_where_they_do_not_hold(directed, noise, reason):
 def test_in_discrete_time_the_averaged_graph_is_no_lower_bound():
     """Two agents whose disagreement is multiplied by .95 and .85 in turn do better than with .9 all the time."""
     weights = [-np.log(0.95) / 2, -np.log(0.85) / 2]
-    document = {
-        "name": "alternating",
-        "time": "discrete",
-        "graphs": {"weak": {"edges": [[1, 2, weights[0]]]}, "strong": {"edges": [[1, 2, weights[1]]]}},
-        "switching": {"transition": [[0.001, 0.999], [0.999, 0.001]]},
-        "noise": {"process": 1.0},
-        "run": {"duration": 10},
-    }
-    prediction = predict(Experiment.parse(document))
+    graphs = {"weak": {"edges": [[1, 2, weights[0]]]}, "strong": {"edges": [[1, 2, weights[1]]]}}
+    switching = {"transition": [[0.001, 0.999], [0.999, 0.001]]}
+    prediction = predict(line_ring(time="discrete", graphs=graphs, switching=switching))
     assert prediction.emulated.system_error < 1 / (1 - 0.9**2) - 0.05
     bounds = error_bounds(prediction)
     assert bounds.lower is None

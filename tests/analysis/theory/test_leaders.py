@@ -13,8 +13,8 @@ import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from experiments import Experiment, line_ring
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.theory.leaders import (
     LeaderProblem,
     joint_robustness_centrality,
@@ -191,10 +191,9 @@ def test_monotone_and_supermodular(seed: int, directed: bool, law: str, finite: 
     experiment = Experiment.parse(document(seed, directed=directed))
     problem = LeaderProblem(experiment, law, 0.7 if finite else math.inf)  # type: ignore[arg-type]
     assert problem.supermodular
-    worth = {
-        frozenset(s): problem.system_error(frozenset(s)) for size in (1, 2, 3) for s in combinations(range(5), size)
-    }
-    for base in (frozenset(s) for size in (1, 2) for s in combinations(range(5), size)):
+    sets = [frozenset(s) for size in (1, 2, 3) for s in combinations(range(5), size)]
+    worth = {leaders: problem.system_error(leaders) for leaders in sets}
+    for base in (leaders for leaders in sets if len(leaders) < 3):
         for v in set(range(5)) - base:
             gain = worth[base] - worth[base | {v}]
             assert gain >= -1e-10 * worth[base]
@@ -212,9 +211,8 @@ def errors_of(problem: LeaderProblem) -> Callable[..., float]:
 @given(st.integers(0, 10**6), st.booleans(), st.integers(0, 2), st.sampled_from([0.0, 0.3]))
 def test_supermodular_with_noise_on_the_air_loss_and_delay(seed: int, directed: bool, delay: int, loss: float) -> None:
     noise = {"process": 0.5, "link": 1.0, "broadcast": 0.7, "loss": loss, "delay": delay}
-    problem = LeaderProblem(
-        Experiment.parse(random_document(seed, agents=4, directed=directed, noise=noise)), "emulated"
-    )
+    experiment = Experiment.parse(random_document(seed, agents=4, directed=directed, noise=noise))
+    problem = LeaderProblem(experiment, "emulated")
     assert problem.supermodular
     error = errors_of(problem)
     for a in range(4):
@@ -264,14 +262,8 @@ def test_large_steps_get_no_guarantee() -> None:
 def test_agents_that_hear_nobody_must_lead() -> None:
     """Agents 1 and 6 only speak: whoever leads, they must."""
     arcs = [[1, 2], [2, 3], [3, 4], [4, 3], [6, 5], [5, 4]]
-    document = {
-        "name": "roots",
-        "problem": "tracking",
-        "graphs": {"g": {"arcs": arcs}},
-        "leaders": {"agents": [1, 6]},
-        "run": {"dt": 0.1, "duration": 10},
-    }
-    experiment = Experiment.parse(document)
+    graphs = {"g": {"arcs": arcs}}
+    experiment = line_ring(problem="tracking", graphs=graphs, switching={}, leaders={"agents": [1, 6]})
     assert system_error(experiment, [2, 3]) == math.inf
     assert joint_robustness_centrality(experiment, [2, 3]) == 0.0
     for method in ("exhaustive", "greedy", "swap"):
@@ -327,9 +319,8 @@ def test_bad_questions(changes: dict[str, Any], message: str) -> None:
 
 def test_document() -> None:
     document = select_leaders(Experiment.parse(random_document(8)), 2, method="swap", top=3).to_json()
-    assert [document[key] for key in ("experiment", "law", "gain", "count", "method")] == [
-        *("random", "continuous", "inf", 2, "swap")
-    ]
+    about = {"experiment": "random", "law": "continuous", "gain": "inf", "count": 2, "method": "swap"}
+    assert about.items() <= {key: document[key] for key in about}.items()
     assert len(document["sets"]) == 3
     errors = [entry["system_error"] for entry in document["sets"]]
     assert errors == sorted(errors)

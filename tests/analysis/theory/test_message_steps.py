@@ -1,6 +1,3 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """Messages one by one: held values, agents one after the other, bursts; against brute force, nothing reduced.
 
 The oracle is built from the document of the experiment alone. It makes a period message by message, on vectors of
@@ -20,8 +17,7 @@ from tests.support.switching_systems import LINE_RING, steady_of
 
 from experiments import Experiment, line_ring, predict
 from msg_analysis.errors import InputError
-from msg_analysis.model.phases import phases
-from msg_analysis.model.step_model import build_run_model, build_step_model
+from msg_analysis.model.step_model import build_run_model, build_step_model, phases
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.fourth_moments import (
     FourthMoment,
@@ -32,12 +28,12 @@ from msg_analysis.theory.fourth_moments import (
     random_steps,
     second_radius,
 )
+from msg_analysis.theory.graph_indices import two_topology
 from msg_analysis.theory.leaders import select_leaders, system_error
-from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import stationary_start_factor
 from msg_analysis.theory.settling import asymptotic_rates
+from msg_analysis.theory.solvers import DenseSolver, IterativeSolver
 from msg_analysis.theory.transient import solve_transient
-from msg_analysis.theory.two_graphs import two_topology
 
 GRAPHS = {"a": {"arcs": [[1, 2], [2, 3, 0.7], [3, 1]]}, "b": {"edges": [[1, 2, 0.5]]}}
 PAIR = {"a": {"edges": [[1, 2]]}, "b": {"arcs": [[1, 2, 0.5]]}}
@@ -76,17 +72,15 @@ CASES = {
 }
 
 
-def parse(case, **run):
+def parse(case, start="stationary", **changes):
     graphs, noise, more = CASES[case]
     more = dict(more)
-    run = {"dt": 0.3, "duration": 6, "pace": more.pop("pace", "lockstep"), "seed": 3} | run
-    document = {"name": "case", "graphs": graphs, "noise": noise, "run": run}
+    run = {"dt": 0.3, "duration": 6, "pace": more.pop("pace", "lockstep"), "seed": 3, "start": start}
+    switching = {"generator": [[-2.0, 2.0], [3.0, -3.0]]}
     if more.get("time") == "discrete":
-        del run["dt"]
-        document["switching"] = {"transition": [[0.8, 0.2], [0.4, 0.6]]}
-    else:
-        document["switching"] = {"generator": [[-2.0, 2.0], [3.0, -3.0]]}
-    return Experiment.parse(document | more)
+        run["dt"], switching = 1.0, {"transition": [[0.8, 0.2], [0.4, 0.6]]}
+    document = {"name": "case", "graphs": graphs, "noise": noise, "switching": switching, "run": run}
+    return Experiment.parse(document | more | changes)
 
 
 def loss_of(noise, i, j):
@@ -197,11 +191,8 @@ class Brute:
         return chain, law
 
     def maps(self):
-        found = []
-        for graph in range(self.n):
-            for pattern in self.patterns:
-                found.append(self.period(graph, dict(zip(self.lossy, pattern, strict=True))))
-        return np.stack(found)
+        every = itertools.product(range(self.n), self.patterns)
+        return np.stack([self.period(graph, dict(zip(self.lossy, lost, strict=True))) for graph, lost in every])
 
     def errors(self, moments):
         """(..., m) of E[x x^T] (..., m, m)."""
@@ -292,10 +283,8 @@ def test_bursts_as_short_as_those_of_independent_losses(pace, on_loss):
 
 
 def test_longer_bursts_of_a_held_value_are_worse():
-    errors = [
-        predict(line_and_ring(loss={"edges": [[2, 3, 0.5]]}, on_loss="hold", burst=b)).emulated.system_error
-        for b in (2, 8, 40)
-    ]
+    laws = [line_and_ring(loss={"edges": [[2, 3, 0.5]]}, on_loss="hold", burst=burst) for burst in (2, 8, 40)]
+    errors = [predict(law).emulated.system_error for law in laws]
     assert errors == sorted(errors)
 
 
@@ -303,11 +292,10 @@ def test_longer_bursts_of_a_held_value_are_worse():
 def test_dense_and_iterative_solutions_and_their_adjoint(case):
     prediction = predict(parse(case))
     system = prediction.system
-    dense = MomentSolver(system, method="dense")
-    steady = dense.steady()
-    np.testing.assert_allclose(steady, prediction.steady, rtol=1e-8, atol=1e-10)
+    dense = DenseSolver(system)
+    np.testing.assert_allclose(dense.steady(), prediction.steady, rtol=1e-8, atol=1e-10)
     form = system.output.T @ system.output
-    for solver in (dense, MomentSolver(system, method="krylov")):
+    for solver in (dense, IterativeSolver(system)):
         dual = solver.dual(form[None])[0]
         value = np.einsum("i,ij,jab,iab->", system.stationary, system.chain, dual, system.noise)
         assert value == pytest.approx(prediction.emulated.system_error, rel=1e-9)
@@ -319,10 +307,8 @@ def test_a_stationary_start_is_what_agents_are_and_have_heard(case):
     experiment = parse(case)
     prediction = predict(experiment)
     step = prediction.step
-    squares = [
-        np.diag(factor @ factor.T)
-        for factor in (stationary_start_factor(experiment, mode) for mode in range(step.modes))
-    ]
+    factors = np.stack([stationary_start_factor(experiment, mode) for mode in range(step.modes)])
+    squares = (factors**2).sum(axis=2)
     np.testing.assert_allclose(step.stationary @ squares, prediction.emulated.node_errors, rtol=1e-9)
     course = solve_transient(experiment, np.arange(3) * experiment.step_length).course
     np.testing.assert_allclose(course.node_errors[0], prediction.emulated.node_errors, rtol=1e-9, atol=1e-12)
@@ -353,16 +339,8 @@ def test_rates_are_eigenvalues_of_the_whole(case):
 
 
 def test_too_many_values_or_channels_are_refused():
-    many = Experiment.parse(
-        LINE_RING
-        | {
-            "graphs": {"a": {"complete": True}},
-            "agents": 41,
-            "switching": {"generator": [[0.0]]},
-            "noise": {"loss": 0.1, "on_loss": "hold"},
-            "run": {"dt": 0.01, "duration": 10},
-        }
-    )
+    changes = {"graphs": {"a": {"complete": True}}, "switching": {"generator": [[0.0]]}, "run": {"dt": 0.01}}
+    many = line_ring(agents=41, noise={"loss": 0.1, "on_loss": "hold"}, **changes)
     with pytest.raises(InputError, match="1640 links of 41 agents make 1681 values"):
         predict(many)
     with pytest.raises(InputError, match=r"noise.burst: 2 graphs and 10 links .* 2\^10 states"):
@@ -382,17 +360,7 @@ def test_unreduced_moments_have_the_same_disagreement(case):
 @pytest.mark.parametrize("case", ["held, by link, noisy", "real time, own", "real time, held"])
 def test_closed_form_for_two_graphs(case):
     """With losses that are kept from step to step, too; each graph must have an error of its own."""
-    graphs, noise, more = CASES[case]
-    pace = more.get("pace", "lockstep")
-    document = {
-        "name": "two",
-        "graphs": {"a": {"arcs": [[1, 2], [2, 3, 0.7], [3, 1]]}, "b": {"path": [1, 2, 3]}},
-        "switching": {"generator": [[-2.0, 2.0], [3.0, -3.0]]},
-        "noise": noise,
-        "run": {"dt": 0.3, "duration": 6, "pace": pace},
-    }
-    prediction = predict(Experiment.parse(document))
-    assert graphs is GRAPHS
+    prediction = predict(parse(case, graphs=GRAPHS | {"b": {"path": [1, 2, 3]}}))
     found = two_topology(prediction.system)
     np.testing.assert_allclose(found.node_errors, prediction.emulated.node_errors, rtol=1e-9)
 
@@ -401,13 +369,8 @@ def test_closed_form_for_two_graphs(case):
 @pytest.mark.parametrize("gain", [0.8, math.inf])
 def test_leaders(case, gain):
     """The value of a set is the prediction with these leaders; the oracle's for one of them."""
-    graphs, noise, more = CASES[case]
-    run = {"dt": 0.3, "duration": 6, "pace": more.get("pace", "lockstep"), "seed": 3}
-    document = {"name": "led", "graphs": graphs, "switching": {"generator": [[-2.0, 2.0], [3.0, -3.0]]}}
-    document |= {"noise": noise, "run": run}
-    consensus = Experiment.parse(document)
-    leaders = {"problem": "tracking", "leaders": {"agents": [3], "gain": gain}}
-    tracking = Experiment.parse(document | leaders)
+    consensus = parse(case)
+    tracking = consensus.with_leaders(3, gain=gain)
     found = system_error(consensus, [3], gain=gain)
     assert found == pytest.approx(predict(tracking).emulated.system_error, rel=1e-10)
     brute = Brute(case, tracking)
@@ -476,18 +439,10 @@ def test_the_radius_is_that_of_the_kronecker_powers(document):
     assert fourth_moment(step, prediction.system) == found
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        "held",
-        "own, by link",
-        "own, bursts",
-        "real time, own",
-        "real time, held",
-        "held, delay",
-        "real time, own, delay",
-    ],
-)
+OF_EVERY_KIND = "held", "own, by link", "own, bursts", "real time, own", "real time, held", "held, delay"
+
+
+@pytest.mark.parametrize("case", [*OF_EVERY_KIND, "real time, own, delay"])
 def test_fourth_moments_from_a_known_start(case):
     """E[y^4] without noise, over three steps of messages that are lost, late, held or used one after the other.
 
@@ -517,12 +472,8 @@ def test_fourth_moments_from_a_known_start(case):
         np.testing.assert_allclose(np.einsum("abcd,ia,ib,ic,id->i", tensor, *[rows] * 4), expected[k], rtol=1e-9)
         if len(alive) * len(maps) > 300_000:
             break
-        alive = [
-            (p * chain[mode, after], after, maps[mode] @ z)
-            for p, mode, z in alive
-            for after in range(len(maps))
-            if chain[mode, after] > 0.0
-        ]
+        moved = [(p, mode, maps[mode] @ z) for p, mode, z in alive]
+        alive = [(p * c, after, z) for p, mode, z in moved for after, c in enumerate(chain[mode].tolist()) if c > 0.0]
         stack = advance(steps, stack)
     assert k > 0
 
@@ -550,16 +501,8 @@ def test_means_with_weights_that_are_not_negative_have_light_tails(noise):
 
 def test_what_is_too_large_is_bounded():
     """20 agents: bounds only, and still finite, since every agent takes a mean."""
-    document = {
-        "name": "large",
-        "graphs": {"ring": {"cycle": list(range(1, 21))}, "star": {"star": {"center": 1}}},
-        "agents": 20,
-        "switching": {"generator": [[-1.0, 1.0], [1.0, -1.0]]},
-        "noise": {"process": 1.0, "loss": 0.2},
-        "run": {"dt": 0.05, "duration": 5.0},
-    }
-    _, prediction = of(document)
-    found = prediction.fourth_moment
+    graphs = {"ring": {"cycle": list(range(1, 21))}, "star": {"star": {"center": 1}}}
+    found = predict(line_ring(20, graphs=graphs, noise={"loss": 0.2})).fourth_moment
     assert found.radius is None
     assert found.lower == pytest.approx(found.upper**2)
     assert found.finite

@@ -1,15 +1,18 @@
 """Second moments against the paper's full Kronecker formulas, scipy and plain recursion."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from switching_systems import generator
+from switching_systems import generator, steady_of
 from switching_systems import system as switching
 
 from msg_analysis.errors import InputError
-from msg_analysis.theory import moments, solvers
-from msg_analysis.theory.moments import MomentSolver, mode_potential
+from msg_analysis.theory.jump_system import JumpSystem
+from msg_analysis.theory.moments import MomentSolver, mode_potential, transient_mean
+from msg_analysis.theory.solvers import DenseSolver
 
 MODELS = settings(max_examples=25, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
@@ -49,6 +52,7 @@ def test_poisson_equation(seed, m, n):
     dual = solver.dual(form[None])
     means, kappa = mode_potential(system, dual)
     assert means[0] == pytest.approx(np.trace(form @ solver.steady().sum(axis=0)), rel=1e-10)
+    assert kappa[0] @ system.stationary == pytest.approx(0.0, abs=1e-9 * means[0])
     y = random.standard_normal(m - 1)
     for g in range(n):
         w, noise = system.matrices[g], system.noise[g]
@@ -60,21 +64,104 @@ def test_poisson_equation(seed, m, n):
         assert now - after == pytest.approx(y @ form @ y - means[0], rel=1e-8, abs=1e-8)
 
 
-def test_too_large_says_the_size(monkeypatch):
-    monkeypatch.setattr(solvers, "MAX_UNKNOWNS", 10)
-    system = switching(np.random.default_rng(8), 4, generator(np.random.default_rng(9), 2))
-    with pytest.raises(InputError, match="2 graphs of 4 agents give 12 coupled unknowns"):
-        MomentSolver(system, method="dense")
+@pytest.mark.parametrize("size", [1.0, 1e-20])
+@pytest.mark.parametrize("steps", [1, 2, 8, 9, 60, 10**9])
+def test_the_mean_over_the_steps_from_a_known_start(steps, size):
+    """Step after step from the definition; of a billion, few differ from the steady state."""
+    random = np.random.default_rng(3)
+    system = switching(random, 4, generator(random, 3, 40.0), dt=0.05)
+    system = dataclasses.replace(system, noise=size * system.noise)
+    y, first = 9.0 * np.sqrt(size) * random.standard_normal(3), np.array([0.2, 0.8, 0.0])
+    moments, law, total, steady = first[:, None, None] * np.outer(y, y), first, 0.0, steady_of(system)
+    for _ in range(min(steps, 3000)):
+        total = total + moments.sum(axis=0)
+        after = system.matrices @ moments @ system.matrices.transpose(0, 2, 1) + law[:, None, None] * system.noise
+        moments, law = np.tensordot(system.chain, after, axes=(0, 0)), law @ system.chain
+    total += max(steps - 3000, 0) * steady.sum(axis=0)
+    found = transient_mean(system, steady, first[:, None, None] * np.outer(y, y), first, steps)
+    np.testing.assert_allclose(found, total / steps, rtol=1e-11, atol=1e-13 * size)
 
 
-def test_adjoint_solutions_are_kept_while_they_are_small(monkeypatch):
+def test_a_start_with_steady_moments_under_another_graph_leaves_them():
+    random = np.random.default_rng(3)
+    system = switching(random, 4, generator(random, 2, 1.0), dt=0.05)
+    steady, first = steady_of(system), np.array([1.0, 0.0])
+    found = transient_mean(system, steady, steady, first, 2)
+    after, _ = system.advance(steady, first)
+    np.testing.assert_allclose(found, (steady + after).sum(axis=0) / 2, rtol=1e-12)
+
+
+@pytest.mark.parametrize("noise", [1.0, 1e-9, 0.0])
+def test_the_claimed_error_is_what_rounding_of_the_matrices_may_leave(noise):
+    """Coordinates that do not act on each other, one of them slow: every moment from two equations."""
+    drift, q = np.array([[1.0, 1e-4], [3.0, 2e-4]]), noise * np.array([[1.0, 2.0], [0.5, 4.0]])
+    gamma, law = np.array([[-1.0, 1.0], [3.0, -3.0]]), np.array([0.75, 0.25])
+    diagonals = [np.linalg.solve(2.0 * np.diag(z) - gamma.T, law * own) for z, own in zip(drift.T, q.T, strict=True)]
+    moments = np.stack([np.diag(c) for c in np.transpose(diagonals)])
+    stacks = [np.stack([np.diag(row) for row in rows]) for rows in (drift, q)]
+    solver = MomentSolver(JumpSystem("continuous", *stacks, gamma, law, np.eye(2)))
+    assert solver.report is None
+    np.testing.assert_allclose(solver.steady(), moments, rtol=1e-9, atol=1e-15 * noise)
+    terms = 2.0 * (0.75 * 1.0 + 0.25 * 3.0) * max(np.linalg.norm(c) / p for c, p in zip(moments, law, strict=True))
+    sizes = np.linalg.norm(q, axis=1)
+    expected = 8.0 * 2.0**-52 * terms / (0.75 * sizes[0] + 0.25 * sizes[1]) if noise else 0.0
+    assert solver.report.error == pytest.approx(expected, rel=1e-6, abs=0.0)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-3, 1e3])
+def test_no_positive_solution_is_refused_and_nothing_that_is_zero(size):
+    """A moment may be negative by 1e-6 of the largest one, as rounding leaves it, and no more."""
+    z = np.stack([np.diag([1.0, 1.0, 2.0])])
+
+    def steady(least):
+        noise = size * np.stack([np.diag([0.0, 2.0, 4.0 * least])])
+        return MomentSolver(JumpSystem("continuous", z, noise, np.zeros((1, 1)), np.ones(1), np.eye(3))).steady()
+
+    np.testing.assert_allclose(steady(-0.9e-6)[0], size * np.diag([0.0, 1.0, -0.9e-6]), rtol=1e-12)
+    with pytest.raises(InputError, match="no positive solution, so the errors grow without bound"):
+        steady(-1.1e-6)
+
+
+@pytest.mark.parametrize("dt", [None, 0.05])
+def test_a_guess_saves_iterations_and_changes_nothing(dt):
+    random = np.random.default_rng(9)
+    gamma = generator(random, 3)
+    first = switching(np.random.default_rng(1), 15, gamma, dt=dt)
+    second = switching(np.random.default_rng(1), 15, gamma * (1 + 1e-4), dt=dt)
+    start = MomentSolver(first).steady()
+    cold, warm = MomentSolver(second), MomentSolver(second, guess=start)
+    np.testing.assert_allclose(warm.steady(), cold.steady(), rtol=1e-10, atol=1e-12)
+    assert warm.report.iterations < cold.report.iterations
+
+
+def test_a_guess_for_another_system_is_refused():
+    random = np.random.default_rng(9)
+    model = switching(random, 5, generator(random, 2))
+    with pytest.raises(InputError, match=r"guess: shape \(2, 3, 3\).*\(2, 4, 4\)"):
+        MomentSolver(model, guess=np.zeros((2, 3, 3)))
+
+
+def test_systems_without_coordinates():
+    empty = np.zeros((1, 0, 0))
+    solver = MomentSolver(JumpSystem("continuous", empty, empty, np.zeros((1, 1)), np.ones(1), np.zeros((2, 0))))
+    assert solver.steady().shape == (1, 0, 0)
+    assert solver.report.method == "dense"
+
+
+def test_too_large_says_the_size():
     system = switching(np.random.default_rng(8), 4, generator(np.random.default_rng(9), 2))
-    solver = MomentSolver(system)
+    with pytest.raises(InputError, match=r"2 graphs of 4 agents give 12 coupled unknowns.* at most 11 are"):
+        DenseSolver(system, most_unknowns=11)
+    DenseSolver(system, most_unknowns=12)
+
+
+def test_adjoint_solutions_are_kept_while_they_are_small():
+    system = switching(np.random.default_rng(8), 4, generator(np.random.default_rng(9), 2))
+    solver = MomentSolver(system, most_kept=2 * 2 * 3 * 3)
     one, other = np.eye(3)[None], np.diag([1.0, 2.0, 3.0])[None]
     first, second = solver.dual(one), solver.dual(other)
     assert solver.dual(one.copy()) is first
     assert not first.flags.writeable
-    monkeypatch.setattr(moments, "MAX_KEPT", first.size + second.size)
     third = solver.dual(one + other)
     assert solver.dual(other) is second
     assert solver.dual(one + other) is not third

@@ -61,13 +61,9 @@ def test_one_graph_is_resistance_and_information_centrality(graph, oracle):
 
 
 def test_one_grounded_leader_is_half_the_sum_of_resistances():
-    prediction = predict(
-        one_graph(
-            {"edges": [[1, 2], [2, 3], [3, 1], [3, 4]]},
-            problem="tracking",
-            leaders={"agents": [3], "gain": float("inf"), "reference": 1.0},
-        )
-    )
+    leaders = {"agents": [3], "gain": float("inf"), "reference": 1.0}
+    graph = {"edges": [[1, 2], [2, 3], [3, 1], [3, 4]]}
+    prediction = predict(one_graph(graph, problem="tracking", leaders=leaders))
     information = nx.information_centrality(nx.Graph([(0, 1), (1, 2), (2, 0), (2, 3)]))
     assert prediction.continuous.system_error == pytest.approx(0.5 / information[2], rel=1e-10)
     assert prediction.continuous.node_errors[2] == 0.0

@@ -8,8 +8,8 @@ import pytest
 
 from experiments import line_ring, predict, simulate
 from msg_analysis.model.graph_path import past_modes
-from msg_analysis.model.phases import phases
-from msg_analysis.model.step_model import build_run_model, build_step_model, ideal_uses, sequential
+from msg_analysis.model.reception import ideal_uses
+from msg_analysis.model.step_model import build_run_model, build_step_model, phases, sequential
 
 CORRELATED = [[1.0, 0.3, 0.0, 0.0], [0.0, 0.5, 0.2, 0.0], [0.0, 0.0, 2.0, 0.0], [0.1, 0.0, 0.0, 0.7]]
 GRAPHS = {"a": {"path": [1, 2, 3, 4]}, "b": {"arcs": [[1, 2], [2, 3, 2.0], [3, 1], [1, 3], [3, 4], [4, 1]]}}

@@ -95,9 +95,8 @@ def test_long_runs(law: str) -> None:
     experiment = of(law, duration=20_000 if law == "discrete" else 2000, replicas=8, seed=11)
     prediction = predict(experiment)
     states, dt = experiment.simulate().states, prediction.step.dt
-    errors = states - (
-        states.mean(axis=1, keepdims=True) if experiment.problem == "consensus" else experiment.reference
-    )
+    consensus = experiment.problem == "consensus"
+    errors = states - (states.mean(axis=1, keepdims=True) if consensus else experiment.reference)
     frequencies, measured = scipy.signal.welch(errors, fs=1.0 / dt, nperseg=1024, detrend=False, axis=0)
     predicted = spectrum(prediction, np.array([0]), frequencies).node_densities.sum(axis=1)
     for band in np.array_split(np.arange(4, 512), 6):

@@ -38,10 +38,8 @@ def by_brute_force(prediction: Prediction, patterns: list[list[tuple[float, np.n
         """Sum over the six ways to give two places to a and the other two to b."""
         product = np.multiply.outer(a.reshape(d, d), b.reshape(d, d))
         other = np.multiply.outer(b.reshape(d, d), a.reshape(d, d))
-        total = sum(
-            each.transpose(order) for each in (product, other) for order in ((0, 1, 2, 3), (0, 2, 1, 3), (0, 2, 3, 1))
-        )
-        return np.asarray(total).ravel()
+        orders = (0, 1, 2, 3), (0, 2, 1, 3), (0, 2, 3, 1)
+        return np.asarray(sum(each.transpose(order) for each in (product, other) for order in orders)).ravel()
 
     twice = [sum(p * np.kron(w, w) for p, w in some) for some in patterns]
     four = [sum(p * np.kron(np.kron(w, w), np.kron(w, w)) for p, w in some) for some in patterns]
@@ -54,16 +52,9 @@ def by_brute_force(prediction: Prediction, patterns: list[list[tuple[float, np.n
 
     second = steady(twice, [law[i] * noise[i] for i in range(n)])
     moved = [twice[i] @ second[i] for i in range(n)]
-    fourth = steady(
-        four, [symmetrized(moved[i], noise[i]) + law[i] * symmetrized(noise[i], noise[i]) / 2.0 for i in range(n)]
-    )
-    of_path = steady(
-        four,
-        [
-            np.kron(moved[i], noise[i]) + np.kron(noise[i], moved[i]) + law[i] * np.kron(noise[i], noise[i])
-            for i in range(n)
-        ],
-    )
+    triples = list(zip(moved, noise, law, strict=True))
+    fourth = steady(four, [symmetrized(m, q) + p * symmetrized(q, q) / 2.0 for m, q, p in triples])
+    of_path = steady(four, [np.kron(m, q) + np.kron(q, m) + p * np.kron(q, q) for m, q, p in triples])
     square = np.eye(d).ravel()
     mean = float((second @ square).sum())
     found = []
@@ -73,10 +64,8 @@ def by_brute_force(prediction: Prediction, patterns: list[list[tuple[float, np.n
         total = -float((state @ square).sum())
         for _ in range(20000):
             total += 2.0 * float((state @ square).sum())
-            state, weight = (
-                system.chain.T @ np.stack([twice[i] @ state[i] + weight[i] * noise[i] for i in range(n)]),
-                system.chain.T @ weight,
-            )
+            after = np.stack([twice[i] @ state[i] + weight[i] * noise[i] for i in range(n)])
+            state, weight = system.chain.T @ after, system.chain.T @ weight
             if np.abs(state).max() < 1e-13:
                 break
         found.append(total)

@@ -11,13 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from switching_systems import LINE_RING, network, steady_of
 
-from experiments import Experiment, predict
+from experiments import Experiment, line_ring, predict
 from msg_analysis.errors import InputError
 from msg_analysis.theory import jump_system as systems
-from msg_analysis.theory import rational_krylov, transient
+from msg_analysis.theory import transient
+from msg_analysis.theory.rational_krylov import RationalFlow
 from msg_analysis.theory.settling import asymptotic_rates, settling_time
 from msg_analysis.theory.transient import point_start, start_of, unreduced_consensus
 
+PROBLEMS = "consensus", "tracking"
 MODELS = settings(max_examples=20, deadline=None, derandomize=True)
 
 
@@ -44,7 +46,7 @@ def kronecker(experiment, start, law, time):
 @MODELS
 @given(st.integers(0, 1000), st.integers(2, 4), st.integers(1, 3), st.booleans(), st.floats(0.01, 20.0))
 def test_continuous_time_is_the_papers(seed, m, n, tracking, time):
-    experiment = network(seed, m, n, problem="tracking" if tracking else "consensus")
+    experiment = network(seed, m, n, problem=PROBLEMS[tracking])
     random = np.random.default_rng(seed)
     place, law = random.standard_normal(m), random.dirichlet(np.ones(n))
     pi, nu, c = kronecker(experiment, place, law, time)
@@ -69,17 +71,9 @@ def test_continuous_time_is_the_papers(seed, m, n, tracking, time):
 @given(st.integers(0, 1000), st.integers(2, 4), st.integers(1, 3), st.sampled_from(["discrete", "loss", "tracking"]))
 def test_steps_are_the_plain_recursion(seed, m, n, kind):
     """In full coordinates, one term after the other; small systems by powers and large ones by steps."""
-    experiment = network(
-        seed,
-        m,
-        n,
-        time="discrete" if kind == "discrete" else "continuous",
-        problem="tracking" if kind == "tracking" else "consensus",
-    )
-    if kind == "loss":
-        document = experiment.to_document()
-        document["noise"]["loss"] = 0.2
-        experiment = Experiment.parse(document)
+    time, problem = "discrete" if kind == "discrete" else "continuous", PROBLEMS[kind == "tracking"]
+    experiment = network(seed, m, n, time=time, problem=problem)
+    experiment = experiment.with_noise(loss=0.2) if kind == "loss" else experiment
     prediction = predict(experiment)
     step = prediction.step
     random = np.random.default_rng(seed)
@@ -165,9 +159,7 @@ def test_stiff_systems(rate, gain):
 @pytest.mark.parametrize("kind", ["consensus", "tracking", "directed", "unreduced"])
 def test_large_systems_are_reduced_without_loss(rate, kind):
     """The rational Krylov space against powers of the whole, over times from the fastest to beyond the slowest."""
-    experiment = network(
-        9, 9, 3, problem="tracking" if kind == "tracking" else "consensus", directed=kind == "directed"
-    )
+    experiment = network(9, 9, 3, problem=PROBLEMS[kind == "tracking"], directed=kind == "directed")
     system = unreduced_consensus(experiment) if kind == "unreduced" else systems.continuous(experiment)
     system = dataclasses.replace(system, chain=rate * system.chain)
     steady = None if kind == "unreduced" else steady_of(system)
@@ -184,10 +176,7 @@ def test_large_systems_are_reduced_without_loss(rate, kind):
 def test_sixty_agents_in_continuous_time():
     """A path that gains an edge at times, against one graph's closed form when the chain is left out."""
     m = 60
-    document = LINE_RING | {
-        "graphs": {"line": {"path": list(range(1, m + 1))}, "ring": {"cycle": list(range(1, m + 1))}}
-    }
-    experiment = Experiment.parse(document)
+    experiment = line_ring(m, 0.5)
     system = systems.held(systems.continuous(experiment), 0)
     values = np.linalg.eigvalsh(experiment.graph_list[0].laplacian)[1:]
     times = np.array([0.0, 0.01, 1.0, 30.0, 1e4])
@@ -234,12 +223,11 @@ def test_delay_and_loss():
     np.testing.assert_allclose(found.node_errors[2], prediction.emulated.node_errors, rtol=1e-10)
 
 
-def test_memory_of_large_systems(monkeypatch):
+def test_memory_of_large_systems():
     system = systems.continuous(Experiment.parse(LINE_RING))
-    monkeypatch.setattr(rational_krylov, "MAX_BYTES", 1.0)
-    start, steady = point_start(system, np.zeros(5)), steady_of(system)
-    with pytest.raises(InputError, match="GB in continuous time"):
-        transient.transient(system, start, np.array([1.0]), steady, most_unknowns=1)
+    stack = transient.joint_stack(point_start(system, np.zeros(5)))
+    with pytest.raises(InputError, match=r"2 graphs of 5 agents need 0.0 GB in continuous time"):
+        RationalFlow(system, stack, 1.0, decays=False, most_bytes=1.0)
 
 
 def test_what_is_refused():
@@ -303,7 +291,7 @@ def test_settled_from_the_start_and_slow_graphs():
 @pytest.mark.parametrize("tracking", [False, True])
 @pytest.mark.parametrize("time", ["continuous", "discrete"])
 def test_asymptotic_rates_are_those_of_the_full_matrices(tracking, time):
-    experiment = network(3, 4, 3, time=time, problem="tracking" if tracking else "consensus", directed=False)
+    experiment = network(3, 4, 3, time=time, problem=PROBLEMS[tracking], directed=False)
     system = systems.continuous(experiment) if time == "continuous" else predict(experiment).system
     d, eye = system.dimension, np.eye(system.dimension)
     blocks = scipy.linalg.block_diag

@@ -1,7 +1,6 @@
 """The two-topology closed forms against Kronecker algebra as printed, the coupled solver, and many digits."""
 
 import dataclasses
-import itertools
 from decimal import localcontext
 
 import numpy as np
@@ -10,48 +9,16 @@ import scipy.linalg
 from digits import DIGITS, exactly, solve
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from switching_systems import network
 
-from experiments import Experiment, predict
+from experiments import predict
 from msg_analysis.errors import InputError
 from msg_analysis.theory import jump_system as systems
+from msg_analysis.theory.graph_indices import MAX_UNKNOWNS, two_topology
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.two_graphs import MAX_UNKNOWNS, two_topology
 
 MODELS = settings(max_examples=25, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
-
-
-def random_experiment(
-    seed, m, *, problem="consensus", gain=1.0, time="continuous", directed=False, equal=False, dt=0.01
-):
-    random = np.random.default_rng(seed)
-    graphs = {}
-    for name in ("first", "second"):
-        order = random.permutation(m) + 1
-        links = {(int(a), int(b)): random.uniform(0.2, 2.0) for a, b in itertools.pairwise(order)}
-        for a, b in random.integers(1, m + 1, (m, 2)):
-            if a != b and (int(a), int(b)) not in links and (directed or (int(b), int(a)) not in links):
-                links[int(a), int(b)] = random.uniform(0.2, 2.0)
-        if directed:  # and both ways along the path, so that each graph holds everybody together
-            links |= {(int(b), int(a)): 0.3 for a, b in itertools.pairwise(order)}
-        graphs[name] = {"arcs" if directed else "edges": [[a, b, w] for (a, b), w in links.items()]}
-    q12, q21 = random.uniform(0.05, 0.95, 2)
-    document = {
-        "name": "random",
-        "problem": problem,
-        "time": time,
-        "graphs": graphs,
-        "agents": m,
-        "noise": {"process": 1.0 if equal else random.standard_normal((m, m)).tolist()},
-        "run": {"dt": dt, "duration": 100 * dt} if time == "continuous" else {"duration": 10},
-    }
-    if time == "continuous":
-        document["switching"] = {"generator": [[-q12, q12], [q21, -q21]]}
-    else:
-        document["switching"] = {"transition": [[1 - q12, q12], [q21, 1 - q21]]}
-    if problem == "tracking":
-        document["leaders"] = {"agents": [1], "gain": gain}
-    return Experiment.parse(document)
 
 
 def with_rate(system, rate):
@@ -87,7 +54,7 @@ def printed_consensus(experiment):
 @MODELS
 @given(seeds, st.integers(2, 5))
 def test_consensus_is_the_formula_of_the_paper(seed, m):
-    experiment = random_experiment(seed, m)
+    experiment = network(seed, m, 2, directed=False)
     static, error = printed_consensus(experiment)
     found = two_topology(systems.continuous(experiment))
     np.testing.assert_allclose(found.static, static, rtol=1e-9)
@@ -103,14 +70,9 @@ def test_consensus_is_the_formula_of_the_paper(seed, m):
     st.booleans(),
 )
 def test_closed_form_is_the_solution_of_the_coupled_equations(seed, m, problem, law, directed):
-    experiment = random_experiment(
-        seed,
-        m,
-        problem="consensus" if problem == "consensus" else "tracking",
-        gain=np.inf if problem == "grounded" else 0.7,
-        time="discrete" if law == "discrete" else "continuous",
-        directed=directed,
-    )
+    gain, time = np.inf if problem == "grounded" else 0.7, "discrete" if law == "discrete" else "continuous"
+    kind = "consensus" if problem == "consensus" else "tracking"
+    experiment = network(seed, m, 2, problem=kind, gain=gain, time=time, directed=directed, dt=0.01)
     system = systems.continuous(experiment) if law == "continuous" else predict(experiment).system
     covariance = system.lifted(MomentSolver(system).steady().sum(axis=0))
     found = two_topology(system)
@@ -125,7 +87,7 @@ def test_closed_form_is_the_solution_of_the_coupled_equations(seed, m, problem, 
 @given(seeds, st.integers(2, 5), st.sampled_from(["continuous", "discrete"]))
 def test_noise_and_loss_that_depend_on_the_graph(seed, m, time):
     random = np.random.default_rng(seed)
-    experiment = random_experiment(seed, m, time=time)
+    experiment = network(seed, m, 2, time=time, directed=False, dt=0.01)
     system = systems.continuous(experiment) if time == "continuous" else predict(experiment).system
     d = system.dimension
     f = random.standard_normal((2, d, d))
@@ -152,7 +114,7 @@ def exact_error(z, pi, q, beta):
 @pytest.mark.parametrize("gain", [None, 1e-3, 1e6, np.inf])
 def test_any_rate_to_high_precision(rate, gain):
     problem = "consensus" if gain is None else "tracking"
-    experiment = random_experiment(3, 4, problem=problem, gain=gain if gain is not None else 1.0, dt=1e-8)
+    experiment = network(3, 4, 2, problem=problem, gain=gain or 1.0, directed=False, dt=1e-8)
     system = with_rate(systems.continuous(experiment), rate)
     pi = [system.stationary[0], 1 - system.stationary[0]]
     exact = exact_error(system.matrices, pi, system.noise[0], rate)
@@ -162,7 +124,8 @@ def test_any_rate_to_high_precision(rate, gain):
 @MODELS
 @given(seeds, st.integers(2, 5), st.sampled_from(["continuous", "discrete"]), st.booleans())
 def test_equal_noise_makes_switching_help_the_more_the_faster(seed, m, time, tracking):
-    experiment = random_experiment(seed, m, time=time, equal=True, problem="tracking" if tracking else "consensus")
+    problem = "tracking" if tracking else "consensus"
+    experiment = network(seed, m, 2, time=time, noise=1.0, problem=problem, directed=False, dt=0.01)
     system = systems.continuous(experiment) if time == "continuous" else predict(experiment).system
     fastest = 1.0 / system.stationary.max()  # no probability above 1
     rates = np.geomspace(1e-4, 1e4, 9) if time == "continuous" else np.linspace(0.05, 1.0, 9) * fastest
@@ -172,13 +135,13 @@ def test_equal_noise_makes_switching_help_the_more_the_faster(seed, m, time, tra
 
 
 def test_fast_limits():
-    experiment = random_experiment(8, 5)
+    experiment = network(8, 5, 2, directed=False)
     system = systems.continuous(experiment)
     averaged = np.tensordot(system.stationary, system.matrices, axes=1)
     slowest = scipy.linalg.solve_continuous_lyapunov(averaged, system.noise[0])
     found = two_topology(system)
     np.testing.assert_allclose(found.static + found.fast, np.diag(system.lifted(slowest)), rtol=1e-10)
-    discrete = predict(random_experiment(8, 5, time="discrete")).system
+    discrete = predict(network(8, 5, 2, time="discrete", directed=False)).system
     found = two_topology(discrete)
     independent = two_topology(with_rate(discrete, 1.0))
     np.testing.assert_allclose(found.fast, independent.switching, rtol=1e-10)
@@ -186,7 +149,7 @@ def test_fast_limits():
 
 def test_graphs_that_hardly_differ_lose_nothing():
     """Relative accuracy of a switching term of 1e-14 of the error: its leading order is quadratic in the difference."""
-    experiment = random_experiment(4, 4)
+    experiment = network(4, 4, 2, directed=False)
     system = systems.continuous(experiment)
     first = system.matrices[0]
     change = system.matrices[1] - first
@@ -198,20 +161,16 @@ def test_graphs_that_hardly_differ_lose_nothing():
 
 
 def test_what_is_refused():
-    document = random_experiment(1, 3).to_document()
-    document["graphs"] = {"first": {"edges": [[1, 2]]}, "second": {"edges": [[2, 3]]}}
+    experiment = network(1, 3, 2)
+    pieces = experiment.with_graphs({"g0": {"edges": [[1, 2]]}, "g1": {"edges": [[2, 3]]}})
     with pytest.raises(InputError, match="graph 1 held fixed has no steady error"):
-        two_topology(systems.continuous(Experiment.parse(document)))
-    system = systems.continuous(random_experiment(1, 3))
+        two_topology(systems.continuous(pieces))
+    system = systems.continuous(experiment)
     with pytest.raises(InputError, match="1 graphs, expected 2"):
         two_topology(systems.held(system, 0))
     m = 80
-    large = dataclasses.replace(
-        system,
-        matrices=np.broadcast_to(np.eye(m), (2, m, m)),
-        noise=np.broadcast_to(np.eye(m), (2, m, m)),
-        lift=np.eye(m),
-    )
+    both = np.broadcast_to(np.eye(m), (2, m, m))
+    large = dataclasses.replace(system, matrices=both, noise=both, lift=np.eye(m))
     assert m * (m + 1) // 2 > MAX_UNKNOWNS
     with pytest.raises(InputError, match="80 agents"):
         two_topology(large)

@@ -11,11 +11,9 @@ import pytest
 from experiments import Completeness, Experiment, Run, check, flipped, new_record, stored
 from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK
 from msg_analysis.arithmetic.update_law import from_payload, to_payload
-from msg_analysis.model.agent_law import agent_law
+from msg_analysis.model.agent_law import ProcessNoise, agent_law
 from msg_analysis.model.graph_path import mode_path
-from msg_analysis.model.phases import phases
-from msg_analysis.model.process_noise import ProcessNoise
-from msg_analysis.model.step_model import build_step_model
+from msg_analysis.model.step_model import build_step_model, phases
 from msg_analysis.twin.log_replay import replay
 
 DT = 50_000_000  # ns
@@ -39,9 +37,7 @@ def emulate(experiment: Experiment, seed: int) -> Run:
     rng = np.random.default_rng(seed)
     steps, agents = experiment.steps, experiment.agents
     due = (np.arange(steps)[:, None] + phases(experiment)) * DT
-    late = np.where(
-        rng.random(due.shape) < 0.1, rng.exponential(3 * DT, due.shape), rng.exponential(DT / 50, due.shape)
-    )
+    late = np.where(rng.random(due.shape) < 0.1, 3 * DT, DT / 50) * rng.exponential(size=due.shape)
     made = np.zeros((steps + 1, agents), dtype=np.int64)
     made[1:] = np.maximum.accumulate(due + late, axis=0) + np.arange(1, steps + 1)[:, None]
     delay = rng.exponential(DT / 10, (steps + 1, agents))  # until others have it
@@ -144,9 +140,7 @@ def test_each_step_is_that_of_the_agent(run: Run) -> None:
     graphs = random.integers(-1, 2, (count, m))
     used = np.arange(count - 1)[:, None, None] - random.geometric(0.3, run.used.shape)
     used = np.where(random.random(used.shape) < 0.1, -1, np.maximum(used, -1))
-    log = dataclasses.replace(
-        run, record=record, states=states, published=published, agent_modes=graphs, used=used, made=run.made
-    )
+    log = dataclasses.replace(run, record=record, states=states, published=published, agent_modes=graphs, used=used)
     blocks = list(replay(log))
     found = np.concatenate([block.states for block in blocks])
     said = np.concatenate([block.published for block in blocks if block.published is not None])

@@ -35,10 +35,10 @@ RUNS: dict[str, dict[str, Any]] = {
 }
 
 
-def experiment(case: str, steps: int, replicas: int = 2) -> Experiment:
+def experiment(case: str, steps: int, replicas: int = 2, agents: int = 5) -> Experiment:
     changes = RUNS[case]
     run = {"duration": 0.05 * steps, "replicas": replicas, "seed": 5} | changes.get("run", {})
-    return line_ring(5, **changes | {"run": run})
+    return line_ring(agents, **changes | {"run": run})
 
 
 @pytest.mark.parametrize("case", RUNS)
@@ -62,23 +62,23 @@ def test_the_same_in_files(case: str, tmp_path: Path, monkeypatch: pytest.Monkey
 def test_check_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice the steps need hardly more memory: 8 bytes of each step for its graph, and as much for a copy."""
     monkeypatch.setattr(arrays, "LARGE", 1)
-    runs = [simulate(experiment(case, steps)) for steps in (768, 1_280)]
+    runs = [simulate(experiment(case, steps, replicas=4, agents=3)) for steps in (768, 1_280)]
     short, long = (_peak(lambda run=run: check(run)) for run in runs)
     assert long - short < 512 * 32
 
 
 @pytest.mark.parametrize("case", ["real time", "protocol in real time"])
 def test_comparison_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Twice the steps need at most some numbers more for each; its states alone have 320 bytes."""
+    """Twice the steps need at most some numbers more for each; its states alone have 192 bytes."""
     monkeypatch.setattr(arrays, "LARGE", 1)
     monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 4_000)
     whole = Observation.of
     monkeypatch.setattr(Observation, "of", lambda *of: dataclasses.replace(whole(*of), block_numbers=400))
-    runs = [simulate(experiment(case, steps, replicas=8)) for steps in (200, 400)]
+    runs = [simulate(experiment(case, steps, replicas=8, agents=3)) for steps in (100, 200)]
     for run in runs:  # what is kept for comparisons to come
         compare(run)
     short, long = (_peak(lambda run=run: compare(run)) for run in runs)
-    assert long - short < 200 * 160
+    assert long - short < 100 * 96
 
 
 def _peak(work: Callable[[], object]) -> int:
