@@ -37,7 +37,7 @@ TESTS = {
     "tests/analysis/theory/test_solvers.py -k 'not test_solvers or converge or dense'",
     "analysis/msg_analysis/inference/verdict.py": "tests/analysis/inference/test_compare.py",
     "analysis/msg_analysis/bags/salvage.py": "tests/analysis/bags/test_trajectory_writer_and_salvage.py -k 'not 00'",
-    "analysis/msg_analysis/messages/acceptance.py": "tests/analysis/wire/test_receiving.py",
+    "analysis/msg_analysis/messages/acceptance.py": "tests/analysis/messages/test_acceptance.py",
 }
 ENOUGH = 0.85  # of all changes
 OURS = ("msg_", "test", "conftest", "_pytest", "__main__", "rclpy")  # not imported before the fork
