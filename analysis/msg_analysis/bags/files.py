@@ -241,10 +241,16 @@ class FileInventory:
     """One file: what it holds and what is wrong with it, complete once ``watch`` has run to its end."""
 
     file: StoredFile
-    count: FileCount
+    count: FileCount = field(init=False)
     summary: Summary | None = None  # None where the file has none that is correct
     stated_messages: int | None = None  # how many messages its summary says that it has
     problem: str | None = None  # why nothing of the file can be read
+    # By number: a topic that takes an old number later counts as the old one, as for other readers.
+    _channels: dict[int, ChannelCount] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Count from the start."""
+        self.count = FileCount(self.file.path.name)
 
     def watch(self) -> Iterator[Batch]:
         """The batches of the file, counted as they pass."""
@@ -264,11 +270,12 @@ class FileInventory:
             self.summary, self.stated_messages = summary_of(self.file.path)
 
     def _channel(self, number: int) -> ChannelCount:
-        channel = self.file.channels[number]
-        if channel.topic not in self.count.channels:
+        if number not in self._channels:
+            channel = self.file.channels[number]
             schema = self.file.schemas.get(channel.schema_id)
-            self.count.channels[channel.topic] = channel_count(channel, schema.name if schema else "")
-        return self.count.channels[channel.topic]
+            new = channel_count(channel, schema.name if schema else "")
+            self._channels[number] = self.count.channels.setdefault(channel.topic, new)
+        return self._channels[number]
 
     @property
     def whole(self) -> bool:
@@ -289,18 +296,6 @@ class FileInventory:
         """Compression of its chunks: "none", "zstd", "lz4", or several; None without a summary or chunks."""
         kinds = {index.compression or "none" for index in self.summary.chunk_indexes} if self.summary else set()
         return ", ".join(sorted(kinds)) or None
-
-
-@dataclass(slots=True)
-class Inventory:
-    """All files of a bag, in their order."""
-
-    files: list[FileInventory] = field(default_factory=list)
-
-    def add(self, file: StoredFile) -> FileInventory:
-        """Add a file that has not been read yet."""
-        self.files.append(FileInventory(file, FileCount(file.path.name)))
-        return self.files[-1]
 
 
 def summary_of(file: Path) -> tuple[Summary | None, int | None]:

@@ -24,7 +24,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
-from msg_analysis.bags.files import Inventory, bag_files, first_file, stored_file
+from msg_analysis.bags.files import FileInventory, bag_files, first_file, stored_file
 from msg_analysis.bags.mcap_reading import MAGIC, RECORD
 from msg_analysis.bags.mcap_writing import RECORD_NAME
 from msg_analysis.bags.states import Collector
@@ -60,7 +60,7 @@ MOST_SEARCHED = 16 << 20  # bytes of messages in which the record of another rec
 MOST_RECORDS = 100  # different run records that a bag may have: reading each takes milliseconds
 
 
-def read_bag(path: str | Path, inventory: Inventory | None = None) -> Run:
+def read_bag(path: str | Path, inventory: list[FileInventory] | None = None) -> Run:
     """The run in a bag of msg-agents, the twin or ``ros2 bag``; torn and damaged bags as far as possible.
 
     Parameters
@@ -68,7 +68,7 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Run:
     path
         directory of a bag, or one of its files (.mcap, .db3)
     inventory
-        filled with what the files hold, even if no run can be made of it
+        gets what the files hold, even if no run can be made of it
 
     Raises
     ------
@@ -83,9 +83,11 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Run:
     files = bag_files(path)
     for number, file in enumerate(files):
         tell(f"reading {path.name}", number, len(files))
-        entry = (inventory or Inventory()).add(stored_file(file))
+        entry = FileInventory(stored_file(file))
+        if inventory is not None:
+            inventory.append(entry)
         try:
-            contents.read(entry.file, entry.watch() if inventory else entry.file.batches())
+            contents.read(entry.file, entry.file.batches() if inventory is None else entry.watch())
         except BagError as error:  # the recorder died just after it made the file, or its start is damaged
             entry.problem = str(error)
             unreadable.append(error)

@@ -99,8 +99,8 @@ class RunRecord:
     matrices
         of a step, in discrete time or of a linear protocol; else None: they follow from the experiment
     key
-        with which the nodes sign what steers the run: see ``messages.acceptance``; None where it is not known, in bags for
-        example, or not used
+        with which the nodes sign what steers the run: see ``messages.acceptance``; None where it is not known, in bags
+        for example, or not used
     started
         when the record was made
     until

@@ -12,7 +12,7 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 
-from msg_analysis.bags.files import Inventory
+from msg_analysis.bags.files import FileInventory
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.salvage import salvage, salvage_in_place
 from msg_analysis.errors import BagError
@@ -104,11 +104,11 @@ def test_too_many_run_records(tmp_path: Path) -> None:
 def test_metadata_in_a_chunk_is_not_kept(tmp_path: Path) -> None:
     """Chunks have messages, channels and schemas; the others could be a thousand times as large as the file."""
     metadata = _record(12, _text("msg_agents") + struct.pack("<I", 0))
-    inventory = Inventory()
+    inventory: list[FileInventory] = []
     with pytest.raises(BagError, match="`experiment` is missing"):
         read_bag(_file(tmp_path / "x.mcap", _chunk(metadata * 1000 + _channel(1, "/t") + _message(1))), inventory)
-    assert inventory.files[0].file.metadata == []
-    assert inventory.files[0].count.messages == 1
+    assert inventory[0].file.metadata == []
+    assert inventory[0].count.messages == 1
 
 
 def test_times_that_no_clock_shows(tmp_path: Path) -> None:
