@@ -113,6 +113,7 @@ def salvage_in_place(directory: str | Path) -> SalvageReport:
     _refuse_living(directory)
     # A file that cannot be read to its end stays as it is: of a disk, another attempt may read more.
     entries = _read_all(bag_files(directory), parts=False)
+    report = _report(entries)
     copies: dict[Path, FileInventory] = {}  # of the files that are not whole
     try:
         for entry in _readable(entries):
@@ -133,7 +134,7 @@ def salvage_in_place(directory: str | Path) -> SalvageReport:
     finally:
         for copy in copies:
             copy.unlink(missing_ok=True)
-    return _report(entries)
+    return report
 
 
 def _refuse_living(bag: Path) -> None:

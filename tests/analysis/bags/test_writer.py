@@ -3,7 +3,6 @@
 import json
 import multiprocessing
 import os
-import resource
 import signal
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from full_disk import full_disk
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
@@ -177,14 +177,10 @@ def test_a_head_larger_than_a_file_should_be(tmp_path: Path) -> None:
 def test_full_disk(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / "bag", network_topics(1), record=json.dumps({"run": "abc"}))
     file = tmp_path / "bag" / "bag_0.mcap"
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (250_000, hard))  # like a full disk, for this process only
-    try:
+    with full_disk(250_000):
         with pytest.raises(BagError, match="cannot be written"):
             _fill(bag, 10**5)
         bag.close()  # what is left to close is closed: no second error
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert {path.name for path in file.parent.iterdir()} == {".recording", "bag_0.mcap"}
     assert recording_pid(file.parent) is None
     report = salvage_in_place(file.parent)
