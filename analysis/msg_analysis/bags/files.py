@@ -14,7 +14,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -75,10 +75,7 @@ class FileCount:
 def bag_information(
     files: Sequence[FileCount], custom: Mapping[str, str], distribution: str | None = None
 ) -> dict[str, Any]:
-    """What metadata.yaml says of a bag with these files, in their order; ``custom`` holds our own entries.
-
-    ``distribution``: the ROS 2 that it was recorded with; None: the one here. Empty if unknown, as in rosbag2.
-    """
+    """What metadata.yaml says of a bag with these files; ``custom`` holds our own entries."""
     topics = total_channels(files)
     start = min(file.start for file in files)
     return {
@@ -113,6 +110,7 @@ def bag_information(
             for file in files
         ],
         "custom_data": dict(custom),
+        # Of the recorder: the one here, unless another is given. Empty if unknown, as in rosbag2.
         "ros_distro": ros_distribution() if distribution is None else distribution,
     }
 
@@ -190,7 +188,9 @@ def bag_files(path: Path) -> list[Path]:
         return sorted(files, key=_file_number)
     _refuse_unknown(path, information)
     names = information.get("relative_file_paths")
-    files = [_listed(path, str(name)) for name in names] if isinstance(names, list) else []
+    files = [path / str(name) for name in names] if isinstance(names, list) else []
+    # Before version 4 of the format of metadata.yaml, the names begin with that of the bag.
+    files = [file if file.is_file() else path / file.name for file in files]
     lost = [file.name for file in files if not file.is_file()]
     if lost or not files:
         raise BagError(
@@ -222,12 +222,6 @@ def _refuse_unknown(path: Path, information: dict[str, Any]) -> None:
         raise BagError(
             f"{path}: its compression_format is {compression}, expected zstd: convert it with `ros2 bag convert`"
         )
-
-
-def _listed(path: Path, name: str) -> Path:
-    """A file of metadata.yaml; before version 4 of its format, its name has that of the bag before it."""
-    file = path / name
-    return file if file.is_file() else path / PurePath(name).name
 
 
 def _file_number(file: Path) -> tuple[int, str]:
@@ -299,23 +293,19 @@ class FileInventory:
 
 
 def summary_of(file: Path) -> tuple[Summary | None, int | None]:
-    """The summary at the end of an MCAP file, and the number of messages that it states.
-
-    No summary where it or its chunk indexes are wrong. The number is known also where the CRC shows that the summary is
-    right: then the head of a chunk is damaged.
-    """
+    """The summary of an MCAP file, None where it or its chunk indexes are wrong, and how many messages it states."""
     try:
         with file.open("rb") as stream:
             stream.seek(-_FOOTER.size, io.SEEK_END)
             start, _, crc = _FOOTER.unpack(stream.read())
             stream.seek(start)
-            if crc and crc != zlib.crc32(stream.read()[:-_BEHIND_CRC]):  # the library does not check it
-                return None, None
+            right = not crc or crc == zlib.crc32(stream.read()[:-_BEHIND_CRC])  # the library does not check it
             stream.seek(0)
-            summary = SeekingReader(stream, record_size_limit=RECORD_LIMIT).get_summary()
+            summary = SeekingReader(stream, record_size_limit=RECORD_LIMIT).get_summary() if right else None
             if summary is None:
                 return None, None
             right = all(_is_there(stream, index) for index in summary.chunk_indexes)
+            # With a correct CRC, the summary is right, and the head of a chunk is damaged.
             stated = summary.statistics.message_count if summary.statistics and (right or crc) else None
             return summary if right else None, stated
     except Exception:  # the library raises many kinds of errors on damage

@@ -206,7 +206,7 @@ def test_a_file_that_cannot_be_read_to_its_end(tmp_path: Path) -> None:
     """Its beginning is saved into a new bag; in place it stays, and what it says of the run counts."""
     torn = tmp_path / "x"
     torn.mkdir()
-    write(torn / "x_0.mcap", *LOOSE)
+    write(torn / "x_0.mcap", *LOOSE, b"\x05")
     endless = write(torn / "x_1.mcap", *LOOSE, message(0, b"more", 60), metadata("msg_agents", record=RECORD), TOO_MANY)
     before = endless.read_bytes()
     report = salvage(torn, tmp_path / "out")
@@ -214,7 +214,7 @@ def test_a_file_that_cannot_be_read_to_its_end(tmp_path: Path) -> None:
     assert report.torn == f"{unended(*LOOSE)[1]}; {endless}: more than 8192 topics: record the topics of the run alone"
     assert [each[-1] for each in content(tmp_path / "out/out_1.mcap")["messages"]] == [b"data", b"more"]
     report = salvage_in_place(torn)
-    assert (report.kept_messages, report.dropped_files, report.dropped_bytes) == (1, 1, len(before))
+    assert (report.kept_messages, report.dropped_files, report.dropped_bytes) == (1, 1, 1 + len(before))
     assert endless.read_bytes() == before
     assert information(torn)["relative_file_paths"] == ["x_0.mcap"]
     assert (information(torn)["custom_data"]["run"], information(torn)["ros_distro"]) == (RUN, "kilted")
@@ -263,8 +263,9 @@ def test_many_torn_files(tmp_path: Path) -> None:
     (tmp_path / "x").mkdir()
     files = [[channel(1, "/a"), message(1, bytes(number))] for number in range(15)]
     for number, records in enumerate(files):
-        write(tmp_path / f"x/x_{number}.mcap", *records)
+        write(tmp_path / f"x/x_{number}.mcap", *records, b"\x05")
     report = salvage(tmp_path / "x", tmp_path / "out")
+    assert (report.kept_messages, report.dropped_bytes) == (15, 15)
     assert report.torn == "; ".join([*(unended(*records)[1] for records in files[:14]), "..."])
     (tmp_path / "x/x_14.mcap").unlink()
     report = salvage(tmp_path / "x", tmp_path / "again")
@@ -290,10 +291,10 @@ def test_a_full_disk(tmp_path: Path) -> None:
 
 def test_what_cannot_be_salvaged(tmp_path: Path) -> None:
     (tmp_path / "x").mkdir()
-    for name in ("x_0", "x_1"):
+    for name in ("x_0", "x_1", "x_2"):
         (tmp_path / f"x/{name}.mcap").write_text("no bag")
     for attempt in (lambda: salvage(tmp_path / "x", tmp_path / "out"), lambda: salvage_in_place(tmp_path / "x")):
-        with pytest.raises(BagError, match=r"x_1\.mcap: not an MCAP file"):
+        with pytest.raises(BagError, match=r"x_2\.mcap: not an MCAP file"):
             attempt()
     empty = write(tmp_path / "empty.mcap", header(), TOPICS)
     with pytest.raises(BagError, match=r"empty\.mcap: no whole message is left in it: nothing can be salvaged"):
