@@ -1,10 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reads a recorded run, whichever program recorded it, and counts what is there and what is missing.
-
-The run record comes from the topic `experiment`, or from the metadata of files that this software wrote.
-"""
+"""Reads a recorded run, whichever program recorded it, and counts what is there and what is missing."""
 
 from __future__ import annotations
 
@@ -33,6 +30,7 @@ from msg_analysis.bags.writing import recording_pid
 from msg_analysis.common.arrays import AnyArray, IntArray
 from msg_analysis.common.resources import tell
 from msg_analysis.errors import BagError, InputError
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import CdrError
 from msg_analysis.messages.messages import (
@@ -49,7 +47,7 @@ from msg_analysis.model.run_record import RunRecord
 
 # Topics are recognised by type and by the end of their name: the network may run in any namespace.
 _STATE, _TRUTH, _GRAPH, _EXPERIMENT, _STOP = "state", "truth", "graph", "experiment", "stop"
-_NUMBERS = {None: 0, _STATE: 1, _TRUTH: 2, _GRAPH: 3, _EXPERIMENT: 4, _STOP: 5}
+_NUMBERS = {_STATE: 1, _TRUTH: 2, _GRAPH: 3, _EXPERIMENT: 4, _STOP: 5}
 _TOPICS = {
     AGENT_STATE.full_name: re.compile(r"(?:^|/)agent_\d+/(state|truth)$"),
     ACTIVE_GRAPH.full_name: re.compile(r"(?:^|/)(graph)$"),
@@ -98,10 +96,7 @@ def read_bag(path: str | Path, inventory: list[FileInventory] | None = None) -> 
 
 
 def read_record(path: str | Path, *, most: int | None = None) -> RunRecord:
-    """The run record of a bag, as ``read_bag`` finds it, without the states; at once where it comes first.
-
-    BagError or InputError: no bag, or no valid run record in the first ``most`` bytes of messages (None: in all).
-    """
+    """The run record alone; BagError or InputError: no bag, or no valid one in the first ``most`` bytes of messages."""
     path = Path(path)
     contents = _Contents(path)
     unreadable: list[BagError] = []
@@ -149,8 +144,8 @@ class _Contents:
         self.refused[Refusal.DAMAGED_CHUNK] += file.damaged_chunks
 
     def network_topics(self, file: StoredFile, batches: Iterable[Batch]) -> Iterator[tuple[Batch, AnyArray]]:
-        """Each batch with the kinds of its messages, (messages,): one of ``_NUMBERS``."""
-        kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel; 0: not a topic of the network
+        """Each batch with the kinds of its messages, (messages,): ``_NUMBERS``; 0: not of a topic of the network."""
+        kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel
         known = 0
         size = file.path.stat().st_size
         for batch in batches:
@@ -158,8 +153,8 @@ class _Contents:
             for number, channel in itertools.islice(file.channels.items(), known, None):
                 schema = file.schemas.get(channel.schema_id)
                 pattern = _TOPICS.get(schema.name if schema else "")
-                found = pattern.search(channel.topic) if pattern else None
-                kind_of[number] = _NUMBERS[found[1] if found else None]
+                if pattern and (found := pattern.search(channel.topic)):
+                    kind_of[number] = _NUMBERS[found[1]]
             known = len(file.channels)
             yield batch, kind_of[batch.channel]
 
@@ -190,9 +185,12 @@ class _Contents:
         """Take the run records in a batch with messages of these kinds, (messages,)."""
         for index in np.flatnonzero(kind == _NUMBERS[_EXPERIMENT]).tolist():
             try:
-                self._learn(decode_string(batch.message(index)))
+                text = decode_string(batch.message(index))
             except CdrError:
                 self.refused[Refusal.UNDECODABLE] += 1
+                continue
+            if text not in self.experiments:
+                self._learn(text)
 
     def first_record(self) -> RunRecord | None:
         """The first valid run record so far."""
@@ -200,8 +198,6 @@ class _Contents:
         return next((record for record in found if isinstance(record, RunRecord)), None)
 
     def _learn(self, text: str) -> None:
-        if text in self.experiments:
-            return
         if len(self.experiments) >= MOST_RECORDS:
             raise BagError(
                 f"{self.path}: more than {MOST_RECORDS} different messages on the topic `experiment`: expected the one "
@@ -209,7 +205,7 @@ class _Contents:
             )
         self.experiments[text] = record = self.parsed(text)
         if isinstance(record, RunRecord):
-            for collector, width in zip((self.states, self.truths), _widths(record), strict=True):
+            for collector, width in zip((self.states, self.truths), _widths(record.experiment), strict=True):
                 collector.expect(record, width)
 
     def parsed(self, text: str) -> RunRecord | InputError:
@@ -220,21 +216,20 @@ class _Contents:
             return error
 
 
-def _widths(record: RunRecord) -> tuple[int, int]:
+def _widths(experiment: Experiment) -> tuple[int, int]:
     """Lengths of the states on the topics `state` and `truth`."""
-    experiment = record.experiment
     return (experiment.run.replicas, experiment.width) if experiment.truth else (experiment.width, 0)
 
 
 def _choose(contents: _Contents) -> RunRecord:
     """The run record of the one run that has states."""
-    path = contents.path
+    path, damaged = contents.path, contents.refused[Refusal.DAMAGED_CHUNK]
     later = (text for text in contents.metadata if text not in contents.experiments)
     found = [*contents.experiments.values(), *map(contents.parsed, later)]
-    if not found and contents.refused[Refusal.DAMAGED_CHUNK]:
+    if not found and damaged:
         raise BagError(
-            f"{path}: {contents.refused[Refusal.DAMAGED_CHUNK]} chunks are damaged (wrong checksums, or times that no "
-            "clock shows), and no record of the run is in what is left: copy the bag again, or record the run again"
+            f"{path}: {damaged} chunks are damaged (wrong checksums, or times that no clock shows), and no record of "
+            "the run is in what is left: copy the bag again, or record the run again"
         )
     if not found:
         pid = recording_pid(path)
@@ -243,7 +238,6 @@ def _choose(contents: _Contents) -> RunRecord:
             f"{path}: the latched topic `experiment` is missing, so the run is not known{hint}: record that topic too, "
             "with durability transient_local (as `ros2 bag record -a` does)"
         )
-    errors = [each for each in found if isinstance(each, InputError)]
     records: dict[bytes, RunRecord] = {}
     for each in found:
         if not isinstance(each, RunRecord):
@@ -255,7 +249,7 @@ def _choose(contents: _Contents) -> RunRecord:
                 "program published on the topic `experiment`; record the run again"
             )
     if not records:
-        raise errors[0]
+        raise next(each for each in found if isinstance(each, InputError))
     with_states = [record for run, record in records.items() if contents.states.count(run)]
     candidates = with_states or list(records.values())
     if len(candidates) > 1:
@@ -272,7 +266,7 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Run:
         record = record.ended(end)
     experiment = record.experiment
     modes = _modes(contents, record.run.bytes, experiment.steps, planned, len(experiment.graph_list))
-    published, widths = None, _widths(record)
+    published, widths = None, _widths(experiment)
     truth = contents.states.finish(record, widths[0])
     if experiment.truth:
         published, truth = truth, contents.truths.finish(record, widths[1])
@@ -294,9 +288,13 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Run:
         missing_modes=int((modes < 0).sum()),
         refused={reason: count for reason, count in sorted(contents.refused.items()) if count},
     )
-    logged: dict[str, Any] = {"lost": truth.lost, "used": truth.used, "made": truth.made}
-    states = published.states if published else None
-    return Run(record, truth.states, modes, completeness, truth.modes, published=states, **logged)
+    return Run(
+        *(record, truth.states, modes, completeness, truth.modes),
+        lost=truth.lost,
+        used=truth.used,
+        made=truth.made,
+        published=published.states if published else None,
+    )
 
 
 def _end(contents: _Contents, record: RunRecord) -> int | None:
@@ -311,10 +309,7 @@ def _end(contents: _Contents, record: RunRecord) -> int | None:
 
 
 def _modes(contents: _Contents, run: bytes, steps: int, planned: int, graphs: int) -> IntArray:
-    """(N,) graph of every step from the sojourns, from 0; -1 where none or more than one covers it.
-
-    Sojourns may go on after ``steps``, up to the ``planned`` ones.
-    """
+    """(N,) graph of every step, from 0; -1: no sojourn, or more than one. They may go on up to the planned steps."""
     sojourns: set[tuple[int, int, int, int]] = set()
     for graph in contents.graphs.values():
         if graph.run != run:
@@ -325,7 +320,7 @@ def _modes(contents: _Contents, run: bytes, steps: int, planned: int, graphs: in
             sojourns.add((graph.sequence, graph.mode, graph.first_step, graph.last_step))
     modes = np.full(steps, -1, dtype=np.int64)
     claims = np.zeros(steps, dtype=np.int64)
-    for _, mode, first, last in sorted(sojourns):
+    for _, mode, first, last in sojourns:
         modes[first : last + 1] = mode - 1
         claims[first : last + 1] += 1
     modes[claims != 1] = -1
@@ -333,10 +328,7 @@ def _modes(contents: _Contents, run: bytes, steps: int, planned: int, graphs: in
 
 
 def record_document(path: Path) -> dict[str, Any]:
-    """The document of the run record of a bag; only that of another recorder's bag is checked.
-
-    BagError: there is none in the first ``MOST_SEARCHED`` bytes; InputError: it is not valid.
-    """
+    """The document of the run record, checked if another recorded the bag; BagError: none is found; InputError."""
     text = _head_record(first_file(path)) or read_record(path, most=MOST_SEARCHED).to_json()
     try:
         document = json.loads(text)
