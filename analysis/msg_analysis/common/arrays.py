@@ -28,10 +28,7 @@ SMALL_BLOCK = 200_000  # the same where there are several such arrays: they stay
 
 
 def large_zeros(shape: tuple[int, ...], dtype: Any, *, total: int) -> AnyArray:
-    """Zeros; in a file where it and what belongs to it has ``total`` >= ``LARGE`` bytes, if there is room for it.
-
-    MemoryError or ValueError: neither file nor memory is large enough.
-    """
+    """Zeros, in a file if ``total`` >= ``LARGE`` bytes belong together and it has room; MemoryError or ValueError."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     if total >= LARGE and size and hasattr(os, "posix_fallocate"):
         with suppress(OSError), tempfile.TemporaryFile(prefix="msg_analysis.") as file:

@@ -22,15 +22,10 @@ REPORT_FILE = "report.html"  # the same
 
 
 def require_place(file: Path | None) -> None:
-    """Refuse, before long work, a path where no file can be put: its directory is missing, or it is not a regular file.
-
-    None stands for no file. Raises InputError; permissions are not checked.
-    """
-    if file is None:
-        return
-    if not file.parent.is_dir():
+    """Refuse, before long work, a path where no file can be put, whatever the permissions; None: no file."""
+    if file is not None and not file.parent.is_dir():
         raise InputError(f"{file}: no such directory {file.parent}: create it")
-    if file.exists() and not file.is_file():
+    if file is not None and file.exists() and not file.is_file():
         raise InputError(f"{file}: not a regular file: choose another")
 
 

@@ -63,11 +63,9 @@ def one_blas_thread() -> AbstractContextManager[Any]:
 
 
 def blas_threads(agents: int) -> AbstractContextManager[Any]:
-    """Context in which BLAS uses one thread for networks of this size, unless they are large.
-
-    Its threads wait for each other without sleeping. Where another program keeps a core busy, every product of small
-    matrices then takes as long as a time slice: a comparison of 20 agents took 3 minutes instead of 4 s.
-    """
+    """Context in which BLAS uses one thread for networks of this size, unless they are large."""
+    # Its threads wait for each other without sleeping. Where another program keeps a core busy, every product of small
+    # matrices then takes as long as a time slice: a comparison of 20 agents took 3 minutes instead of 4 s.
     if agents >= LARGE:
         return nullcontext()
     import scipy.linalg  # noqa: F401  it brings a library of its own
@@ -126,9 +124,7 @@ def ros_distribution() -> str:
 
 
 def distribution_at(place: Path | None, sourced: str) -> str:
-    """The same, for an rclpy in the folder ``place`` and the ROS_DISTRO of a sourced ROS 2.
-
-    Wheels set no variable; ros-<name>-rclpy is installed beside theirs. ROS_DISTRO may be that of another ROS 2 then.
-    """
+    """The same, for an rclpy in the folder ``place`` and the ROS_DISTRO of a sourced ROS 2."""
+    # Wheels set no variable; ros-<name>-rclpy is installed beside theirs. ROS_DISTRO may be that of another ROS 2 then.
     wheels = sorted(place.glob("ros_*_rclpy-*.dist-info")) if place else []
     return wheels[0].name.split("_")[1] if wheels else sourced

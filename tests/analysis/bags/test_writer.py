@@ -29,7 +29,7 @@ def _fill(bag: BagWriter, steps: int = 50) -> None:
     bag.write("/experiment", encode_string("text"), 0)
     codec = StateCodec(RUN, 1, 2, 0.5)
     for k in range(steps):
-        data = codec.encode(k, min(k, 1), np.array([k, -k], dtype=float))
+        data = codec.wrap(k, min(k, 1), np.array([k, -k], dtype=float).tobytes())
         bag.write("/agent_1/state", data, stamp_ns(data))
 
 
