@@ -66,11 +66,6 @@ class FileCount:
         """Of all topics."""
         return sum(channel.messages for channel in self.channels.values())
 
-    @property
-    def duration(self) -> int:
-        """From the first to the last message [ns]."""
-        return max(0, self.end - self.start)
-
 
 def bag_information(
     files: Sequence[FileCount], custom: Mapping[str, str], distribution: str | None = None
@@ -104,7 +99,7 @@ def bag_information(
             {
                 "path": file.name,
                 "starting_time": {"nanoseconds_since_epoch": file.start},
-                "duration": {"nanoseconds": file.duration},
+                "duration": {"nanoseconds": max(0, file.end - file.start)},
                 "message_count": file.messages,
             }
             for file in files
@@ -249,11 +244,10 @@ class FileInventory:
     def watch(self) -> Iterator[Batch]:
         """The batches of the file, counted as they pass."""
         for batch in self.file.batches():
-            numbers, counts = np.unique(batch.channel, return_counts=True)
-            known = [number in self.file.channels for number in numbers.tolist()]
-            for number, messages in zip(numbers[known].tolist(), counts[known].tolist(), strict=True):
-                self._channel(number).messages += messages
-            times = batch.table[np.isin(batch.channel, numbers[known]), 2]
+            head = batch.head[np.isin(batch.channel, list(self.file.channels))]
+            for number, messages in zip(*np.unique(head["channel"], return_counts=True), strict=True):
+                self._channel(int(number)).messages += int(messages)
+            times = head["log_time"]
             if len(times):
                 self.count.start = min(self.count.start, int(times.min()))
                 self.count.end = max(self.count.end, int(times.max()))
@@ -267,7 +261,8 @@ class FileInventory:
         if number not in self._channels:
             channel = self.file.channels[number]
             schema = self.file.schemas.get(channel.schema_id)
-            new = channel_count(channel, schema.name if schema else "")
+            type_hash, qos = channel.metadata.get("topic_type_hash", ""), offered_profiles(channel)
+            new = ChannelCount(channel.topic, schema.name if schema else "", type_hash, qos)
             self._channels[number] = self.count.channels.setdefault(channel.topic, new)
         return self._channels[number]
 
@@ -319,12 +314,6 @@ def _is_there(stream: BinaryIO, index: ChunkIndex) -> bool:
     found = bytearray(stream.read(len(head)))
     found[CHUNK_CRC] = head[CHUNK_CRC]
     return found == head and len(head) + index.compressed_size == index.chunk_length
-
-
-def channel_count(channel: Channel, type_name: str) -> ChannelCount:
-    """A topic without messages yet, from an MCAP channel; ``type_name`` is ``package/msg/Name``."""
-    type_hash = channel.metadata.get("topic_type_hash", "")
-    return ChannelCount(channel.topic, type_name, type_hash, offered_profiles(channel))
 
 
 def offered_profiles(channel: Channel) -> list[Any]:

@@ -205,11 +205,7 @@ class McapFile(StoredFile):
     def _chunk(self, chunk: _Chunk, zstd: zstandard.ZstdDecompressor) -> Iterator[Batch]:
         try:
             data = unpack(chunk.content, zstd)
-        except Exception:  # decompressors raise many kinds of errors on damage
-            self.damaged_chunks += 1
-            return
-        self.count_expanded(len(data), chunk.end)
-        try:
+            self.count_expanded(len(data), chunk.end)
             places = locate(data, chunk.index)
             if places is None:
                 places = self._walk(data)
@@ -219,10 +215,10 @@ class McapFile(StoredFile):
             batch = Batch.of_contents(data, *places, chunk.end)
         except BagError:
             raise
-        except Exception:  # the library raises many kinds of errors on damage
+        except Exception:  # decompressors and the library raise many kinds of errors on damage
             self.damaged_chunks += 1
-            return
-        yield batch
+        else:
+            yield batch
 
     def _walk(self, data: bytes) -> tuple[IntArray, IntArray]:
         """(messages,) content offsets and sizes of all message records of a chunk; other records are noted."""

@@ -282,7 +282,7 @@ class LatchedMessage:
 class WrittenFile:
     """A new file; OSError, from every method: exists, or cannot be written."""
 
-    def __init__(self, path: Path, earlier: Sequence[FileCount], storage: Storage, *, begin: int = 0) -> None:
+    def __init__(self, path: Path, earlier: Sequence[FileCount], storage: Storage, begin: int) -> None:
         self.count = FileCount(path.name)
         self.begin = begin  # first time that belongs into it [ns]
         # Last one [ns]; None: not full. Messages up to it still belong into a full file of a split bag.
@@ -297,7 +297,7 @@ class WrittenFile:
         topics: Sequence[Topic],
         record: str | None,
         custom: Mapping[str, str],
-        latched: Iterable[LatchedMessage] = (),
+        latched: Iterable[LatchedMessage],
     ) -> None:
         """Write the run record, the topics, and what is in force of the latched ones; the first thing to be written."""
         storage, self._custom = self._storage, custom
@@ -330,17 +330,14 @@ class WrittenFile:
         """Whether it has as many bytes as a file of a split bag should have."""
         return self._limit is not None and self._stream.tell() >= self._limit
 
-    def add(self, topic: str, data: bytes, time_ns: int, sequence: int) -> None:
+    def add(self, topic: str, data: bytes, time_ns: int, sequence: int, published_ns: int | None = None) -> None:
         """Append a message."""
-        self.mcap.add_message(self._numbers[topic], time_ns, data, sequence)
+        self.mcap.add_message(self._numbers[topic], time_ns, data, sequence, published_ns)
         self._counted(topic, 1, time_ns, time_ns)
 
     def repeat(self, message: LatchedMessage) -> None:
         """Append a message again that another file has: logged at the beginning of this one, published when it was."""
-        self.mcap.add_message(
-            self._numbers[message.topic], self.begin, message.data, message.sequence, published_ns=message.time
-        )
-        self._counted(message.topic, 1, self.begin, self.begin)
+        self.add(message.topic, message.data, self.begin, message.sequence, message.time)
 
     def add_many(
         self,

@@ -15,6 +15,7 @@ from bisect import bisect_right
 from collections import Counter, OrderedDict
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 
 from mcap.opcode import Opcode
@@ -116,7 +117,8 @@ class Playback:
                 for number, channel in file.channels.items():
                     if number not in names:
                         names[number] = channel.topic if channel.topic in topics else None
-                for number, sequence, time, published, start, size in batch.table.tolist():
+                places = zip(batch.start.tolist(), batch.size.tolist(), strict=True)
+                for (number, sequence, time, published), (start, size) in zip(batch.head.tolist(), places, strict=True):
                     topic = names.get(number)
                     if topic is None:
                         continue
@@ -148,11 +150,8 @@ class Playback:
 
     def _starts_after(self) -> list[int]:
         """For each file, the earliest time [ns] in the files behind it."""
-        starts, least = [], 2**63
-        for outline in reversed(self._outlines):
-            starts.append(least)
-            least = min(least, 2**63 if outline.start is None else outline.start)
-        return starts[::-1]
+        starts = [2**63 if outline.start is None else outline.start for outline in reversed(self._outlines)]
+        return [*accumulate(starts[:-1], min, initial=2**63)][::-1]
 
 
 class _Repetitions:
@@ -177,10 +176,7 @@ class _Lows:
 
     def __init__(self, lows: list[tuple[int, int]], later: int) -> None:
         self._ends = [end for end, _ in lows]
-        self._from = [later]  # by piece: lowest time from it on
-        for _, low in reversed(lows):
-            self._from.append(min(self._from[-1], low))
-        self._from.reverse()
+        self._from = [*accumulate((low for _, low in reversed(lows)), min, initial=later)][::-1]  # lowest, by piece
         self._next = 0
 
     def behind(self, offset: int) -> int:

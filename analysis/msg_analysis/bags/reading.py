@@ -329,7 +329,7 @@ def _modes(contents: _Contents, run: bytes, steps: int, planned: int, graphs: in
 
 def record_document(path: Path) -> dict[str, Any]:
     """The document of the run record, checked if another recorded the bag; BagError: none is found; InputError."""
-    text = _head_record(first_file(path)) or read_record(path, most=MOST_SEARCHED).to_json()
+    text = _head_record(path) or read_record(path, most=MOST_SEARCHED).to_json()
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -342,14 +342,15 @@ def record_document(path: Path) -> dict[str, Any]:
 def started(path: Path) -> datetime | None:
     """When the run of a bag was started, by the head of its first file alone; None where that does not say it."""
     try:
-        found = datetime.fromisoformat(json.loads(_head_record(first_file(path)) or "{}")["started"])
+        found = datetime.fromisoformat(json.loads(_head_record(path) or "{}")["started"])
         return found if found.tzinfo else found.replace(tzinfo=UTC)
     except (BagError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 
-def _head_record(file: Path | None) -> str | None:
+def _head_record(bag: Path) -> str | None:
     """The text that our recorder and the twin put before the first chunk of an MCAP file; None where there is none."""
+    file = first_file(bag)
     if file is None or file.suffix != ".mcap":
         return None
     try:
@@ -367,7 +368,8 @@ def _head_record(file: Path | None) -> str | None:
                     if record.name == RECORD_NAME:
                         found: str | None = record.metadata.get("record")
                         return found
-    except Exception as error:  # the library raises many kinds of errors on damage
-        if isinstance(error, OSError):
-            raise BagError(f"{file}: cannot be read ({error.strerror})") from error
+    except OSError as error:
+        raise BagError(f"{file}: cannot be read ({error.strerror})") from error
+    except Exception:  # the library raises many kinds of errors on damage
+        return None
     return None

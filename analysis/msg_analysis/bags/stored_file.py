@@ -123,12 +123,6 @@ class Batch:
         """(messages,) channel number."""
         return np.asarray(self.head["channel"])
 
-    @property
-    def table(self) -> IntArray:
-        """(messages, 6) int64: channel number, sequence, log time [ns], publish time [ns], start, size."""
-        columns = [self.head[name].astype(np.int64) for name in MESSAGE_HEAD.names or ()]
-        return np.column_stack((*columns, self.start, self.size))
-
     def message(self, index: int) -> bytes:
         """CDR bytes of the message at an index of the batch."""
         start = int(self.start[index])

@@ -65,36 +65,28 @@ class BagWriter:
         if record is not None:
             self._custom["run"] = str(json.loads(record).get("run", ""))
         self._closed = False
+        self._open: list[WrittenFile] = []  # those that are not finished, in their order
         try:
             # It may be there already, empty: a runner that starts several runs at once reserves their names that way.
             self.directory.mkdir(parents=True, exist_ok=True)
             if any(self.directory.iterdir()):
                 raise FileExistsError
-            self._open = [self._new_file()]  # those that are not finished, in their order
             self._marker = (self.directory / RECORDING_MARKER).open("w", encoding="utf-8")
         except FileExistsError as error:
             raise exists_already(directory) from error
         except OSError as error:
             raise BagError(f"{directory}: cannot be made ({error.strerror}): choose another place") from error
-        try:
+        with self._writing():
             fcntl.flock(self._marker, fcntl.LOCK_EX)  # the system releases it when this process ends
             json.dump({"pid": os.getpid()}, self._marker)
             self._marker.flush()
-            self._open[0].write_head(self._topics, record, self._custom)
-        except OSError as error:
-            raise self._failed(error) from error
-
-    def _new_file(self, begin: int = 0) -> WrittenFile:
-        path = self.directory / f"{self.directory.name}_{len(self._counts)}.mcap"
-        file = WrittenFile(path, self._counts, self._storage, begin=begin)
-        self._counts.append(file.count)
-        return file
+            self._begin_file()
 
     def write(self, topic: str, data: bytes, time_ns: int, until: int | None = None) -> None:
         """Append a message (CDR) of a time [ns]; later files repeat a latched one, up to the time ``until`` if any."""
         if topic not in self._sequences or self._closed:
             raise self._refused("is closed" if self._closed else f"has no topic {topic}")
-        try:
+        with self._writing():
             if topic in self._latched:
                 message = LatchedMessage(time_ns, self._sequences[topic], topic, data, until)
                 self._sequences[topic] += 1
@@ -108,8 +100,6 @@ class BagWriter:
             file.add(topic, data, time_ns, self._sequences[topic])
             self._sequences[topic] += 1
             self._passed(file, (topic,))
-        except OSError as error:
-            raise self._failed(error) from error
 
     def write_many(
         self, topics: Sequence[str], of: IntArray, time_ns: IntArray, data: bytes, start: IntArray, size: IntArray
@@ -118,20 +108,16 @@ class BagWriter:
         if self._closed:
             raise self._refused("is closed")
         done = 0
-        try:
+        with self._writing():
             while done < len(of):  # the same as ``write`` for each, in a fraction of the time
                 file = self._file_of(int(time_ns[done]))
                 end = done + file.mcap.fitting(size[done : done + self._together(file, time_ns[done:])])
                 piece = slice(done, end)
                 if self._release(int(time_ns[piece].max())):
                     continue  # perhaps into a new file
-                present = file.add_many(
-                    topics, of[piece], time_ns[piece], data, start[piece], size[piece], self._sequences
-                )
-                self._passed(file, present)
+                several = of[piece], time_ns[piece], data, start[piece], size[piece]
+                self._passed(file, file.add_many(topics, *several, self._sequences))
                 done = end
-        except OSError as error:
-            raise self._failed(error) from error
 
     def _together(self, file: WrittenFile, time_ns: IntArray) -> int:
         """How many of the messages with these times belong into the same file as the first."""
@@ -157,13 +143,16 @@ class BagWriter:
     def _first_with(self, time_ns: int) -> WrittenFile | None:
         return next((file for file in self._open if file.bound is not None and time_ns <= file.bound), None)
 
-    def _begin_file(self, begin: int) -> WrittenFile:
+    def _begin_file(self, begin: int = 0) -> WrittenFile:
         if len(self._open) == MOST_OPEN:
             self._finish_first()
-        self._open.append(self._new_file(begin))
+        path = self.directory / f"{self.directory.name}_{len(self._counts)}.mcap"
+        file = WrittenFile(path, self._counts, self._storage, begin)
+        self._open.append(file)
+        self._counts.append(file.count)
         self._in_force = [each for each in self._in_force if each.until is None or each.until >= begin]
-        self._open[-1].write_head(self._topics, self._record, self._custom, self._in_force)
-        return self._open[-1]
+        file.write_head(self._topics, self._record, self._custom, self._in_force)
+        return file
 
     def _finish_first(self) -> None:
         self._open[0].finish()
@@ -204,41 +193,42 @@ class BagWriter:
 
     def flush(self) -> None:
         """Hand everything so far to the operating system, so that it survives the end of this process."""
-        try:
+        with self._writing():
             for file in self._open:
                 file.mcap.flush()
-        except OSError as error:
-            raise self._failed(error) from error
 
     def close(self, complete: bool = True) -> None:
         """Finish the files, write metadata.yaml, remove the marker; ``complete``: the end of the run was seen."""
         if self._closed:
             return
         self._custom["complete"] = "true" if complete else "false"
-        try:
+        with self._writing():
             self._release(2**63)
             while self._open:
                 self._finish_first()
             write_metadata(self.directory, bag_information(self._counts, self._custom))
             (self.directory / RECORDING_MARKER).unlink()
             self._marker.close()
-        except OSError as error:
-            raise self._failed(error) from error
         self._closed = True
 
     def _refused(self, reason: str) -> BagError:
         return BagError(f"{self.directory}: {reason}: nothing more can be written to it")
 
-    def _failed(self, error: OSError) -> BagError:
-        self._closed = True
-        for file in self._open:
-            file.abandon()
-        with contextlib.suppress(OSError):
-            self._marker.close()
-        return BagError(
-            f"{self.directory}: cannot be written ({error.strerror or error}): free some space or choose "
-            "another place; what was written before can still be read"
-        )
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """After an OSError the bag is closed; what was written before can be read."""
+        try:
+            yield
+        except OSError as error:
+            self._closed = True
+            for file in self._open:
+                file.abandon()
+            with contextlib.suppress(OSError):
+                self._marker.close()
+            raise BagError(
+                f"{self.directory}: cannot be written ({error.strerror or error}): free some space or choose "
+                "another place; what was written before can still be read"
+            ) from error
 
     def __enter__(self) -> Self:
         return self

@@ -14,10 +14,12 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
+
+    from msg_analysis.experiment.experiment import Experiment
 
 try:
     __version__ = version("msg_analysis")
@@ -41,15 +43,6 @@ SINGLE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_N
 LARGE = 500  # smallest number of agents with which more than one thread pays on a quiet machine
 
 
-class Network(Protocol):
-    """What has a number of agents: an experiment."""
-
-    @property
-    def agents(self) -> int:
-        """Their number."""
-
-
-N = TypeVar("N", bound=Network)
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -73,13 +66,13 @@ def blas_threads(agents: int) -> AbstractContextManager[Any]:
     return one_blas_thread()
 
 
-def few_blas_threads(function: Callable[Concatenate[N, P], R]) -> Callable[Concatenate[N, P], R]:
+def few_blas_threads(function: Callable[Concatenate[Experiment, P], R]) -> Callable[Concatenate[Experiment, P], R]:
     """Decorator: call a function of an experiment within ``blas_threads``."""
 
     @functools.wraps(function)
-    def limited(network: N, /, *arguments: P.args, **options: P.kwargs) -> R:
-        with blas_threads(network.agents):
-            return function(network, *arguments, **options)
+    def limited(experiment: Experiment, /, *arguments: P.args, **options: P.kwargs) -> R:
+        with blas_threads(experiment.agents):
+            return function(experiment, *arguments, **options)
 
     return limited
 
