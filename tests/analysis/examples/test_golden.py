@@ -1,6 +1,6 @@
 """Results of the examples as they were before the packages were rearranged, in tests/data/golden/examples.json.
 
-Numbers agree to 1e-9 of the largest in their list. Of lists with more than eight numbers, shape and three sums are kept.
+Numbers agree to 1e-9 of the largest in their list; of lists with more than eight numbers, shape and sums are kept.
 """
 
 import hashlib
