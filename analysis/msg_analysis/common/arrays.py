@@ -38,11 +38,12 @@ def large_zeros(shape: tuple[int, ...], dtype: Any, *, total: int) -> AnyArray:
 
 
 class LargeRows:
-    """Rows that are found one part after the other: in a file from ``LARGE`` / 8 bytes on, if there is room for it."""
+    """Rows that are found one part after the other: in a file from some number of bytes on, if there is room for it."""
 
-    def __init__(self, columns: int, dtype: Any) -> None:
+    def __init__(self, columns: int, dtype: Any, in_memory: int = LARGE // 8) -> None:
         self._shape, self._dtype = (-1, columns), np.dtype(dtype)
         self._parts: list[AnyArray] = []
+        self._in_memory = in_memory  # bytes, at most
         self._held = self._written = 0  # bytes
         self._file: IO[bytes] | None = None
 
@@ -52,7 +53,7 @@ class LargeRows:
         before: int = (self._held + self._written) // (self._shape[1] * self._dtype.itemsize)
         self._parts.append(part)
         self._held += part.nbytes
-        if self._held + self._written >= LARGE // 8:
+        if self._held + self._written >= self._in_memory:
             self._move()
         return before
 
