@@ -55,12 +55,14 @@ class McapWriter:
         *,
         chunk_size: int,
         compression: Compression,
+        level: int = ZSTD_LEVEL,
         profile: str = "ros2",
         library: str = "mcap",
         directory: str | None = None,  # of a temporary file; None: that of the system
         indexes_in_memory: int = INDEXES_IN_MEMORY,
     ) -> None:
-        self._stream, self._chunk_size, self._compression = stream, chunk_size, compression
+        self._stream, self._chunk_size = stream, chunk_size
+        self._compression, self._level = compression, level
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         # An index of a chunk has an entry for every channel: an hour of a thousand agents has gigabytes of them.
@@ -166,7 +168,7 @@ class McapWriter:
         self._chunk.clear()
         self._index.clear()
         self._size = 0
-        compressed = _compressed(content, self._compression)
+        compressed = _compressed(content, self._compression, self._level)
         name = COMPRESSION_NAMES[self._compression].encode()
         times = np.frombuffer(b"".join(entries.values()), "<u8")[::2]
         start, end = int(times.min()), int(times.max())
@@ -254,11 +256,11 @@ def _encoded(record: McapRecord) -> bytes:
     return data
 
 
-def _compressed(data: bytes, compression: Compression) -> bytes:
+def _compressed(data: bytes, compression: Compression, level: int) -> bytes:
     if compression == "zstd":
         import zstandard
 
-        compressed: bytes = zstandard.compress(data, level=ZSTD_LEVEL)
+        compressed: bytes = zstandard.compress(data, level=level)
         return compressed
     if compression == "lz4":
         import lz4.frame
