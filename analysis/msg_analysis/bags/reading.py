@@ -110,8 +110,9 @@ def read_record(path: str | Path, *, most: int | None = None) -> RunRecord:
                     return _choose(contents)
                 contents.learn(batch, kind)
                 contents.learn_metadata(file)
-                if (known := contents.first_record()) is not None:
-                    return known
+                for record in contents.records.values():
+                    if isinstance(record, RunRecord):
+                        return record
         except BagError as error:
             unreadable.append(error)
         contents.learn_metadata(file)
@@ -130,9 +131,9 @@ class _Contents:
     # By their bytes: every file of a split bag may begin with those in force.
     graphs: dict[bytes, ActiveGraph] = field(default_factory=dict)
     stops: set[tuple[bytes, int]] = field(default_factory=set)  # run, and the step at which it ended early
-    # Run records by text, in order, or why a text is not one: from the topic, and from the metadata of our files.
-    experiments: dict[str, RunRecord | InputError] = field(default_factory=dict)
-    metadata: dict[str, None] = field(default_factory=dict)
+    # Run records by text, in order, from the topic and from the metadata of our files, or why a text is not one: that
+    # matters only if no text is (another program's topic).
+    records: dict[str, RunRecord | InputError] = field(default_factory=dict)
     refused: Counter[str] = field(default_factory=Counter)
 
     def read(self, file: StoredFile, batches: Iterable[Batch]) -> None:
@@ -161,8 +162,8 @@ class _Contents:
     def learn_metadata(self, file: StoredFile) -> None:
         """Take the run records in the metadata of a file."""
         for record in file.metadata:
-            if record.name == RECORD_NAME and "record" in record.metadata and len(self.metadata) < MOST_RECORDS:
-                self.metadata[record.metadata["record"]] = None
+            if record.name == RECORD_NAME and "record" in record.metadata and len(self.records) < MOST_RECORDS:
+                self._learn(record.metadata["record"])
 
     def _add(self, batch: Batch, kind: AnyArray) -> None:
         self.learn(batch, kind)  # first: states of a known run are put in their places at once
@@ -189,31 +190,23 @@ class _Contents:
             except CdrError:
                 self.refused[Refusal.UNDECODABLE] += 1
                 continue
-            if text not in self.experiments:
-                self._learn(text)
-
-    def first_record(self) -> RunRecord | None:
-        """The first valid run record so far."""
-        found = (*self.experiments.values(), *map(self.parsed, self.metadata))
-        return next((record for record in found if isinstance(record, RunRecord)), None)
+            if text not in self.records and len(self.records) >= MOST_RECORDS:
+                raise BagError(
+                    f"{self.path}: more than {MOST_RECORDS} different messages on the topic `experiment`: expected the "
+                    "one record of a run: record each run into a bag of its own"
+                )
+            self._learn(text)
 
     def _learn(self, text: str) -> None:
-        if len(self.experiments) >= MOST_RECORDS:
-            raise BagError(
-                f"{self.path}: more than {MOST_RECORDS} different messages on the topic `experiment`: expected the one "
-                "record of a run: record each run into a bag of its own"
-            )
-        self.experiments[text] = record = self.parsed(text)
-        if isinstance(record, RunRecord):
-            for collector, width in zip((self.states, self.truths), _widths(record.experiment), strict=True):
-                collector.expect(record, width)
-
-    def parsed(self, text: str) -> RunRecord | InputError:
-        """A run record, or why the text is not one: that matters only if no text is (another program's topic)."""
+        if text in self.records:
+            return
         try:
-            return RunRecord.from_json(text, f"{self.path}: topic experiment")
+            self.records[text] = record = RunRecord.from_json(text, f"{self.path}: topic experiment")
         except InputError as error:
-            return error
+            self.records[text] = error
+            return
+        for collector, width in zip((self.states, self.truths), _widths(record.experiment), strict=True):
+            collector.expect(record, width)
 
 
 def _widths(experiment: Experiment) -> tuple[int, int]:
@@ -224,8 +217,7 @@ def _widths(experiment: Experiment) -> tuple[int, int]:
 def _choose(contents: _Contents) -> RunRecord:
     """The run record of the one run that has states."""
     path, damaged = contents.path, contents.refused[Refusal.DAMAGED_CHUNK]
-    later = (text for text in contents.metadata if text not in contents.experiments)
-    found = [*contents.experiments.values(), *map(contents.parsed, later)]
+    found = contents.records.values()
     if not found and damaged:
         raise BagError(
             f"{path}: {damaged} chunks are damaged (wrong checksums, or times that no clock shows), and no record of "
