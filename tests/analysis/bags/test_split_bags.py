@@ -4,7 +4,6 @@ The messages come as from a network: agents drift apart, and sojourns are publis
 read by mcap's reader.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from msg_analysis.bags.playback import Playback
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.stored_file import Storage
 from msg_analysis.bags.writing import BagWriter
-from msg_analysis.messages.messages import ActiveGraph, stamp_ns
+from msg_analysis.messages.messages import ActiveGraph
 from msg_analysis.messages.topics import network_topics
 
 MakeRun = Callable[..., Run]
@@ -133,20 +132,18 @@ def test_repetitions_say_what_they_repeat(bag: Path) -> None:
     """Logged when the file begins, published when the original was, with its number: and only what is in force."""
     originals: dict[tuple[str, int], Any] = {}
     for number, file in enumerate(files_of(bag)):
-        begin = min(message.log_time for _, message in messages_of(file))
-        repeated: list[str] = []
-        for topic, message in messages_of(file):
-            first = originals.setdefault((topic, message.sequence), message)
-            if first is message:
-                assert message.log_time == message.publish_time
-                continue
+        messages = messages_of(file)
+        begin = min(message.log_time for _, message in messages)
+        firsts = [originals.setdefault((topic, message.sequence), message) for topic, message in messages]
+        repeated = [(*each, first) for each, first in zip(messages, firsts, strict=True) if each[1] is not first]
+        assert all(first.log_time == first.publish_time for first in firsts)
+        for topic, message, first in repeated:
             assert topic in LATCHED
             assert (message.log_time, message.publish_time) == (begin, first.publish_time)
             assert message.data == first.data
-            end = until(topic, message.data)
-            assert end is None or end >= begin
-            repeated.append(topic)
-        assert (Counter(repeated)["/experiment"], len(repeated) < 5) == (min(number, 1), True)
+            assert (until(topic, message.data) or begin) >= begin
+        assert [topic for topic, *_ in repeated].count("/experiment") == min(number, 1)
+        assert len(repeated) < 5
     for topic in ("/graph", "/agent_1/state"):
         numbers = {number for name, number in originals if name == topic}
         assert numbers == set(range(len(numbers)))
@@ -254,8 +251,3 @@ def test_what_others_publish_again_is_no_repetition(tmp_path: Path) -> None:
     assert [*_theirs(tmp_path / "repeated", [[(on, 1), (off, 2)], [(off, 2), (on, 3)]])] == [on, off, on]
     assert [*_theirs(tmp_path / "twice", [[(on, 1)], [(off, 2), (off, 2)]])] == [on, off, off]
     assert [*_theirs(tmp_path / "volatile", [[(on, 1)], [(on, 1)]], latched=False)] == [on, on]
-
-
-def test_stamps_are_times(arriving: list[tuple[str, bytes, int]]) -> None:
-    """The test's own messages."""
-    assert all(stamp_ns(data) == time for topic, data, time in arriving if topic not in LATCHED)
