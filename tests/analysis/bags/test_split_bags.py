@@ -39,19 +39,25 @@ def files_of(bag: Path) -> list[Path]:
     return [bag / f"{bag.name}_{number}.mcap" for number in range(len(list(bag.glob("*.mcap"))))]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def run(make_run: MakeRun) -> Run:
     return make_run(AGENTS, STEPS, 3)
 
 
-@pytest.fixture
-def arriving(run: Run, tmp_path: Path) -> list[tuple[str, bytes, int]]:
+@pytest.fixture(scope="module")
+def unsplit(run: Run, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[str, Any]]:
+    directory = tmp_path_factory.mktemp("unsplit") / "bag"
+    write_trajectory(run, directory)
+    return messages_of(directory / "bag_0.mcap")
+
+
+@pytest.fixture(scope="module")
+def arriving(unsplit: list[tuple[str, Any]]) -> list[tuple[str, bytes, int]]:
     """As a recorder receives the run: agents are up to 15 steps apart, sojourns come up to 100 steps early."""
-    write_trajectory(run, tmp_path / "unsplit")
     # Each agent's states come in order.
     drift = {f"/agent_{i + 1}/state": 7.5 * np.sin(np.arange(STEPS + 1) / 20 + i) for i in range(AGENTS)}
     keyed = []
-    for number, (topic, message) in enumerate(messages_of(tmp_path / "unsplit/unsplit_0.mcap")):
+    for number, (topic, message) in enumerate(unsplit):
         step = message.log_time / STEP
         place = -1 if topic == "/experiment" else step - 100 if topic == "/graph" else step + drift[topic][int(step)]
         keyed.append((place, number, topic, message.data, message.log_time))
@@ -84,14 +90,19 @@ def record(bag: BagWriter, messages: list[tuple[str, bytes, int]], portion: int 
     write()
 
 
-@pytest.fixture(params=[1, 37])
-def bag(request: pytest.FixtureRequest, run: Run, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> Path:
-    storage = Storage("zstd", 12_000)
-    with BagWriter(tmp_path / "split", network_topics(AGENTS), record=run.record.to_json(), storage=storage) as writer:
+@pytest.fixture(scope="module", params=[1, 37])
+def bag(
+    request: pytest.FixtureRequest,
+    run: Run,
+    arriving: list[tuple[str, bytes, int]],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
+    storage, directory = Storage("zstd", 12_000), tmp_path_factory.mktemp("split") / "split"
+    with BagWriter(directory, network_topics(AGENTS), record=run.record.to_json(), storage=storage) as writer:
         record(writer, arriving, request.param)
         assert writer.messages == len(arriving)
-    assert len(files_of(tmp_path / "split")) > 4
-    return tmp_path / "split"
+    assert len(files_of(directory)) > 4
+    return directory
 
 
 def test_files_follow_each_other_in_time(bag: Path) -> None:
@@ -149,7 +160,7 @@ def test_repetitions_say_what_they_repeat(bag: Path) -> None:
         assert numbers == set(range(len(numbers)))
 
 
-def test_the_whole_bag_is_that_which_is_not_split(run: Run, bag: Path, tmp_path: Path) -> None:
+def test_the_whole_bag_is_that_which_is_not_split(run: Run, bag: Path) -> None:
     found = read_bag(bag)
     assert found.completeness.complete
     assert (found.completeness.duplicates, found.completeness.refused) == (0, {})
@@ -157,7 +168,7 @@ def test_the_whole_bag_is_that_which_is_not_split(run: Run, bag: Path, tmp_path:
     assert np.array_equal(found.modes, run.modes)
 
 
-def test_it_is_played_once(bag: Path, tmp_path: Path) -> None:
+def test_it_is_played_once(bag: Path, unsplit: list[tuple[str, Any]]) -> None:
     """Every topic as from the bag that is not split, with an offset too."""
     for until_time in (2**63, 7 * 10**9):
         played: dict[str, list[tuple[int, bytes]]] = {}
@@ -165,7 +176,7 @@ def test_it_is_played_once(bag: Path, tmp_path: Path) -> None:
         for message in playback.messages(list(playback.topics), until_time):
             played.setdefault(message.topic, []).append((message.time, message.data))
         wanted: dict[str, list[tuple[int, bytes]]] = {}
-        for topic, message in messages_of(tmp_path / "unsplit/unsplit_0.mcap"):
+        for topic, message in unsplit:
             if message.log_time <= until_time:
                 wanted.setdefault(topic, []).append((message.log_time, message.data))
         assert played == wanted
