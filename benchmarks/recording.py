@@ -39,7 +39,7 @@ def run_of(replicas: int) -> tuple[RunRecord, list[bytes]]:
     sent, found, size = [], [], 0
     for k, states in enumerate(run.states):
         for i, codec in enumerate(codecs):
-            sent.append(codec.encode(k, 1 if k else 0, states[i].copy()))
+            sent.append(codec.wrap(k, 1 if k else 0, states[i].tobytes()))
             size += len(sent[-1])
             if size >= BATCH_SIZE:
                 found.append(encode_batch(run.record.run.bytes, sent))

@@ -150,25 +150,35 @@ def test_select_leaders(experiment: Experiment) -> None:
 
 
 def test_everything_says_what_it_is(experiment: Experiment, run: Run) -> None:
-    """In a line; and in a notebook as a table, whose rows have equally many cells."""
+    """In a line; and in a notebook as a table, whose rows have equally many cells: every class that is exported."""
+    prediction, comparison = experiment.predict(), run.compare()
     results = [
         (experiment, ["line_ring", "consensus of 5 agents", "1000 steps"]),
         (run, ["line_ring", "x(0..1000)", "seed 3", "complete"]),
-        (experiment.predict(), ["1.41159", "1.35941", "1.5"]),
-        (experiment.predict().emulated, ["5 agents", "1.41159"]),
-        (run.compare(), ["agrees", "measured", "predicted 1.41159"]),
+        (run.completeness, []),
+        (prediction, ["1.41159", "1.35941", "1.5"]),
+        (prediction.emulated, ["5 agents", "1.41159"]),
+        (comparison, ["agrees", "measured", "predicted 1.41159"]),
+        (comparison.system_error, []),
         (compare(run, experiment.simulate(seed=4)), ["2 runs"]),
         (experiment.leaders(1), ["agents 3", "exhaustive"]),
         (experiment.transient([0, 1]), ["2 times"]),
+        (experiment.spectrum([0, 1]), []),
+        (msg_analysis.sweep(experiment, {"switching.scale": [1.0, 2.0]}), ["switching.scale", "2 points"]),
     ]
     for result, words in results:
         text = repr(result)
         assert "\n" not in text
         assert len(text) < 200
         assert all(word in text for word in words), text
-        rows = [line for line in result._repr_markdown_().splitlines() if line.startswith("|")]
+        lines = result._repr_markdown_().splitlines()
+        rows = [line for line in lines if line.startswith("|")]
         assert len(rows) >= 3
+        assert lines[-1] == rows[-1]
+        assert any(re.fullmatch(r"(\| -{3}:? )+\|", row) for row in rows)
         assert len({row.count("|") for row in rows}) == 1
+    classes = [getattr(msg_analysis, name) for name in msg_analysis.__all__ if name[0].isupper()]
+    assert {kind for kind in classes if not issubclass(kind, Exception)} <= {type(each) for each, _ in results}
 
 
 def test_large_networks_are_short_too() -> None:
@@ -181,22 +191,6 @@ def test_large_networks_are_short_too() -> None:
     experiment = Experiment.parse(document)
     assert "g3, ...;" in repr(experiment)
     assert len(experiment.predict()._repr_markdown_().splitlines()) < 40
-
-
-def test_every_object_has_a_table_for_notebooks(experiment: Experiment, run: Run) -> None:
-    """Every class that is exported, errors aside, and what its attributes are in the documentation."""
-    prediction, comparison = experiment.predict(), run.compare()
-    shown = [
-        *(experiment, prediction, prediction.emulated, run, run.completeness, comparison, comparison.system_error),
-        *(experiment.transient([0, 1, 2]), experiment.spectrum([0, 1]), Experiment.load(TRACKING).leaders(1)),
-        msg_analysis.sweep(experiment, {"switching.scale": [1.0, 2.0]}),
-    ]
-    classes = [getattr(msg_analysis, name) for name in msg_analysis.__all__ if name[0].isupper()]
-    assert {kind for kind in classes if not issubclass(kind, Exception)} <= {type(each) for each in shown}
-    for each in shown:
-        lines = each._repr_markdown_().splitlines()
-        assert any(re.fullmatch(r"(\| -{3}:? )+\|", line) for line in lines), each
-        assert lines[-1].startswith("|"), each
 
 
 def test_plots(experiment: Experiment, run: Run) -> None:

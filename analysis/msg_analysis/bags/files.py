@@ -14,7 +14,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -66,19 +66,11 @@ class FileCount:
         """Of all topics."""
         return sum(channel.messages for channel in self.channels.values())
 
-    @property
-    def duration(self) -> int:
-        """From the first to the last message [ns]."""
-        return max(0, self.end - self.start)
-
 
 def bag_information(
     files: Sequence[FileCount], custom: Mapping[str, str], distribution: str | None = None
 ) -> dict[str, Any]:
-    """What metadata.yaml says of a bag with these files, in their order; ``custom`` holds our own entries.
-
-    ``distribution``: the ROS 2 that it was recorded with; None: the one here. Empty if unknown, as in rosbag2.
-    """
+    """What metadata.yaml says of a bag with these files; ``custom`` holds our own entries."""
     topics = total_channels(files)
     start = min(file.start for file in files)
     return {
@@ -107,12 +99,13 @@ def bag_information(
             {
                 "path": file.name,
                 "starting_time": {"nanoseconds_since_epoch": file.start},
-                "duration": {"nanoseconds": file.duration},
+                "duration": {"nanoseconds": max(0, file.end - file.start)},
                 "message_count": file.messages,
             }
             for file in files
         ],
         "custom_data": dict(custom),
+        # Of the recorder: the one here, unless another is given. Empty if unknown, as in rosbag2.
         "ros_distro": ros_distribution() if distribution is None else distribution,
     }
 
@@ -190,7 +183,9 @@ def bag_files(path: Path) -> list[Path]:
         return sorted(files, key=_file_number)
     _refuse_unknown(path, information)
     names = information.get("relative_file_paths")
-    files = [_listed(path, str(name)) for name in names] if isinstance(names, list) else []
+    files = [path / str(name) for name in names] if isinstance(names, list) else []
+    # Before version 4 of the format of metadata.yaml, the names begin with that of the bag.
+    files = [file if file.is_file() else path / file.name for file in files]
     lost = [file.name for file in files if not file.is_file()]
     if lost or not files:
         raise BagError(
@@ -224,12 +219,6 @@ def _refuse_unknown(path: Path, information: dict[str, Any]) -> None:
         )
 
 
-def _listed(path: Path, name: str) -> Path:
-    """A file of metadata.yaml; before version 4 of its format, its name has that of the bag before it."""
-    file = path / name
-    return file if file.is_file() else path / PurePath(name).name
-
-
 def _file_number(file: Path) -> tuple[int, str]:
     """Order of the files of a split bag, which rosbag2 numbers: name_0.mcap, name_1.mcap, ..., name_10.mcap."""
     number = re.search(r"_(\d+)\.(?:mcap|db3)", file.name)
@@ -241,19 +230,24 @@ class FileInventory:
     """One file: what it holds and what is wrong with it, complete once ``watch`` has run to its end."""
 
     file: StoredFile
-    count: FileCount
+    count: FileCount = field(init=False)
     summary: Summary | None = None  # None where the file has none that is correct
     stated_messages: int | None = None  # how many messages its summary says that it has
     problem: str | None = None  # why nothing of the file can be read
+    # By number: a topic that takes an old number later counts as the old one, as for other readers.
+    _channels: dict[int, ChannelCount] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Count from the start."""
+        self.count = FileCount(self.file.path.name)
 
     def watch(self) -> Iterator[Batch]:
         """The batches of the file, counted as they pass."""
         for batch in self.file.batches():
-            numbers, counts = np.unique(batch.channel, return_counts=True)
-            known = [number in self.file.channels for number in numbers.tolist()]
-            for number, messages in zip(numbers[known].tolist(), counts[known].tolist(), strict=True):
-                self._channel(number).messages += messages
-            times = batch.table[np.isin(batch.channel, numbers[known]), 2]
+            head = batch.head[np.isin(batch.channel, list(self.file.channels))]
+            for number, messages in zip(*np.unique(head["channel"], return_counts=True), strict=True):
+                self._channel(int(number)).messages += int(messages)
+            times = head["log_time"]
             if len(times):
                 self.count.start = min(self.count.start, int(times.min()))
                 self.count.end = max(self.count.end, int(times.max()))
@@ -264,11 +258,13 @@ class FileInventory:
             self.summary, self.stated_messages = summary_of(self.file.path)
 
     def _channel(self, number: int) -> ChannelCount:
-        channel = self.file.channels[number]
-        if channel.topic not in self.count.channels:
+        if number not in self._channels:
+            channel = self.file.channels[number]
             schema = self.file.schemas.get(channel.schema_id)
-            self.count.channels[channel.topic] = channel_count(channel, schema.name if schema else "")
-        return self.count.channels[channel.topic]
+            type_hash, qos = channel.metadata.get("topic_type_hash", ""), offered_profiles(channel)
+            new = ChannelCount(channel.topic, schema.name if schema else "", type_hash, qos)
+            self._channels[number] = self.count.channels.setdefault(channel.topic, new)
+        return self._channels[number]
 
     @property
     def whole(self) -> bool:
@@ -291,36 +287,20 @@ class FileInventory:
         return ", ".join(sorted(kinds)) or None
 
 
-@dataclass(slots=True)
-class Inventory:
-    """All files of a bag, in their order."""
-
-    files: list[FileInventory] = field(default_factory=list)
-
-    def add(self, file: StoredFile) -> FileInventory:
-        """Add a file that has not been read yet."""
-        self.files.append(FileInventory(file, FileCount(file.path.name)))
-        return self.files[-1]
-
-
 def summary_of(file: Path) -> tuple[Summary | None, int | None]:
-    """The summary at the end of an MCAP file, and the number of messages that it states.
-
-    No summary where it or its chunk indexes are wrong. The number is known also where the CRC shows that the summary is
-    right: then the head of a chunk is damaged.
-    """
+    """The summary of an MCAP file, None where it or its chunk indexes are wrong, and how many messages it states."""
     try:
         with file.open("rb") as stream:
             stream.seek(-_FOOTER.size, io.SEEK_END)
             start, _, crc = _FOOTER.unpack(stream.read())
             stream.seek(start)
-            if crc and crc != zlib.crc32(stream.read()[:-_BEHIND_CRC]):  # the library does not check it
-                return None, None
+            right = not crc or crc == zlib.crc32(stream.read()[:-_BEHIND_CRC])  # the library does not check it
             stream.seek(0)
-            summary = SeekingReader(stream, record_size_limit=RECORD_LIMIT).get_summary()
+            summary = SeekingReader(stream, record_size_limit=RECORD_LIMIT).get_summary() if right else None
             if summary is None:
                 return None, None
             right = all(_is_there(stream, index) for index in summary.chunk_indexes)
+            # With a correct CRC, the summary is right, and the head of a chunk is damaged.
             stated = summary.statistics.message_count if summary.statistics and (right or crc) else None
             return summary if right else None, stated
     except Exception:  # the library raises many kinds of errors on damage
@@ -334,12 +314,6 @@ def _is_there(stream: BinaryIO, index: ChunkIndex) -> bool:
     found = bytearray(stream.read(len(head)))
     found[CHUNK_CRC] = head[CHUNK_CRC]
     return found == head and len(head) + index.compressed_size == index.chunk_length
-
-
-def channel_count(channel: Channel, type_name: str) -> ChannelCount:
-    """A topic without messages yet, from an MCAP channel; ``type_name`` is ``package/msg/Name``."""
-    type_hash = channel.metadata.get("topic_type_hash", "")
-    return ChannelCount(channel.topic, type_name, type_hash, offered_profiles(channel))
 
 
 def offered_profiles(channel: Channel) -> list[Any]:

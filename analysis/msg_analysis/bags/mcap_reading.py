@@ -3,8 +3,7 @@
 
 """The messages of an MCAP file, whole or torn, in batches that numpy can work on.
 
-A file is read once, from front to back, and all messages of a chunk are found at once. Damaged chunks are counted and
-left out; a tear ends the reading.
+Damaged chunks are counted and left out; a tear ends the reading.
 """
 
 from __future__ import annotations
@@ -82,11 +81,7 @@ class _Source:
         return found
 
     def messages(self, head: bytes) -> tuple[bytes, IntArray, IntArray, int]:
-        """Buffer, (messages,) content offsets and sizes in it, and bytes of all, of whole message records in a row.
-
-        The first is the one whose ``head`` was read last. 0 bytes where it is cut off or does not fit into ``loose``
-        bytes.
-        """
+        """Buffer, (messages,) offsets and sizes of contents, and bytes, of message records; ``head``: of the first."""
         if self._at >= len(head):
             self._at -= len(head)
         else:
@@ -97,8 +92,8 @@ class _Source:
                 break
             self._buffer, self._at = self._buffer[self._at :] + self._stream.read(self._loose), 0
         length, self._at = end - self._at, end
-        if not length:
-            self._at += len(head)  # the head counts as read again
+        if not length:  # cut off, or longer than ``loose``: the head counts as read again
+            self._at += len(head)
         return self._buffer, start, size, length
 
 
@@ -135,7 +130,7 @@ class McapFile(StoredFile):
             raise BagError(f"{self.path}: not an MCAP file: expected a bag of ROS 2's mcap storage")
         self.whole_bytes = len(MAGIC)
         _keep_memory()
-        zstd = zstandard.ZstdDecompressor()
+        zstd = zstandard.ZstdDecompressor()  # for all chunks: making one takes longer than a small chunk
         chunk: _Chunk | None = None
         for opcode, content, places in self._records(_Source(stream, self.loose), size):
             if opcode == Opcode.MESSAGE_INDEX and chunk is not None:
@@ -185,10 +180,7 @@ class McapFile(StoredFile):
             yield opcode, content, (np.array([0]), np.array([length]))
 
     def note(self, opcode: int, content: bytes) -> None:
-        """Take the content of a record that is not a message; DamageError where it does not fit its type.
-
-        BagError where there are too many channels.
-        """
+        """Take the content of a record that is no message; DamageError: not of its type; BagError: too many topics."""
         stream = ReadDataStream(io.BytesIO(content))
         try:
             if opcode == Opcode.HEADER:
@@ -213,22 +205,20 @@ class McapFile(StoredFile):
     def _chunk(self, chunk: _Chunk, zstd: zstandard.ZstdDecompressor) -> Iterator[Batch]:
         try:
             data = unpack(chunk.content, zstd)
-        except Exception:  # decompressors raise many kinds of errors on damage
-            self.damaged_chunks += 1
-            return
-        self.count_expanded(len(data), chunk.end)
-        try:
+            self.count_expanded(len(data), chunk.end)
             places = locate(data, chunk.index)
             if places is None:
                 places = self._walk(data)
-                self.false_indexes += bool(chunk.index) and not indexed(places[0], chunk.index)
+                named = _indexed_places(chunk.index)
+                right = named is not None and np.array_equal(named, (places[0] - RECORD.size).astype(np.uint64))
+                self.false_indexes += bool(chunk.index) and not right
             batch = Batch.of_contents(data, *places, chunk.end)
         except BagError:
             raise
-        except Exception:  # the library raises many kinds of errors on damage
+        except Exception:  # decompressors and the library raise many kinds of errors on damage
             self.damaged_chunks += 1
-            return
-        yield batch
+        else:
+            yield batch
 
     def _walk(self, data: bytes) -> tuple[IntArray, IntArray]:
         """(messages,) content offsets and sizes of all message records of a chunk; other records are noted."""
@@ -255,11 +245,9 @@ class McapFile(StoredFile):
 
 
 def _keep_memory() -> None:
-    """Let the C library keep large blocks that are freed from chunk to chunk, instead of mapping fresh pages each time.
-
-    Touching fresh pages takes longer than all that is done with a chunk. Freeing one large block raises the threshold
-    (mallopt(3), M_MMAP_THRESHOLD).
-    """
+    """Let the C library keep large blocks that are freed from chunk to chunk."""
+    # Mapping fresh pages each time takes longer than all that is done with a chunk. Freeing one large block raises the
+    # threshold (mallopt(3), M_MMAP_THRESHOLD).
     np.empty(2**24, np.uint8)
 
 
@@ -280,10 +268,7 @@ def chunk_head(index: ChunkIndex) -> bytes:
 
 
 def unpack(content: bytes, zstd: zstandard.ZstdDecompressor, limit: int = RECORD_LIMIT) -> bytes:
-    """The records in a chunk, from the content of its record; DamageError: too large, or a wrong checksum.
-
-    ``zstd`` is reused from chunk to chunk: making one takes longer than a small chunk.
-    """
+    """The records in a chunk, from the content of its record; DamageError: too large, or a wrong checksum."""
     _, _, size, crc, name_size = _CHUNK.unpack_from(content)
     at = _CHUNK.size + name_size
     name = content[_CHUNK.size : at]
@@ -311,17 +296,10 @@ def unpack(content: bytes, zstd: zstandard.ZstdDecompressor, limit: int = RECORD
 
 
 def locate(data: bytes, index: Sequence[bytes]) -> tuple[IntArray, IntArray] | None:
-    """(messages,) offsets of the contents of all message records of a chunk, ascending, and (messages,) their sizes.
-
-    ``index`` has the contents of the message index records behind the chunk. None where the messages that it names do
-    not fill the chunk from the first byte to the last: then only a walk from record to record finds what is there.
-    """
-    entries = [np.frombuffer(record, "<u8", offset=INDEX_HEAD) for record in index if _is_index(record)]
-    if not entries or len(entries) < len(index):
-        return None
-    start = np.concatenate(entries)[1::2]
-    start.sort(kind="stable")  # each channel's offsets are sorted already: a stable sort merges them, ten times as fast
-    if not len(start) or len(data) < RECORD.size or start[-1] > len(data) - RECORD.size:
+    """(messages,) ascending offsets and sizes of the contents of the records of a chunk, by its index records."""
+    start = _indexed_places(index)
+    # Unless these messages fill the chunk, only a walk from record to record finds what is there.
+    if start is None or not len(start) or len(data) < RECORD.size or start[-1] > len(data) - RECORD.size:
         return None
     start = start.astype(np.int64)
     head = gather(data, start, RECORD.size).view(_RECORD_HEAD)
@@ -333,11 +311,7 @@ def locate(data: bytes, index: Sequence[bytes]) -> tuple[IntArray, IntArray] | N
 
 
 def run_of_messages(data: bytes, at: int) -> tuple[IntArray, IntArray, int]:
-    """(messages,) content offsets and (messages,) sizes of the whole message records that follow ``at``, and their end.
-
-    Records are walked one by one while their lengths differ; after ``_ALIKE`` of equal length, the others of that
-    length are found at once.
-    """
+    """(messages,) offsets and sizes of the contents of the whole message records that follow ``at``, and their end."""
     starts: list[IntArray] = []
     sizes: list[IntArray] = []
     walked: list[tuple[int, int]] = []
@@ -357,7 +331,7 @@ def run_of_messages(data: bytes, at: int) -> tuple[IntArray, IntArray, int]:
             break
         alike = alike + 1 if length == before else 0
         before = length
-        if alike < _ALIKE:
+        if alike < _ALIKE:  # one by one while the lengths differ; then all of the same length at once
             walked.append((at + RECORD.size, length))
             at += step
             continue
@@ -373,17 +347,12 @@ def run_of_messages(data: bytes, at: int) -> tuple[IntArray, IntArray, int]:
     return np.concatenate([none, *starts]), np.concatenate([none, *sizes]), at
 
 
-def indexed(start: IntArray, index: Sequence[bytes]) -> bool:
-    """Whether a non-empty index names exactly the messages whose contents begin at ``start``, (messages,) ascending."""
-    if not all(map(_is_index, index)):
-        return False
-    entries = [np.frombuffer(record, "<u8", offset=INDEX_HEAD)[1::2] for record in index]
-    return np.array_equal(np.sort(np.concatenate(entries)), (start - RECORD.size).astype(np.uint64))
-
-
-def _is_index(record: bytes) -> bool:
-    """Whether it has the length that it states, in whole entries."""
-    if len(record) < INDEX_HEAD:
-        return False
-    size = int.from_bytes(record[INDEX_HEAD - 4 : INDEX_HEAD], "little")
-    return size == len(record) - INDEX_HEAD and size % 16 == 0
+def _indexed_places(index: Sequence[bytes]) -> IntArray | None:
+    """(messages,) ascending places of the messages that index records name; None: no records, or a wrong length."""
+    sizes = [int.from_bytes(record[INDEX_HEAD - 4 : INDEX_HEAD], "little") for record in index]
+    whole = all(len(record) == INDEX_HEAD + size and not size % 16 for record, size in zip(index, sizes, strict=True))
+    if not index or not whole:
+        return None
+    places = np.concatenate([np.frombuffer(record, "<u8", offset=INDEX_HEAD)[1::2] for record in index])
+    places.sort(kind="stable")  # each channel's are sorted already: a stable sort merges them, ten times as fast
+    return places

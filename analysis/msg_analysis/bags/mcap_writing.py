@@ -55,12 +55,14 @@ class McapWriter:
         *,
         chunk_size: int,
         compression: Compression,
+        level: int = ZSTD_LEVEL,
         profile: str = "ros2",
         library: str = "mcap",
         directory: str | None = None,  # of a temporary file; None: that of the system
         indexes_in_memory: int = INDEXES_IN_MEMORY,
     ) -> None:
-        self._stream, self._chunk_size, self._compression = stream, chunk_size, compression
+        self._stream, self._chunk_size = stream, chunk_size
+        self._compression, self._level = compression, level
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         # An index of a chunk has an entry for every channel: an hour of a thousand agents has gigabytes of them.
@@ -86,8 +88,8 @@ class McapWriter:
         """Append an attachment, outside the chunks."""
         record = _encoded(attachment)
         a, place = attachment, self._stream.tell()
-        index = (place, len(record), a.log_time, a.create_time, len(a.data), a.name, a.media_type)
-        self._attachment_indexes.append(AttachmentIndex(*index))
+        index = AttachmentIndex(place, len(record), a.log_time, a.create_time, len(a.data), a.name, a.media_type)
+        self._attachment_indexes.append(index)
         self._stream.write(record)
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
@@ -121,12 +123,9 @@ class McapWriter:
             self._finish_chunk()
 
     def add_messages(self, head: AnyArray, data: bytes, start: IntArray, size: IntArray) -> None:
-        """Append messages: heads (``MESSAGE_HEAD``), places and sizes of their bytes in ``data``, (messages,) each.
-
-        The same bytes as by ``add_message`` for each, in a fraction of the time.
-        """
+        """Append messages: heads (``MESSAGE_HEAD``), places and sizes of their bytes in ``data``, (messages,) each."""
         done = 0
-        while done < len(head):
+        while done < len(head):  # the same bytes as by ``add_message`` for each, in a fraction of the time
             piece = slice(done, done + self.fitting(size[done:]))
             self._add_piece(head[piece], data, start[piece], size[piece])
             done = piece.stop
@@ -169,7 +168,7 @@ class McapWriter:
         self._chunk.clear()
         self._index.clear()
         self._size = 0
-        compressed = _compressed(content, self._compression)
+        compressed = _compressed(content, self._compression, self._level)
         name = COMPRESSION_NAMES[self._compression].encode()
         times = np.frombuffer(b"".join(entries.values()), "<u8")[::2]
         start, end = int(times.min()), int(times.max())
@@ -179,17 +178,25 @@ class McapWriter:
         place = self._stream.tell()
         after = place + len(head) + len(compressed)
         indexes, offsets = bytearray(), {}
-        for channel, index in entries.items():
-            self._counts[channel] = self._counts.get(channel, 0) + len(index) // ENTRY.size
+        for channel, its in entries.items():
+            self._counts[channel] = self._counts.get(channel, 0) + len(its) // ENTRY.size
             offsets[channel] = after + len(indexes)
-            indexes += MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, len(index) + 6, channel, len(index))
-            indexes += index
+            indexes += MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, len(its) + 6, channel, len(its))
+            indexes += its
         for part in (head, compressed, indexes):
             self._stream.write(part)
-        sizes = {"compressed_size": len(compressed), "uncompressed_size": len(content), "chunk_length": after - place}
-        places = {"chunk_start_offset": place, "message_index_offsets": offsets, "message_index_length": len(indexes)}
-        times_and_name = {"message_start_time": start, "message_end_time": end, "compression": name.decode()}
-        self._chunk_indexes.write(_encoded(records.ChunkIndex(**sizes, **places, **times_and_name)))
+        index = records.ChunkIndex(
+            chunk_length=after - place,
+            chunk_start_offset=place,
+            compression=name.decode(),
+            compressed_size=len(compressed),
+            message_end_time=end,
+            message_index_length=len(indexes),
+            message_index_offsets=offsets,
+            message_start_time=start,
+            uncompressed_size=len(content),
+        )
+        self._chunk_indexes.write(_encoded(index))
         self._chunks += 1
         self._first = start if self._first is None else min(self._first, start)
         self._last = max(self._last, end)
@@ -220,35 +227,25 @@ class McapWriter:
 
     def _groups(self) -> Iterator[tuple[Opcode, Iterable[bytes]]]:
         """Opcode and bytes of the groups of the summary."""
-        groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
-            (Opcode.SCHEMA, self._schemas),
-            (Opcode.CHANNEL, self._channels),
-            (Opcode.STATISTICS, [self._statistics()]),
-        ]
-        for opcode, group in groups:
-            yield opcode, map(_encoded, group)
+        yield Opcode.SCHEMA, map(_encoded, self._schemas)
+        yield Opcode.CHANNEL, map(_encoded, self._channels)
+        yield Opcode.STATISTICS, [_encoded(self._statistics())]
         self._chunk_indexes.seek(0)
         yield Opcode.CHUNK_INDEX, iter(lambda: self._chunk_indexes.read(2**20), b"")
         yield Opcode.ATTACHMENT_INDEX, map(_encoded, self._attachment_indexes)
         yield Opcode.METADATA_INDEX, map(_encoded, self._metadata_indexes)
 
     def _statistics(self) -> records.Statistics:
-        counts = {
-            name: len(of)
-            for name, of in (
-                ("attachment_count", self._attachment_indexes),
-                ("channel_count", self._channels),
-                ("metadata_count", self._metadata_indexes),
-                ("schema_count", self._schemas),
-            )
-        }
-        messages = {"channel_message_counts": self._counts, "message_count": sum(self._counts.values())}
         return records.Statistics(
-            **counts,
-            **messages,
+            attachment_count=len(self._attachment_indexes),
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
             chunk_count=self._chunks,
-            message_start_time=self._first or 0,
+            message_count=sum(self._counts.values()),
             message_end_time=self._last,
+            message_start_time=self._first or 0,
+            metadata_count=len(self._metadata_indexes),
+            schema_count=len(self._schemas),
         )
 
 
@@ -259,11 +256,11 @@ def _encoded(record: McapRecord) -> bytes:
     return data
 
 
-def _compressed(data: bytes, compression: Compression) -> bytes:
+def _compressed(data: bytes, compression: Compression, level: int) -> bytes:
     if compression == "zstd":
         import zstandard
 
-        compressed: bytes = zstandard.compress(data, level=ZSTD_LEVEL)
+        compressed: bytes = zstandard.compress(data, level=level)
         return compressed
     if compression == "lz4":
         import lz4.frame
@@ -285,15 +282,13 @@ class LatchedMessage:
 
 
 class WrittenFile:
-    """A new file; OSError, from every method: exists, or cannot be written.
+    """A new file; OSError, from every method: exists, or cannot be written."""
 
-    A split bag knows where the file ends only when it is full: messages up to ``bound`` still belong into it then.
-    """
-
-    def __init__(self, path: Path, earlier: Sequence[FileCount], storage: Storage, *, begin: int = 0) -> None:
+    def __init__(self, path: Path, earlier: Sequence[FileCount], storage: Storage, begin: int) -> None:
         self.count = FileCount(path.name)
         self.begin = begin  # first time that belongs into it [ns]
-        self.bound: int | None = None  # last one [ns]; None: not full
+        # Last one [ns]; None: not full. Messages up to it still belong into a full file of a split bag.
+        self.bound: int | None = None
         self.behind: set[str] = set()  # topics of which messages up to the bound may still come
         self._earlier, self._storage, self._directory = list(earlier), storage, str(path.parent)
         self._numbers: dict[str, int] = {}  # of the channels
@@ -304,7 +299,7 @@ class WrittenFile:
         topics: Sequence[Topic],
         record: str | None,
         custom: Mapping[str, str],
-        latched: Iterable[LatchedMessage] = (),
+        latched: Iterable[LatchedMessage],
     ) -> None:
         """Write the run record, the topics, and what is in force of the latched ones; the first thing to be written."""
         storage, self._custom = self._storage, custom
@@ -337,17 +332,14 @@ class WrittenFile:
         """Whether it has as many bytes as a file of a split bag should have."""
         return self._limit is not None and self._stream.tell() >= self._limit
 
-    def add(self, topic: str, data: bytes, time_ns: int, sequence: int) -> None:
+    def add(self, topic: str, data: bytes, time_ns: int, sequence: int, published_ns: int | None = None) -> None:
         """Append a message."""
-        self.mcap.add_message(self._numbers[topic], time_ns, data, sequence)
+        self.mcap.add_message(self._numbers[topic], time_ns, data, sequence, published_ns)
         self._counted(topic, 1, time_ns, time_ns)
 
     def repeat(self, message: LatchedMessage) -> None:
         """Append a message again that another file has: logged at the beginning of this one, published when it was."""
-        self.mcap.add_message(
-            self._numbers[message.topic], self.begin, message.data, message.sequence, published_ns=message.time
-        )
-        self._counted(message.topic, 1, self.begin, self.begin)
+        self.add(message.topic, message.data, self.begin, message.sequence, message.time)
 
     def add_many(
         self,
@@ -376,12 +368,8 @@ class WrittenFile:
         return names
 
     def _counted(self, topic: str, messages: int, begin: int, end: int) -> None:
-        count = self.count
-        count.channels[topic].messages += messages
-        if end > count.end:
-            count.end = end
-        if begin < count.start:
-            count.start = begin
+        self.count.channels[topic].messages += messages
+        self.count.start, self.count.end = min(self.count.start, begin), max(self.count.end, end)
 
     def finish(self) -> None:
         """Write the summary; then the file is whole and on the disk."""

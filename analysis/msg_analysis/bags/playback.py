@@ -12,9 +12,10 @@ Messages of latched topics that later files of a split bag repeat are left out.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 
 from mcap.opcode import Opcode
@@ -68,11 +69,7 @@ class Message:
 
 
 class Playback:
-    """A bag, whole or torn, that is read in the order of time, as often as wanted, a piece at a time.
-
-    ``topics`` has those with messages, by name; ``start`` and ``end`` are the extreme log times [ns]; ``damage`` has a
-    line per damaged file, some only after reading. BagError: no bag, no messages, or a topic with two types.
-    """
+    """A bag in the order of time, a piece at a time; BagError: no bag, no messages, or a topic with two types."""
 
     def __init__(self, path: Path, most_held: int = MOST_HELD) -> None:
         self._most_held = most_held  # bytes
@@ -81,9 +78,10 @@ class Playback:
         ends = [outline.end for outline in self._outlines if outline.end is not None]
         if not starts:
             raise BagError(f"{path}: has no messages: there is nothing to play")
-        self.start, self.end = min(starts), max(ends)
+        self.start, self.end = min(starts), max(ends)  # extreme log times [ns]
+        # A line per damaged file, some only after reading.
         self.damage = [f"{outline.path}: {outline.damage}" for outline in self._outlines if outline.damage]
-        self.topics: dict[str, BagTopic] = {}
+        self.topics: dict[str, BagTopic] = {}  # with messages, by name
         for outline in self._outlines:
             for number, channel in outline.channels.items():
                 self._add(channel, outline.schemas.get(channel.schema_id), outline.counts.get(number, 0))
@@ -119,7 +117,8 @@ class Playback:
                 for number, channel in file.channels.items():
                     if number not in names:
                         names[number] = channel.topic if channel.topic in topics else None
-                for number, sequence, time, published, start, size in batch.table.tolist():
+                places = zip(batch.start.tolist(), batch.size.tolist(), strict=True)
+                for (number, sequence, time, published), (start, size) in zip(batch.head.tolist(), places, strict=True):
                     topic = names.get(number)
                     if topic is None:
                         continue
@@ -151,11 +150,8 @@ class Playback:
 
     def _starts_after(self) -> list[int]:
         """For each file, the earliest time [ns] in the files behind it."""
-        starts, least = [], 2**63
-        for outline in reversed(self._outlines):
-            starts.append(least)
-            least = min(least, 2**63 if outline.start is None else outline.start)
-        return starts[::-1]
+        starts = [2**63 if outline.start is None else outline.start for outline in reversed(self._outlines)]
+        return [*accumulate(starts[:-1], min, initial=2**63)][::-1]
 
 
 class _Repetitions:
@@ -180,10 +176,7 @@ class _Lows:
 
     def __init__(self, lows: list[tuple[int, int]], later: int) -> None:
         self._ends = [end for end, _ in lows]
-        self._from = [later]  # by piece: lowest time from it on
-        for _, low in reversed(lows):
-            self._from.append(min(self._from[-1], low))
-        self._from.reverse()
+        self._from = [*accumulate((low for _, low in reversed(lows)), min, initial=later)][::-1]  # lowest, by piece
         self._next = 0
 
     def behind(self, offset: int) -> int:
@@ -196,10 +189,7 @@ class _Lows:
 
 
 def _quick_outline(path: Path) -> _Outline | None:
-    """Outline from the heads of the records and the summary, without unpacking chunks; None where that is not enough.
-
-    It is enough for a file that was closed properly and has all messages in chunks, as most have.
-    """
+    """Outline by heads of records and the summary alone: of a closed file with all messages in chunks; else None."""
     outline, file = _Outline(path), McapFile(path)
     size = path.stat().st_size
     silent = None  # end of a chunk with times 0: its index tells whether it has messages
@@ -247,16 +237,15 @@ def _quick_outline(path: Path) -> _Outline | None:
 def _outline(path: Path) -> _Outline:
     """Outline by reading all of a file; BagError: not an MCAP file, empty, or one that cannot be read."""
     outline, file = _Outline(path), stored_file(path)
+    counts: Counter[int] = Counter()
     for batch in file.batches():
-        if not len(batch.table):
-            continue
-        times = batch.table[:, 2]
-        first, last = int(times.min()), int(times.max())
-        outline.lows.append((batch.end, first))
-        outline.start = first if outline.start is None else min(outline.start, first)
-        outline.end = last if outline.end is None else max(outline.end, last)
-        for number in batch.channel.tolist():
-            outline.counts[number] = outline.counts.get(number, 0) + 1
+        if len(batch.head):
+            times = batch.head["log_time"]
+            outline.lows.append((batch.end, int(times.min())))
+            outline.end = max(outline.end or 0, int(times.max()))
+            counts.update(batch.channel.tolist())
+    outline.start = min((low for _, low in outline.lows), default=None)
+    outline.counts = dict(counts)
     outline.channels, outline.schemas = file.channels, file.schemas
     notes = [file.torn] if file.torn else []
     if file.damaged_chunks:

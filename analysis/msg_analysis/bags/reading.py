@@ -1,10 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reads a recorded run, whichever program recorded it, and counts what is there and what is missing.
-
-The run record comes from the topic `experiment`, or from the metadata of files that this software wrote.
-"""
+"""Reads a recorded run, whichever program recorded it, and counts what is there and what is missing."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Metadata
 
-from msg_analysis.bags.files import Inventory, bag_files, first_file, stored_file
+from msg_analysis.bags.files import FileInventory, bag_files, first_file, stored_file
 from msg_analysis.bags.mcap_reading import MAGIC, RECORD
 from msg_analysis.bags.mcap_writing import RECORD_NAME
 from msg_analysis.bags.states import Collector
@@ -33,6 +30,7 @@ from msg_analysis.bags.writing import recording_pid
 from msg_analysis.common.arrays import AnyArray, IntArray
 from msg_analysis.common.resources import tell
 from msg_analysis.errors import BagError, InputError
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import CdrError
 from msg_analysis.messages.messages import (
@@ -49,7 +47,7 @@ from msg_analysis.model.run_record import RunRecord
 
 # Topics are recognised by type and by the end of their name: the network may run in any namespace.
 _STATE, _TRUTH, _GRAPH, _EXPERIMENT, _STOP = "state", "truth", "graph", "experiment", "stop"
-_NUMBERS = {None: 0, _STATE: 1, _TRUTH: 2, _GRAPH: 3, _EXPERIMENT: 4, _STOP: 5}
+_NUMBERS = {_STATE: 1, _TRUTH: 2, _GRAPH: 3, _EXPERIMENT: 4, _STOP: 5}
 _TOPICS = {
     AGENT_STATE.full_name: re.compile(r"(?:^|/)agent_\d+/(state|truth)$"),
     ACTIVE_GRAPH.full_name: re.compile(r"(?:^|/)(graph)$"),
@@ -60,7 +58,7 @@ MOST_SEARCHED = 16 << 20  # bytes of messages in which the record of another rec
 MOST_RECORDS = 100  # different run records that a bag may have: reading each takes milliseconds
 
 
-def read_bag(path: str | Path, inventory: Inventory | None = None) -> Run:
+def read_bag(path: str | Path, inventory: list[FileInventory] | None = None) -> Run:
     """The run in a bag of msg-agents, the twin or ``ros2 bag``; torn and damaged bags as far as possible.
 
     Parameters
@@ -68,7 +66,7 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Run:
     path
         directory of a bag, or one of its files (.mcap, .db3)
     inventory
-        filled with what the files hold, even if no run can be made of it
+        gets what the files hold, even if no run can be made of it
 
     Raises
     ------
@@ -83,9 +81,11 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Run:
     files = bag_files(path)
     for number, file in enumerate(files):
         tell(f"reading {path.name}", number, len(files))
-        entry = (inventory or Inventory()).add(stored_file(file))
+        entry = FileInventory(stored_file(file))
+        if inventory is not None:
+            inventory.append(entry)
         try:
-            contents.read(entry.file, entry.watch() if inventory else entry.file.batches())
+            contents.read(entry.file, entry.file.batches() if inventory is None else entry.watch())
         except BagError as error:  # the recorder died just after it made the file, or its start is damaged
             entry.problem = str(error)
             unreadable.append(error)
@@ -96,10 +96,7 @@ def read_bag(path: str | Path, inventory: Inventory | None = None) -> Run:
 
 
 def read_record(path: str | Path, *, most: int | None = None) -> RunRecord:
-    """The run record of a bag, as ``read_bag`` finds it, without the states; at once where it comes first.
-
-    BagError or InputError: no bag, or no valid run record in the first ``most`` bytes of messages (None: in all).
-    """
+    """The run record alone; BagError or InputError: no bag, or no valid one in the first ``most`` bytes of messages."""
     path = Path(path)
     contents = _Contents(path)
     unreadable: list[BagError] = []
@@ -113,8 +110,9 @@ def read_record(path: str | Path, *, most: int | None = None) -> RunRecord:
                     return _choose(contents)
                 contents.learn(batch, kind)
                 contents.learn_metadata(file)
-                if (known := contents.first_record()) is not None:
-                    return known
+                for record in contents.records.values():
+                    if isinstance(record, RunRecord):
+                        return record
         except BagError as error:
             unreadable.append(error)
         contents.learn_metadata(file)
@@ -133,9 +131,9 @@ class _Contents:
     # By their bytes: every file of a split bag may begin with those in force.
     graphs: dict[bytes, ActiveGraph] = field(default_factory=dict)
     stops: set[tuple[bytes, int]] = field(default_factory=set)  # run, and the step at which it ended early
-    # Run records by text, in order, or why a text is not one: from the topic, and from the metadata of our files.
-    experiments: dict[str, RunRecord | InputError] = field(default_factory=dict)
-    metadata: dict[str, None] = field(default_factory=dict)
+    # Run records by text, in order, from the topic and from the metadata of our files, or why a text is not one: that
+    # matters only if no text is (another program's topic).
+    records: dict[str, RunRecord | InputError] = field(default_factory=dict)
     refused: Counter[str] = field(default_factory=Counter)
 
     def read(self, file: StoredFile, batches: Iterable[Batch]) -> None:
@@ -147,8 +145,8 @@ class _Contents:
         self.refused[Refusal.DAMAGED_CHUNK] += file.damaged_chunks
 
     def network_topics(self, file: StoredFile, batches: Iterable[Batch]) -> Iterator[tuple[Batch, AnyArray]]:
-        """Each batch with the kinds of its messages, (messages,): one of ``_NUMBERS``."""
-        kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel; 0: not a topic of the network
+        """Each batch with the kinds of its messages, (messages,): ``_NUMBERS``; 0: not of a topic of the network."""
+        kind_of = np.zeros(2**16, dtype=np.int8)  # by number of the channel
         known = 0
         size = file.path.stat().st_size
         for batch in batches:
@@ -156,16 +154,16 @@ class _Contents:
             for number, channel in itertools.islice(file.channels.items(), known, None):
                 schema = file.schemas.get(channel.schema_id)
                 pattern = _TOPICS.get(schema.name if schema else "")
-                found = pattern.search(channel.topic) if pattern else None
-                kind_of[number] = _NUMBERS[found[1] if found else None]
+                if pattern and (found := pattern.search(channel.topic)):
+                    kind_of[number] = _NUMBERS[found[1]]
             known = len(file.channels)
             yield batch, kind_of[batch.channel]
 
     def learn_metadata(self, file: StoredFile) -> None:
         """Take the run records in the metadata of a file."""
         for record in file.metadata:
-            if record.name == RECORD_NAME and "record" in record.metadata and len(self.metadata) < MOST_RECORDS:
-                self.metadata[record.metadata["record"]] = None
+            if record.name == RECORD_NAME and "record" in record.metadata and len(self.records) < MOST_RECORDS:
+                self._learn(record.metadata["record"])
 
     def _add(self, batch: Batch, kind: AnyArray) -> None:
         self.learn(batch, kind)  # first: states of a known run are put in their places at once
@@ -188,51 +186,42 @@ class _Contents:
         """Take the run records in a batch with messages of these kinds, (messages,)."""
         for index in np.flatnonzero(kind == _NUMBERS[_EXPERIMENT]).tolist():
             try:
-                self._learn(decode_string(batch.message(index)))
+                text = decode_string(batch.message(index))
             except CdrError:
                 self.refused[Refusal.UNDECODABLE] += 1
-
-    def first_record(self) -> RunRecord | None:
-        """The first valid run record so far."""
-        found = (*self.experiments.values(), *map(self.parsed, self.metadata))
-        return next((record for record in found if isinstance(record, RunRecord)), None)
+                continue
+            if text not in self.records and len(self.records) >= MOST_RECORDS:
+                raise BagError(
+                    f"{self.path}: more than {MOST_RECORDS} different messages on the topic `experiment`: expected the "
+                    "one record of a run: record each run into a bag of its own"
+                )
+            self._learn(text)
 
     def _learn(self, text: str) -> None:
-        if text in self.experiments:
+        if text in self.records:
             return
-        if len(self.experiments) >= MOST_RECORDS:
-            raise BagError(
-                f"{self.path}: more than {MOST_RECORDS} different messages on the topic `experiment`: expected the one "
-                "record of a run: record each run into a bag of its own"
-            )
-        self.experiments[text] = record = self.parsed(text)
-        if isinstance(record, RunRecord):
-            for collector, width in zip((self.states, self.truths), _widths(record), strict=True):
-                collector.expect(record, width)
-
-    def parsed(self, text: str) -> RunRecord | InputError:
-        """A run record, or why the text is not one: that matters only if no text is (another program's topic)."""
         try:
-            return RunRecord.from_json(text, f"{self.path}: topic experiment")
+            self.records[text] = record = RunRecord.from_json(text, f"{self.path}: topic experiment")
         except InputError as error:
-            return error
+            self.records[text] = error
+            return
+        for collector, width in zip((self.states, self.truths), _widths(record.experiment), strict=True):
+            collector.expect(record, width)
 
 
-def _widths(record: RunRecord) -> tuple[int, int]:
+def _widths(experiment: Experiment) -> tuple[int, int]:
     """Lengths of the states on the topics `state` and `truth`."""
-    experiment = record.experiment
     return (experiment.run.replicas, experiment.width) if experiment.truth else (experiment.width, 0)
 
 
 def _choose(contents: _Contents) -> RunRecord:
     """The run record of the one run that has states."""
-    path = contents.path
-    later = (text for text in contents.metadata if text not in contents.experiments)
-    found = [*contents.experiments.values(), *map(contents.parsed, later)]
-    if not found and contents.refused[Refusal.DAMAGED_CHUNK]:
+    path, damaged = contents.path, contents.refused[Refusal.DAMAGED_CHUNK]
+    found = contents.records.values()
+    if not found and damaged:
         raise BagError(
-            f"{path}: {contents.refused[Refusal.DAMAGED_CHUNK]} chunks are damaged (wrong checksums, or times that no "
-            "clock shows), and no record of the run is in what is left: copy the bag again, or record the run again"
+            f"{path}: {damaged} chunks are damaged (wrong checksums, or times that no clock shows), and no record of "
+            "the run is in what is left: copy the bag again, or record the run again"
         )
     if not found:
         pid = recording_pid(path)
@@ -241,7 +230,6 @@ def _choose(contents: _Contents) -> RunRecord:
             f"{path}: the latched topic `experiment` is missing, so the run is not known{hint}: record that topic too, "
             "with durability transient_local (as `ros2 bag record -a` does)"
         )
-    errors = [each for each in found if isinstance(each, InputError)]
     records: dict[bytes, RunRecord] = {}
     for each in found:
         if not isinstance(each, RunRecord):
@@ -253,7 +241,7 @@ def _choose(contents: _Contents) -> RunRecord:
                 "program published on the topic `experiment`; record the run again"
             )
     if not records:
-        raise errors[0]
+        raise next(each for each in found if isinstance(each, InputError))
     with_states = [record for run, record in records.items() if contents.states.count(run)]
     candidates = with_states or list(records.values())
     if len(candidates) > 1:
@@ -270,7 +258,7 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Run:
         record = record.ended(end)
     experiment = record.experiment
     modes = _modes(contents, record.run.bytes, experiment.steps, planned, len(experiment.graph_list))
-    published, widths = None, _widths(record)
+    published, widths = None, _widths(experiment)
     truth = contents.states.finish(record, widths[0])
     if experiment.truth:
         published, truth = truth, contents.truths.finish(record, widths[1])
@@ -292,9 +280,13 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Run:
         missing_modes=int((modes < 0).sum()),
         refused={reason: count for reason, count in sorted(contents.refused.items()) if count},
     )
-    logged: dict[str, Any] = {"lost": truth.lost, "used": truth.used, "made": truth.made}
-    states = published.states if published else None
-    return Run(record, truth.states, modes, completeness, truth.modes, published=states, **logged)
+    return Run(
+        *(record, truth.states, modes, completeness, truth.modes),
+        lost=truth.lost,
+        used=truth.used,
+        made=truth.made,
+        published=published.states if published else None,
+    )
 
 
 def _end(contents: _Contents, record: RunRecord) -> int | None:
@@ -309,10 +301,7 @@ def _end(contents: _Contents, record: RunRecord) -> int | None:
 
 
 def _modes(contents: _Contents, run: bytes, steps: int, planned: int, graphs: int) -> IntArray:
-    """(N,) graph of every step from the sojourns, from 0; -1 where none or more than one covers it.
-
-    Sojourns may go on after ``steps``, up to the ``planned`` ones.
-    """
+    """(N,) graph of every step, from 0; -1: no sojourn, or more than one. They may go on up to the planned steps."""
     sojourns: set[tuple[int, int, int, int]] = set()
     for graph in contents.graphs.values():
         if graph.run != run:
@@ -323,7 +312,7 @@ def _modes(contents: _Contents, run: bytes, steps: int, planned: int, graphs: in
             sojourns.add((graph.sequence, graph.mode, graph.first_step, graph.last_step))
     modes = np.full(steps, -1, dtype=np.int64)
     claims = np.zeros(steps, dtype=np.int64)
-    for _, mode, first, last in sorted(sojourns):
+    for _, mode, first, last in sojourns:
         modes[first : last + 1] = mode - 1
         claims[first : last + 1] += 1
     modes[claims != 1] = -1
@@ -331,11 +320,8 @@ def _modes(contents: _Contents, run: bytes, steps: int, planned: int, graphs: in
 
 
 def record_document(path: Path) -> dict[str, Any]:
-    """The document of the run record of a bag; only that of another recorder's bag is checked.
-
-    BagError: there is none in the first ``MOST_SEARCHED`` bytes; InputError: it is not valid.
-    """
-    text = _head_record(first_file(path)) or read_record(path, most=MOST_SEARCHED).to_json()
+    """The document of the run record, checked if another recorded the bag; BagError: none is found; InputError."""
+    text = _head_record(path) or read_record(path, most=MOST_SEARCHED).to_json()
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -348,14 +334,15 @@ def record_document(path: Path) -> dict[str, Any]:
 def started(path: Path) -> datetime | None:
     """When the run of a bag was started, by the head of its first file alone; None where that does not say it."""
     try:
-        found = datetime.fromisoformat(json.loads(_head_record(first_file(path)) or "{}")["started"])
+        found = datetime.fromisoformat(json.loads(_head_record(path) or "{}")["started"])
         return found if found.tzinfo else found.replace(tzinfo=UTC)
     except (BagError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 
-def _head_record(file: Path | None) -> str | None:
+def _head_record(bag: Path) -> str | None:
     """The text that our recorder and the twin put before the first chunk of an MCAP file; None where there is none."""
+    file = first_file(bag)
     if file is None or file.suffix != ".mcap":
         return None
     try:
@@ -373,7 +360,8 @@ def _head_record(file: Path | None) -> str | None:
                     if record.name == RECORD_NAME:
                         found: str | None = record.metadata.get("record")
                         return found
-    except Exception as error:  # the library raises many kinds of errors on damage
-        if isinstance(error, OSError):
-            raise BagError(f"{file}: cannot be read ({error.strerror})") from error
+    except OSError as error:
+        raise BagError(f"{file}: cannot be read ({error.strerror})") from error
+    except Exception:  # the library raises many kinds of errors on damage
+        return None
     return None

@@ -9,12 +9,11 @@ Whole MCAP files are copied byte for byte; the others are rewritten from their w
 from __future__ import annotations
 
 import contextlib
-import itertools
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +21,9 @@ import numpy as np
 
 from msg_analysis.bags.files import (
     METADATA_FILE,
-    ChannelCount,
-    FileCount,
     FileInventory,
     bag_files,
     bag_information,
-    channel_count,
     dump,
     stored_file,
     write_metadata,
@@ -38,7 +34,6 @@ from msg_analysis.bags.writing import RECORDING_MARKER, exists_already, recordin
 from msg_analysis.errors import BagError
 
 LONGEST_LIST = 500  # characters of what is said of torn files
-_MORE = "; ..."
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,22 +45,10 @@ class SalvageReport:
     # Behind the whole records of torn files, and all of unreadable ones; not exact for a torn .zstd file, of which
     # packed and unpacked bytes are compared.
     dropped_bytes: int
-    lost_messages: int = 0  # in damaged chunks of files that still state how many they had; not those that are cut off
-    damaged_chunks: int = 0  # in the whole part; their content was lost
-    dropped_files: int = 0  # of which nothing can be read
-    torn: str | None = None  # instead of the end of the torn files, of many only the first; None: all were whole
-
-    def __add__(self, other: SalvageReport) -> SalvageReport:
-        """Of two files together."""
-        sums: list[Any] = [mine + its for mine, its in zip(astuple(self)[:-1], astuple(other)[:-1], strict=True)]
-        return SalvageReport(*[*sums, _joined(self.torn, other.torn)])
-
-
-def _joined(first: str | None, second: str | None) -> str | None:
-    """Both texts; of many, only the beginning."""
-    if first is None or second is None or first.endswith(_MORE):
-        return first or second
-    return f"{first}; {second}" if len(first) < LONGEST_LIST else first + _MORE
+    lost_messages: int  # in damaged chunks of files that still state how many they had; not those that are cut off
+    damaged_chunks: int  # in the whole part; their content was lost
+    dropped_files: int  # of which nothing can be read
+    torn: str | None  # instead of the end of the torn files, of many only the first; None: all were whole
 
 
 def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
@@ -97,26 +80,25 @@ def salvage(torn: str | Path, out: str | Path) -> SalvageReport:
     try:
         if out.exists():
             raise exists_already(out)
-        entries, total = _read_all(files, parts=True)
-        if not total.kept_messages:
+        entries = _read_all(files, parts=True)
+        report = _report(entries)
+        if not report.kept_messages:
             raise BagError(f"{torn}: no whole message is left in it: nothing can be salvaged")
         unfinished.mkdir(parents=True)
-        readable = [entry for entry in entries if not entry.problem]
-        for number, entry in enumerate(readable):
-            copy = unfinished / f"{out.name}_{number}.mcap"
+        for number, entry in enumerate(_readable(entries)):
+            entry.count.name = f"{out.name}_{number}.mcap"
+            copy = unfinished / entry.count.name
             if entry.whole:
                 shutil.copyfile(entry.file.path, copy)
-                entry.count.name = copy.name
             else:
-                entry.count = _copy(entry.file.path, copy)
-        counts = [entry.count for entry in readable]
-        write_metadata(unfinished, _information((entry.file for entry in entries), counts))
+                _copy(entry, copy)
+        write_metadata(unfinished, _information(entries))
         unfinished.rename(out)
     except OSError as error:
         raise BagError(f"{out}: cannot be written ({error.strerror}): choose another place") from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
-    return total
+    return report
 
 
 def salvage_in_place(directory: str | Path) -> SalvageReport:
@@ -130,32 +112,29 @@ def salvage_in_place(directory: str | Path) -> SalvageReport:
         raise BagError(f"{directory}: has its {METADATA_FILE}: it is a bag already, nothing to salvage")
     _refuse_living(directory)
     # A file that cannot be read to its end stays as it is: of a disk, another attempt may read more.
-    entries, total = _read_all(bag_files(directory), parts=False)
-    readable = [entry for entry in entries if not entry.problem]
-    copies: dict[Path, Path] = {}  # of the files that are not whole
+    entries = _read_all(bag_files(directory), parts=False)
+    report = _report(entries)
+    copies: dict[Path, FileInventory] = {}  # of the files that are not whole
     try:
-        for entry in readable:
-            file = entry.file.path
+        for entry in _readable(entries):
             if not entry.whole:
-                copies[file] = file.with_name(f".{file.name}.salvaged")
-                entry.count = _copy(file, copies[file])
-        for entry in readable:
-            file, name = entry.file.path, entry.file.path.name
-            if file in copies:  # the copy is MCAP, compressed by chunks
-                name = name.removesuffix(ZSTD_SUFFIX).removesuffix(SQLITE_SUFFIX).removesuffix(".mcap") + ".mcap"
-                copies[file].replace(file.with_name(name))
-                if name != file.name:
-                    file.unlink()
-            entry.count.name = name
-        information = _information((entry.file for entry in entries), [entry.count for entry in readable])
-        write_metadata(directory, information)
+                name = entry.count.name.removesuffix(ZSTD_SUFFIX).removesuffix(SQLITE_SUFFIX).removesuffix(".mcap")
+                entry.count.name = f"{name}.mcap"  # whatever the file was, compressed by chunks
+                copy = directory / f".{entry.file.path.name}.salvaged"
+                copies[copy] = entry
+                _copy(entry, copy)
+        for copy, entry in copies.items():
+            copy.replace(directory / entry.count.name)
+            if entry.count.name != entry.file.path.name:
+                entry.file.path.unlink()
+        write_metadata(directory, _information(entries))
         (directory / RECORDING_MARKER).unlink(missing_ok=True)
     except OSError as error:
         raise BagError(f"{directory}: cannot be written ({error.strerror}): nothing was lost, try again") from error
     finally:
-        for copy in copies.values():
+        for copy in copies:
             copy.unlink(missing_ok=True)
-    return total
+    return report
 
 
 def _refuse_living(bag: Path) -> None:
@@ -164,15 +143,10 @@ def _refuse_living(bag: Path) -> None:
         raise BagError(f"{bag}: process {pid} is recording it: stop that first")
 
 
-def _read_all(files: Sequence[Path], *, parts: bool) -> tuple[list[FileInventory], SalvageReport]:
-    """Read all files: what each holds, and the report of all.
-
-    With ``parts``, a file that cannot be read any further counts as torn there, otherwise as unreadable.
-    """
-    entries, total = [], SalvageReport(0, 0, 0)
-    for file in files:
-        entry = FileInventory(stored_file(file), FileCount(file.name))
-        entries.append(entry)
+def _read_all(files: Sequence[Path], *, parts: bool) -> list[FileInventory]:
+    """What each file holds; with ``parts``, one that cannot be read any further is torn there, else unreadable."""
+    entries = [FileInventory(stored_file(file)) for file in files]
+    for entry in entries:
         try:
             for _ in entry.watch():
                 pass
@@ -181,123 +155,115 @@ def _read_all(files: Sequence[Path], *, parts: bool) -> tuple[list[FileInventory
                 entry.file.torn = str(error)
             else:
                 entry.problem = str(error)
-            if len(entries) == len(files) and all(entry.problem for entry in entries):
-                raise
-        total += _report(entry)
-    return entries, total
+    if not _readable(entries):
+        raise BagError(entries[-1].problem)
+    return entries
 
 
-def _report(entry: FileInventory) -> SalvageReport:
-    source, size = entry.file, entry.file.path.stat().st_size
-    if entry.problem:
-        return SalvageReport(0, 0, size, dropped_files=1)
-    dropped = 0 if source.torn is None else max(0, size - source.whole_bytes)
-    lost, damaged = entry.lost_messages or 0, source.damaged_chunks
-    return SalvageReport(entry.count.messages, source.whole_bytes, dropped, lost, damaged, torn=source.torn)
+def _readable(entries: Sequence[FileInventory]) -> list[FileInventory]:
+    return [entry for entry in entries if not entry.problem]
 
 
-def _information(files: Iterable[StoredFile], counts: Sequence[FileCount]) -> dict[str, Any]:
+def _report(entries: Sequence[FileInventory]) -> SalvageReport:
+    dropped = 0
+    for entry in entries:
+        size = entry.file.path.stat().st_size
+        if entry.problem:
+            dropped += size
+        elif entry.file.torn:
+            dropped += max(0, size - entry.file.whole_bytes)
+    readable = _readable(entries)
+    torn = "; ".join(entry.file.torn for entry in readable if entry.file.torn)
+    end = torn.find("; ", LONGEST_LIST)
+    return SalvageReport(
+        kept_messages=sum(entry.count.messages for entry in readable),
+        kept_bytes=sum(entry.file.whole_bytes for entry in readable),
+        dropped_bytes=dropped,
+        lost_messages=sum(entry.lost_messages or 0 for entry in readable),
+        damaged_chunks=sum(entry.file.damaged_chunks for entry in readable),
+        dropped_files=len(entries) - len(readable),
+        torn=(torn if end < 0 else f"{torn[:end]}; ...") or None,
+    )
+
+
+def _information(entries: Sequence[FileInventory]) -> dict[str, Any]:
     """What is said of the new bag, or of one of its files: that it was salvaged, and what is known of the torn one."""
-    custom = {"complete": "false", "salvaged": "true"}
-    for file in files:
-        record = _run_record(file)
-        if "run" in record:
-            return bag_information(counts, {"run": str(record["run"]), **custom}, _distribution(record))
-    return bag_information(counts, custom, "")
+    record: dict[str, Any] = next((found for entry in entries if (found := _run_record(entry.file))), {})
+    versions = record.get("versions")
+    distribution = str(versions.get("ros_distro", "")) if isinstance(versions, dict) else ""
+    custom = {"run": str(record["run"])} if record else {}
+    counts = [entry.count for entry in _readable(entries)]
+    return bag_information(counts, custom | {"complete": "false", "salvaged": "true"}, distribution)
 
 
 def _run_record(file: StoredFile) -> dict[str, Any]:
     """The run record that the recorder wrote into the file; empty where there is none."""
     for record in file.metadata:
         with contextlib.suppress(ValueError, KeyError, RecursionError):  # another's of that name
-            if record.name == RECORD_NAME and isinstance(found := json.loads(record.metadata["record"]), dict):
+            found = json.loads(record.metadata["record"]) if record.name == RECORD_NAME else None
+            if isinstance(found, dict) and "run" in found:
                 return found
     return {}
 
 
-def _distribution(record: Mapping[str, Any]) -> str:
-    """The ROS 2 that a run was recorded with; empty where its record does not say."""
-    versions = record.get("versions")
-    return str(versions.get("ros_distro", "")) if isinstance(versions, dict) else ""
-
-
-def _readable(file: StoredFile) -> Iterator[Batch]:
-    """Its messages up to where it cannot be read any further; some are known to be there."""
-    with contextlib.suppress(BagError):
-        yield from file.batches()
-
-
-def _copy(file: Path, copy: Path) -> FileCount:
-    """Write what is whole in one file to a new one."""
-    source = stored_file(file)
-    count = FileCount(copy.name)
+def _copy(entry: FileInventory, copy: Path) -> None:
+    """Write what is whole in a file to a new one."""
+    source = stored_file(entry.file.path)
     with copy.open("wb") as stream:
-        batches = _readable(source)
-        first = next(batches, None)  # reads the header
         writer = McapWriter(
             stream,
             chunk_size=CHUNK_SIZE,
             compression="zstd",
-            profile=source.profile or "ros2",
-            library=source.library or "mcap",
+            profile=entry.file.profile or "ros2",
+            library=entry.file.library or "mcap",
             directory=str(copy.parent),
         )
-        channels = _Channels(writer, source, count)
-        for batch in itertools.chain([first] if first else [], batches):
-            channels.write(batch)
-        channels.register_all()
+        channels = _Channels(writer, source)
+        with contextlib.suppress(BagError):  # as far as it can be read: what is there was read before
+            for batch in source.batches():
+                channels.copy(batch)
+        for number in source.channels:
+            channels.number(number)
         for record in source.metadata:
             writer.add_metadata(record.name, record.metadata)
         for item in source.attachments:
             writer.add_attachment(item)
-        writer.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": dump(_information([source], [count]))})
+        writer.add_metadata(ROSBAG2_RECORD, {"serialized_metadata": dump(_information([entry]))})
         writer.finish()
         stream.flush()
         os.fsync(stream.fileno())
-    return count
 
 
 class _Channels:
     """Copies messages; registers their channels and schemas in the new file when they first appear."""
 
-    def __init__(self, writer: McapWriter, source: StoredFile, count: FileCount) -> None:
-        self._writer, self._source, self._count = writer, source, count
-        self._schemas: dict[int, int] = {0: 0}  # number in the source: number in the copy; 0 means none
-        # Number in the copy, and the count, of every number in the source; a topic that takes an old number later
-        # counts as the old one, as for other readers.
-        self._channels: dict[int, tuple[int, ChannelCount]] = {}
+    def __init__(self, writer: McapWriter, source: StoredFile) -> None:
+        self._writer, self._source = writer, source
+        # Numbers in the copy by those in the source. A topic that takes an old number later keeps the copy of the old
+        # one, as for other readers.
+        self._numbers: dict[int, int] = {}
+        self._schemas: dict[int, int] = {}
 
-    def register_all(self) -> None:
-        for number in self._source.channels:
-            self._register(number)
+    def number(self, number: int) -> int:
+        """In the copy, of a channel of the source."""
+        if number not in self._numbers:
+            channel = self._source.channels[number]
+            schema = self._source.schemas.get(channel.schema_id)
+            if schema is not None and schema.id not in self._schemas:
+                self._schemas[schema.id] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            copied = self._schemas[schema.id] if schema else 0  # 0: none
+            self._numbers[number] = self._writer.register_channel(
+                channel.topic, channel.message_encoding, copied, channel.metadata
+            )
+        return self._numbers[number]
 
-    def _register(self, number: int) -> tuple[int, ChannelCount]:
-        if number in self._channels:
-            return self._channels[number]
-        channel = self._source.channels[number]
-        schema = self._source.schemas.get(channel.schema_id)
-        if schema is not None and schema.id not in self._schemas:
-            self._schemas[schema.id] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
-        copied = self._schemas[schema.id] if schema else 0
-        copy = self._writer.register_channel(channel.topic, channel.message_encoding, copied, channel.metadata)
-        count = self._count.channels.setdefault(channel.topic, channel_count(channel, schema.name if schema else ""))
-        self._channels[number] = copy, count
-        return self._channels[number]
-
-    def write(self, batch: Batch) -> None:
+    def copy(self, batch: Batch) -> None:
         # The channel of a message may have been in a chunk that is lost.
         known = np.flatnonzero(np.isin(batch.channel, list(self._source.channels)))
-        if not len(known):
-            return
         head = batch.head[known]
-        numbers, first, counts = np.unique(head["channel"], return_index=True, return_counts=True)
+        numbers, first = np.unique(head["channel"], return_index=True)
         renumbered = np.zeros(2**16, dtype=np.uint16)
-        for index in np.argsort(first).tolist():
-            number = int(numbers[index])
-            renumbered[number], count = self._register(number)
-            count.messages += int(counts[index])
+        for number in numbers[np.argsort(first)].tolist():
+            renumbered[number] = self.number(number)
         head["channel"] = renumbered[head["channel"]]
         self._writer.add_messages(head, batch.data, batch.start[known], batch.size[known])
-        file = self._count
-        file.start = min(file.start, int(head["log_time"].min()))
-        file.end = max(file.end, int(head["log_time"].max()))

@@ -3,7 +3,6 @@
 
 """The states of a run: decoded a batch at a time, and put in their places in the arrays of the result, in any order.
 
-States in other layouts than that of the agents (big-endian, with a ``frame_id``) are first encoded again in theirs.
 Beside the arrays of the result only a few numbers per state are held, whatever the length of the bag.
 """
 
@@ -110,16 +109,13 @@ def run_number(run: bytes) -> tuple[int, int]:
 
 
 def decode_states(batch: Batch, chosen: IntArray, position: int) -> tuple[States, int]:
-    """The messages with the indices ``chosen``, (k,), of a batch as states, and how many of them are not an AgentState.
-
-    ``position`` is the place in the bag of the first of them.
-    """
+    """The messages ``chosen``, (k,), of a batch, the first at ``position`` in the bag; how many are no AgentState."""
     start, size = batch.start[chosen], batch.size[chosen]
     place = position + np.arange(len(chosen))
     states, fixed = own_layout(batch.data, start, size, place)
     if fixed.all():
         return states, 0
-    data, pieces, end = batch.data, [], len(batch.data)
+    pieces, end = [batch.data], len(batch.data)
     for index in np.flatnonzero(~fixed).tolist():
         try:
             piece = _in_own_layout(batch.message(int(chosen[index])))
@@ -128,15 +124,12 @@ def decode_states(batch: Batch, chosen: IntArray, position: int) -> tuple[States
         fixed[index], start[index], size[index] = True, end, len(piece)
         pieces.append(piece)
         end += len(piece)
-    states, _ = own_layout(b"".join((data, *pieces)), start[fixed], size[fixed], place[fixed])
+    states, _ = own_layout(b"".join(pieces), start[fixed], size[fixed], place[fixed])
     return states, len(chosen) - len(states)
 
 
 def own_layout(data: bytes, start: IntArray, size: IntArray, position: IntArray) -> tuple[States, BoolArray]:
-    """The messages that have the agents' own layout, and (messages,) which ones have it.
-
-    Their offsets and sizes in ``data``, and their places in the bag, are (messages,) each.
-    """
+    """The messages that have the agents' own layout, and (messages,) which have: by places in ``data`` and the bag."""
     fixed = size >= STATE_SIZE
     long = start if fixed.all() else np.where(fixed, start, 0)
     if len(data) < STATE_SIZE:
@@ -172,10 +165,7 @@ _OTHER_COLUMNS = 4  # numbers of 8 bytes per state beside its own values, some o
 
 
 class Collector:
-    """Takes the states of one kind of topic (`state` or `truth`), of any runs.
-
-    States of runs whose record has not been seen yet wait for it, as bytes: in most bags the record comes first.
-    """
+    """Takes the states of one kind of topic (`state` or `truth`), of any runs."""
 
     def __init__(self) -> None:
         self._undecodable = 0
@@ -183,6 +173,7 @@ class Collector:
         self._expected: dict[tuple[int, int], tuple[RunRecord, int]] = {}
         self._counts: Counter[tuple[int, int]] = Counter()  # of the expected runs
         self._collected: dict[tuple[int, int], Collected] = {}
+        # For the record of their run, as bytes: in most bags the record comes first.
         self._waiting: list[States] = []
 
     def add(self, batch: Batch, chosen: IntArray) -> None:
@@ -198,28 +189,19 @@ class Collector:
     def _take(self, run: tuple[int, int], states: States) -> States:
         """Take those of a run; the others."""
         its = states.of_run(run)
-        if not its.any():
-            return states
-        self._counts[run] += int(its.sum())
-        if run not in self._collected:  # made for its first state: a bag may have records of runs without states
-            self._collected[run] = Collected(*self._expected[run])
-        self._collected[run].add(states if its.all() else states[its])
-        return states[:0] if its.all() else states[~its]
+        if its.any():
+            self._counts[run] += int(its.sum())
+            if run not in self._collected:  # made for its first state: a bag may have records of runs without states
+                self._collected[run] = Collected(*self._expected[run])
+            self._collected[run].add(states if its.all() else states[its])
+        return states[~its]
 
     def expect(self, record: RunRecord, width: int) -> None:
-        """From now on collect the states, of length ``width``, of this run; nothing where it is expected already.
-
-        BagError where the result does not fit into the memory of this machine.
-        """
+        """From now on collect the states, of this length, of a run; BagError: they do not fit into the memory."""
         run = run_number(record.run.bytes)
-        if run in self._expected:
-            return
-        self._expected[run] = record, width
-        waiting, self._waiting = self._waiting, []
-        for states in waiting:
-            others = self._take(run, states)
-            if len(others):
-                self._waiting.append(others)
+        if run not in self._expected:
+            self._expected[run] = record, width
+            self._waiting = [others for states in self._waiting if len(others := self._take(run, states))]
 
     def count(self, run: bytes) -> int:
         """Number of states of an expected run, given the 16 bytes of its id."""
@@ -238,11 +220,7 @@ class Collector:
 
 
 class Collected:
-    """The states of a run on one kind of topic, each once, by step and agent. BagError: too large for the memory.
-
-    After ``finish``: ``states`` (N + 1, m, width), NaN where missing; ``modes`` (N + 1, m) from 0, -1 where missing;
-    ``lost``, ``used`` and ``made`` as in ``Run``; the counts as in ``Completeness``.
-    """
+    """The states of a run on one kind of topic, each once, by step and agent. BagError: too large for the memory."""
 
     def __init__(self, record: RunRecord, width: int) -> None:
         experiment = record.experiment
@@ -250,12 +228,12 @@ class Collected:
         self._width = width
         self._graphs = len(experiment.graph_list)
         self._realtime = experiment.run.pace == "realtime"
-        self._record, self._experiment = record, experiment
-        self._delay, self._holds = experiment.noise.delay, experiment.noise.holds and not self._realtime
+        self._record = record
+        self._holds = experiment.noise.holds and not self._realtime
         self._lossy = experiment.noise.loss.any or self._realtime
         self._steps_used = self._realtime or self._holds  # whether the log has steps that cannot be known before
         # In lockstep, whether values of other steps than the newest are used, which the log mostly leaves out.
-        self._late = not self._realtime and bool(self._delay or self._holds)
+        self._late = not self._realtime and bool(experiment.noise.delay or self._holds)
         most = self._links.most if self._lossy or self._late else 0
         cells = self._shape[0] * self._shape[1]
         # The result has the size that the record states, however little of it the bag holds.
@@ -291,7 +269,25 @@ class Collected:
     def add(self, states: States) -> None:
         """Put states of this run in their places; they come in the order of the bag, from call to call too."""
         self._unreleased += len(states)
-        self._add(states)
+        states, values = self._good(states)
+        cell = states.step * self._shape[1] + states.agent - 1
+        place = states.position + 1
+        before = self._position[cell]
+        fresh = not before.any()
+        if fresh:
+            self._position[cell] = place
+        if fresh and np.array_equal(self._position[cell], place):  # no two are of the same agent and step
+            self._write(cell, states, values)
+        else:
+            _, first = np.unique(cell, return_index=True)
+            new = first[before[first] == 0]  # of several copies, the first in the bag
+            self._position[cell[new]] = place[new]
+            self._write(cell[new], states[new], values[new])
+            again = np.delete(np.arange(len(cell)), new)
+            differs = self._differ(cell[again], states[again], values[again])
+            self.duplicates += len(again)
+            self.refused[Refusal.CONTRADICTION] += int(differs.sum())
+            self._contradicted.append(np.unique(cell[again[differs]]))
         if self._unreleased * self._width > RELEASED_AT_ONCE:
             self._release()
 
@@ -300,31 +296,10 @@ class Collected:
         for array in (self._states, self._position, self._modes, self._used, self._made, self._lost):
             release(array)
 
-    def _add(self, states: States) -> None:
-        states, values = self._good(states)
-        cell = states.step * self._shape[1] + states.agent - 1
-        place = states.position + 1
-        before = self._position[cell]
-        if not before.any():
-            self._position[cell] = place
-            if np.array_equal(self._position[cell], place):  # no two are of the same agent and step
-                self._write(cell, states, values)
-                return
-            self._position[cell] = 0
-        _, first = np.unique(cell, return_index=True)
-        new = first[before[first] == 0]  # of several copies, the first in the bag
-        self._position[cell[new]] = place[new]
-        self._write(cell[new], states[new], values[new])
-        again = np.delete(np.arange(len(cell)), new)
-        differs = self._differ(cell[again], states[again], values[again])
-        self.duplicates += len(again)
-        self.refused[Refusal.CONTRADICTION] += int(differs.sum())
-        self._contradicted.append(np.unique(cell[again[differs]]))
-
     @cached_property
     def _links(self) -> LoggedInputs:
         """Made when the first ``heard`` has to be interpreted: most runs have none."""
-        return LoggedInputs(self._record.model, self._experiment)
+        return LoggedInputs(self._record.model, self._record.experiment)
 
     def _good(self, states: States) -> tuple[States, FloatArray]:
         """Those that can be states of this run, and their values; the others are counted by reason."""
@@ -404,13 +379,11 @@ class Collected:
 
     def finish(self) -> None:
         """Mark what is missing; call it after the last state."""
-        if self._contradicted:
+        for cells in self._contradicted:
             # One of the copies is wrong and it is not known which: the state counts as missing.
-            cells = np.concatenate(self._contradicted)
             for array in (self._position, self._modes, self._used, self._made, self._lost):
                 if len(array):
                     array[cells] = 0
-        self.received = 0
         for first in range(0, len(self._position), _CELLS):  # in pieces: a run may be long
             piece = slice(first, first + _CELLS)
             missing = self._position[piece] == 0
@@ -423,15 +396,14 @@ class Collected:
             self.received += len(missing) - int(missing.sum())
             self._release()
         self.out_of_order = _out_of_order(self._position.reshape(self._shape))
-        self.states = self._states.reshape(*self._shape, self._width)
-        self.modes = self._modes.reshape(self._shape)
-        most = self._links.most if self._lossy or self._late else 0
+        self.states = self._states.reshape(*self._shape, self._width)  # NaN where missing
+        self.modes = self._modes.reshape(self._shape)  # from 0; -1 where missing
         if self._realtime or self._late:
-            self.used = self._used.reshape(*self._shape, most)[1:]
+            self.used = self._used.reshape(*self._shape, self._used.shape[1])[1:]
         if self._realtime:
             self.made = self._made.reshape(self._shape)
         elif self._lossy:
-            self.lost = self._lost.reshape(*self._shape, most)[1:]
+            self.lost = self._lost.reshape(*self._shape, self._lost.shape[1])[1:]
 
     def _complete(self, piece: slice) -> None:
         """Put in the steps of values that the log leaves out, because no message was lost; and which were lost."""

@@ -64,10 +64,7 @@ class DamageError(Exception):
 
 
 def gather(data: bytes, start: IntArray, size: int) -> AnyArray:
-    """(pieces,) of type ``V<size>``: pieces of a buffer, ``size`` >= 1 bytes each, copied from the offsets ``start``.
-
-    ``.view`` gives them their type. IndexError where a piece ends behind the buffer.
-    """
+    """(pieces,) of type ``V<size>``, to be viewed as another: copies of a buffer from ``start`` on; else IndexError."""
     count = len(data) - size + 1
     if count < 1:
         if len(start):
@@ -113,10 +110,7 @@ class Batch:
 
     @classmethod
     def of_contents(cls, data: bytes, start: IntArray, size: IntArray, end: int) -> Batch:
-        """A batch from the offsets and sizes, (messages,), of the contents of its message records in ``data``.
-
-        DamageError: a record too short for a message, or a time of 2^63 ns or more.
-        """
+        """From the places of the contents of its records in ``data``; DamageError: too short, or no possible time."""
         if (size < MESSAGE_HEAD.itemsize).any():
             raise DamageError
         head = gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
@@ -128,12 +122,6 @@ class Batch:
     def channel(self) -> AnyArray:
         """(messages,) channel number."""
         return np.asarray(self.head["channel"])
-
-    @property
-    def table(self) -> IntArray:
-        """(messages, 6) int64: channel number, sequence, log time [ns], publish time [ns], start, size."""
-        columns = [self.head[name].astype(np.int64) for name in MESSAGE_HEAD.names or ()]
-        return np.column_stack((*columns, self.start, self.size))
 
     def message(self, index: int) -> bytes:
         """CDR bytes of the message at an index of the batch."""
@@ -187,17 +175,14 @@ class StoredFile:
             )
 
     def _unpack(self, batch: Batch, packed: BoolArray) -> Iterator[Batch]:
-        """The same messages, those that rosbag2 compressed one by one (compression mode `message`) unpacked.
-
-        In several batches if they are large; one that cannot be unpacked stays.
-        """
+        """The same messages, unpacked those that rosbag2 compressed one by one; several batches if they are large."""
         zstd = zstandard.ZstdDecompressor()
         pieces: list[bytes] = []
         filled = first = 0
         for index, compressed in enumerate(packed.tolist()):
             piece = batch.message(index)
             if compressed:
-                piece = self._message(piece, zstd, batch.end)
+                piece = self._unpacked_message(piece, zstd, batch.end)
             pieces.append(piece)
             filled += len(piece)
             last = index + 1 == len(packed)
@@ -206,7 +191,8 @@ class StoredFile:
                 yield batch_of(pieces, batch.head[first : index + 1], batch.end if last else batch.end - 1)
                 pieces, filled, first = [], 0, index + 1
 
-    def _message(self, piece: bytes, zstd: zstandard.ZstdDecompressor, end: int) -> bytes:
+    def _unpacked_message(self, piece: bytes, zstd: zstandard.ZstdDecompressor, end: int) -> bytes:
+        """The message, or the piece as it is where it cannot be unpacked."""
         try:
             size = zstandard.frame_content_size(piece)
             if not 0 <= size <= RECORD_LIMIT:
@@ -332,13 +318,11 @@ class SqliteFile(StoredFile):
 
 
 def _connect(file: Path) -> sqlite3.Connection:
-    """Open a file without changing anything, also in a directory that cannot be written.
-
-    Without a log beside it, the mode WAL would make one.
-    """
+    """Open a file without changing anything, also in a directory that cannot be written."""
     with file.open("rb") as stream:
         head = stream.read(_WRITE_VERSION + 1)
     log = file.with_name(file.name + "-wal")
+    # Without a log beside it, the mode WAL would make one.
     alone = head[_WRITE_VERSION:] == bytes([_WAL]) and not (log.exists() and log.stat().st_size)
     connection = sqlite3.connect(f"{file.absolute().as_uri()}?{'immutable=1' if alone else 'mode=ro'}", uri=True)
     connection.text_factory = lambda text: text.decode(errors="replace")

@@ -3,8 +3,7 @@
 
 """Writes bags that rosbag2, rosbags, Foxglove and PlotJuggler open: directories with MCAP files.
 
-While a bag is written, its directory has a locked marker instead of metadata.yaml. The files of a split bag follow each
-other in time, and each begins with what is in force of the latched topics.
+The files of a split bag follow each other in time, and each begins with what is in force of the latched topics.
 """
 
 from __future__ import annotations
@@ -30,8 +29,10 @@ from msg_analysis.bags.stored_file import DEFAULT_STORAGE, Storage
 from msg_analysis.common.arrays import BLOCK_NUMBERS, IntArray, release
 from msg_analysis.common.files import require_utf8
 from msg_analysis.errors import BagError
-from msg_analysis.messages.messages import ActiveGraph, StateCodec, encode_string
+from msg_analysis.messages.acceptance import sojourn_message
+from msg_analysis.messages.messages import StateCodec, encode_string
 from msg_analysis.messages.topics import EXPERIMENT, GRAPH, STATE, TRUTH, Topic, network_topics
+from msg_analysis.model.graph_path import Sojourn
 from msg_analysis.model.reception import LOST
 from msg_analysis.model.run import Run
 
@@ -45,11 +46,7 @@ _Message = tuple[str, bytes, int, int | None]
 
 
 class BagWriter:
-    """A bag being written: its directory, new or empty, has ``.recording`` (locked) and no metadata.yaml.
-
-    The run record (JSON) is in every file. A full file is closed, and on the disk, when all topics have passed its
-    end. BagError, here and in the methods: cannot be written; what was written before stays readable.
-    """
+    """A bag being written: with a locked marker instead of metadata.yaml. BagError, from every method: not writable."""
 
     def __init__(
         self, directory: Path, topics: Sequence[Topic], *, record: str | None = None, storage: Storage = DEFAULT_STORAGE
@@ -68,44 +65,32 @@ class BagWriter:
         if record is not None:
             self._custom["run"] = str(json.loads(record).get("run", ""))
         self._closed = False
+        self._open: list[WrittenFile] = []  # those that are not finished, in their order
         try:
             # It may be there already, empty: a runner that starts several runs at once reserves their names that way.
             self.directory.mkdir(parents=True, exist_ok=True)
             if any(self.directory.iterdir()):
                 raise FileExistsError
-            self._open = [self._new_file()]  # those that are not finished, in their order
             self._marker = (self.directory / RECORDING_MARKER).open("w", encoding="utf-8")
         except FileExistsError as error:
             raise exists_already(directory) from error
         except OSError as error:
             raise BagError(f"{directory}: cannot be made ({error.strerror}): choose another place") from error
-        try:
+        with self._writing():
             fcntl.flock(self._marker, fcntl.LOCK_EX)  # the system releases it when this process ends
             json.dump({"pid": os.getpid()}, self._marker)
             self._marker.flush()
-            self._open[0].write_head(self._topics, record, self._custom)
-        except OSError as error:
-            raise self._failed(error) from error
-
-    def _new_file(self, begin: int = 0) -> WrittenFile:
-        path = self.directory / f"{self.directory.name}_{len(self._counts)}.mcap"
-        file = WrittenFile(path, self._counts, self._storage, begin=begin)
-        self._counts.append(file.count)
-        return file
+            self._begin_file()
 
     def write(self, topic: str, data: bytes, time_ns: int, until: int | None = None) -> None:
-        """Append a message (CDR with encapsulation header) to a topic, by absolute name, at a simulated time [ns].
-
-        Files that begin later repeat it if the topic is latched, up to the time ``until`` [ns] (None: always). A split
-        bag holds a latched message that is ahead of its time until then.
-        """
+        """Append a message (CDR) of a time [ns]; later files repeat a latched one, up to the time ``until`` if any."""
         if topic not in self._sequences or self._closed:
             raise self._refused("is closed" if self._closed else f"has no topic {topic}")
-        try:
+        with self._writing():
             if topic in self._latched:
                 message = LatchedMessage(time_ns, self._sequences[topic], topic, data, until)
                 self._sequences[topic] += 1
-                if self._storage.split_size is not None and time_ns > self._now:
+                if self._storage.split_size is not None and time_ns > self._now:  # it waits for its time
                     heapq.heappush(self._held, message)
                 else:
                     self._place(message)
@@ -115,40 +100,28 @@ class BagWriter:
             file.add(topic, data, time_ns, self._sequences[topic])
             self._sequences[topic] += 1
             self._passed(file, (topic,))
-        except OSError as error:
-            raise self._failed(error) from error
 
     def write_many(
         self, topics: Sequence[str], of: IntArray, time_ns: IntArray, data: bytes, start: IntArray, size: IntArray
     ) -> None:
-        """Append messages of topics that are not latched.
-
-        Of each, (messages,): index of its topic, time [ns], place and size of its bytes. The same as ``write`` for
-        each, in a fraction of the time.
-        """
+        """Append messages of topics that are not latched, (messages,): topic, time [ns], place and size in ``data``."""
         if self._closed:
             raise self._refused("is closed")
         done = 0
-        try:
-            while done < len(of):
+        with self._writing():
+            while done < len(of):  # the same as ``write`` for each, in a fraction of the time
                 file = self._file_of(int(time_ns[done]))
                 end = done + file.mcap.fitting(size[done : done + self._together(file, time_ns[done:])])
                 piece = slice(done, end)
                 if self._release(int(time_ns[piece].max())):
                     continue  # perhaps into a new file
-                present = file.add_many(
-                    topics, of[piece], time_ns[piece], data, start[piece], size[piece], self._sequences
-                )
-                self._passed(file, present)
+                several = of[piece], time_ns[piece], data, start[piece], size[piece]
+                self._passed(file, file.add_many(topics, *several, self._sequences))
                 done = end
-        except OSError as error:
-            raise self._failed(error) from error
 
     def _together(self, file: WrittenFile, time_ns: IntArray) -> int:
         """How many of the messages with these times belong into the same file as the first."""
         before = self._open.index(file)
-        if not before and file.bound is None:
-            return len(time_ns)
         others = np.zeros(len(time_ns), dtype=np.bool_)
         if file.bound is not None:
             others |= time_ns > file.bound
@@ -170,13 +143,16 @@ class BagWriter:
     def _first_with(self, time_ns: int) -> WrittenFile | None:
         return next((file for file in self._open if file.bound is not None and time_ns <= file.bound), None)
 
-    def _begin_file(self, begin: int) -> WrittenFile:
+    def _begin_file(self, begin: int = 0) -> WrittenFile:
         if len(self._open) == MOST_OPEN:
             self._finish_first()
-        self._open.append(self._new_file(begin))
+        path = self.directory / f"{self.directory.name}_{len(self._counts)}.mcap"
+        file = WrittenFile(path, self._counts, self._storage, begin)
+        self._open.append(file)
+        self._counts.append(file.count)
         self._in_force = [each for each in self._in_force if each.until is None or each.until >= begin]
-        self._open[-1].write_head(self._topics, self._record, self._custom, self._in_force)
-        return self._open[-1]
+        file.write_head(self._topics, self._record, self._custom, self._in_force)
+        return file
 
     def _finish_first(self) -> None:
         self._open[0].finish()
@@ -217,44 +193,42 @@ class BagWriter:
 
     def flush(self) -> None:
         """Hand everything so far to the operating system, so that it survives the end of this process."""
-        try:
+        with self._writing():
             for file in self._open:
                 file.mcap.flush()
-        except OSError as error:
-            raise self._failed(error) from error
 
     def close(self, complete: bool = True) -> None:
-        """Finish the file, write metadata.yaml, remove the marker; ``complete``: whether the end of the run was seen.
-
-        Calling it again does nothing. If the disk is full, the marker stays and the bag can be salvaged.
-        """
+        """Finish the files, write metadata.yaml, remove the marker; ``complete``: the end of the run was seen."""
         if self._closed:
             return
         self._custom["complete"] = "true" if complete else "false"
-        try:
+        with self._writing():
             self._release(2**63)
             while self._open:
                 self._finish_first()
             write_metadata(self.directory, bag_information(self._counts, self._custom))
             (self.directory / RECORDING_MARKER).unlink()
             self._marker.close()
-        except OSError as error:
-            raise self._failed(error) from error
         self._closed = True
 
     def _refused(self, reason: str) -> BagError:
         return BagError(f"{self.directory}: {reason}: nothing more can be written to it")
 
-    def _failed(self, error: OSError) -> BagError:
-        self._closed = True
-        for file in self._open:
-            file.abandon()
-        with contextlib.suppress(OSError):
-            self._marker.close()
-        return BagError(
-            f"{self.directory}: cannot be written ({error.strerror or error}): free some space or choose "
-            "another place; what was written before can still be read"
-        )
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """After an OSError the bag is closed; what was written before can be read."""
+        try:
+            yield
+        except OSError as error:
+            self._closed = True
+            for file in self._open:
+                file.abandon()
+            with contextlib.suppress(OSError):
+                self._marker.close()
+            raise BagError(
+                f"{self.directory}: cannot be written ({error.strerror or error}): free some space or choose "
+                "another place; what was written before can still be read"
+            ) from error
 
     def __enter__(self) -> Self:
         return self
@@ -287,10 +261,7 @@ def write_trajectory(
     storage: Storage = DEFAULT_STORAGE,
     block_numbers: int = BLOCK_NUMBERS,
 ) -> None:
-    """Write a bag, whole or not at all; BagError where the directory exists or cannot be written.
-
-    InputError for a name that is not UTF-8.
-    """
+    """Write a bag, whole or not at all; InputError: the directory exists, cannot be written, or is not UTF-8."""
     directory = Path(directory).absolute()
     require_utf8(directory)
     if directory.exists():
@@ -327,39 +298,38 @@ def _write(bag: BagWriter, names: Sequence[str], messages: Iterator[_Message]) -
         bag.write_many(names, of, time, b"".join(contents), np.cumsum(size) - size, size)
 
 
-def _messages(trajectory: Run, block_numbers: int = BLOCK_NUMBERS) -> Iterator[_Message]:
+def _messages(trajectory: Run, block_numbers: int) -> Iterator[_Message]:
     """The messages in the order of time."""
-    experiment = trajectory.record.experiment
-    run, dt = trajectory.record.run.bytes, experiment.step_length
-    time = StepClock(dt).nanoseconds
-    truth = STATE if trajectory.published is None else TRUTH
-    streams = [(_names(truth, experiment.agents), trajectory.states)]
+    record, agents = trajectory.record, range(trajectory.record.experiment.agents)
+    run, dt = record.run.bytes, record.experiment.step_length
+    streams = [(STATE, trajectory.states)]
     if trajectory.published is not None:
-        streams.append((_names(STATE, experiment.agents), trajectory.published))
-    codecs = [[StateCodec(run, i + 1, states.shape[2], dt) for i in range(experiment.agents)] for _, states in streams]
+        streams = [(TRUTH, trajectory.states), (STATE, trajectory.published)]
+    names = [[f"/{topic.of(i)}" for i in agents] for topic, _ in streams]
+    codecs = [[StateCodec(run, i + 1, states.shape[2], dt) for i in agents] for _, states in streams]
     heard = _heard(trajectory)
     sojourns = _sojourns(trajectory)
     sojourn = next(sojourns, None)
-    for steps, agents, times in _in_order(trajectory, block_numbers):
+    for steps, of, times in _in_order(trajectory, block_numbers):
         if trajectory.agent_modes is not None:
-            graphs = trajectory.agent_modes[steps, agents]
+            graphs = trajectory.agent_modes[steps, of]
         else:
             graphs = np.where(steps > 0, trajectory.modes[steps - 1], -1)
-        values = [states[steps, agents] for _, states in streams]
+        values = [states[steps, of] for _, states in streams]
         there = [np.asarray(~np.isnan(each).any(axis=1)).tolist() for each in values]
-        cells = zip(steps.tolist(), agents.tolist(), times.tolist(), graphs.tolist(), strict=True)
+        cells = zip(steps.tolist(), of.tolist(), times.tolist(), graphs.tolist(), strict=True)
         for place, (k, i, now, graph) in enumerate(cells):
-            while sojourn is not None and sojourn.stamp <= now:
-                yield _graph_message(sojourn, time)
+            while sojourn is not None and sojourn[2] <= now:
+                yield sojourn
                 sojourn = next(sojourns, None)
-            for (topics, _), codec, is_there, value in zip(streams, codecs, there, values, strict=True):
+            for topics, codec, is_there, value in zip(names, codecs, there, values, strict=True):
                 if is_there[place]:
                     payload = to_payload(value[place])
                     yield topics[i], codec[i].wrap(k, graph + 1, payload, heard(k, i, graph), now), now, None
         trajectory.release()
-    while sojourn is not None:
-        yield _graph_message(sojourn, time)
-        sojourn = next(sojourns, None)
+    if sojourn is not None:
+        yield sojourn
+        yield from sojourns
 
 
 def _in_order(trajectory: Run, block_numbers: int) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
@@ -391,19 +361,8 @@ def _in_order(trajectory: Run, block_numbers: int) -> Iterator[tuple[IntArray, I
         yield steps[ready], agents[ready], times[ready]
 
 
-def _graph_message(sojourn: ActiveGraph, time: Callable[[int], int]) -> _Message:
-    return f"/{GRAPH.name}", sojourn.encode(), sojourn.stamp, time(sojourn.last_step + 1)
-
-
-def _names(topic: Topic, agents: int) -> list[str]:
-    return [f"/{topic.of(i)}" for i in range(agents)]
-
-
 def _heard(trajectory: Run) -> Callable[[int, int, int], list[int]]:
-    """Function of (k, agent and graph from 0): ``heard`` of that state, the steps used in the step that led there.
-
-    Empty in lockstep where nothing was lost; complete in real time.
-    """
+    """Of (k, agent and graph from 0) the steps used in the step to a state; empty: in lockstep, nothing was lost."""
     lost, values = trajectory.lost, trajectory.used
     if lost is None and values is None:
         return lambda _k, _i, _graph: []
@@ -428,22 +387,13 @@ def _heard(trajectory: Run) -> Callable[[int, int, int], list[int]]:
     return listed
 
 
-def _sojourns(trajectory: Run) -> Iterator[ActiveGraph]:
+def _sojourns(trajectory: Run) -> Iterator[_Message]:
     """The stretches of equal graph, without those whose graph is not known."""
-    experiment, modes = trajectory.record.experiment, trajectory.modes
-    time = StepClock(experiment.step_length).nanoseconds
+    record, modes = trajectory.record, trajectory.modes
+    time = StepClock(record.experiment.step_length).nanoseconds
     first = np.flatnonzero(np.diff(modes, prepend=-2))
     last = np.append(first[1:], len(modes)) - 1
     known = modes[first] >= 0
     for sequence, (start, end) in enumerate(zip(first[known].tolist(), last[known].tolist(), strict=True)):
-        graph = experiment.graph_list[modes[start]]
-        yield ActiveGraph(
-            stamp=time(start),
-            run=trajectory.record.run.bytes,
-            sequence=sequence,
-            mode=int(modes[start]) + 1,
-            name=graph.name,
-            first_step=start,
-            last_step=end,
-            arcs=graph.arcs,
-        )
+        message = sojourn_message(record, Sojourn(sequence, int(modes[start]), start, end))
+        yield f"/{GRAPH.name}", message.encode(), message.stamp, time(end + 1)

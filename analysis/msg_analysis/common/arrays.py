@@ -28,10 +28,7 @@ SMALL_BLOCK = 200_000  # the same where there are several such arrays: they stay
 
 
 def large_zeros(shape: tuple[int, ...], dtype: Any, *, total: int) -> AnyArray:
-    """Zeros; in a file where it and what belongs to it has ``total`` >= ``LARGE`` bytes, if there is room for it.
-
-    MemoryError or ValueError: neither file nor memory is large enough.
-    """
+    """Zeros, in a file if ``total`` >= ``LARGE`` bytes belong together and it has room; MemoryError or ValueError."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     if total >= LARGE and size and hasattr(os, "posix_fallocate"):
         with suppress(OSError), tempfile.TemporaryFile(prefix="msg_analysis.") as file:
@@ -41,11 +38,12 @@ def large_zeros(shape: tuple[int, ...], dtype: Any, *, total: int) -> AnyArray:
 
 
 class LargeRows:
-    """Rows that are found one part after the other: in a file from ``LARGE`` / 8 bytes on, if there is room for it."""
+    """Rows that are found one part after the other: in a file from some number of bytes on, if there is room for it."""
 
-    def __init__(self, columns: int, dtype: Any) -> None:
+    def __init__(self, columns: int, dtype: Any, in_memory: int = LARGE // 8) -> None:
         self._shape, self._dtype = (-1, columns), np.dtype(dtype)
         self._parts: list[AnyArray] = []
+        self._in_memory = in_memory  # bytes, at most
         self._held = self._written = 0  # bytes
         self._file: IO[bytes] | None = None
 
@@ -55,7 +53,7 @@ class LargeRows:
         before: int = (self._held + self._written) // (self._shape[1] * self._dtype.itemsize)
         self._parts.append(part)
         self._held += part.nbytes
-        if self._held + self._written >= LARGE // 8:
+        if self._held + self._written >= self._in_memory:
             self._move()
         return before
 

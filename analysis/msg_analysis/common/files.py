@@ -22,15 +22,10 @@ REPORT_FILE = "report.html"  # the same
 
 
 def require_place(file: Path | None) -> None:
-    """Refuse, before long work, a path where no file can be put: its directory is missing, or it is not a regular file.
-
-    None stands for no file. Raises InputError; permissions are not checked.
-    """
-    if file is None:
-        return
-    if not file.parent.is_dir():
+    """Refuse, before long work, a path where no file can be put, whatever the permissions; None: no file."""
+    if file is not None and not file.parent.is_dir():
         raise InputError(f"{file}: no such directory {file.parent}: create it")
-    if file.exists() and not file.is_file():
+    if file is not None and file.exists() and not file.is_file():
         raise InputError(f"{file}: not a regular file: choose another")
 
 
@@ -99,52 +94,42 @@ def read_bytes(path: Path, longest: int = LONGEST_FILE) -> bytes:
 
 def load_yaml(text: str, loader: Any = SAFE_LOADER) -> Any:
     """The document; YAMLError where it is nested too deeply, or where aliases make it too large."""
-    _Walk().check(text)
+    _require_bounds(text)
     return yaml.load(text, loader)
 
 
-class _Walk:
-    """Sizes of what has an anchor, from the events of a document; nothing is built."""
-
-    def __init__(self) -> None:
-        self._anchors: dict[str, int | None] = {}  # values; None: not finished yet
-        self._open: list[tuple[str | None, int]] = []  # anchor and values so far of the collections around
-        self._repeated = 0
-
-    def check(self, text: str) -> None:
-        for event in yaml.parse(text, SAFE_LOADER):
-            if isinstance(event, yaml.CollectionStartEvent):
-                self._begin(event)
-            elif isinstance(event, yaml.CollectionEndEvent):
-                anchor, size = self._open.pop()
-                self._add(anchor, size + 1)
-            elif isinstance(event, yaml.ScalarEvent):
-                self._add(event.anchor, 1)
-            elif isinstance(event, yaml.AliasEvent):
-                self._repeat(event)
-
-    def _begin(self, event: yaml.CollectionStartEvent) -> None:
-        if len(self._open) >= DEEPEST:
-            raise _error(f"nested too deeply, more than {DEEPEST} levels", event)
-        if event.anchor:
-            self._anchors[event.anchor] = None
-        self._open.append((event.anchor, 0))
-
-    def _add(self, anchor: str | None, size: int) -> None:
+def _require_bounds(text: str) -> None:
+    """From the events of a document; nothing is built."""
+    sizes: dict[str, int | None] = {}  # values of what has an anchor; None: not finished yet
+    around: list[tuple[str | None, int]] = []  # anchor and values so far of the collections that are open
+    repeated = 0
+    for event in yaml.parse(text, SAFE_LOADER):
+        anchor = getattr(event, "anchor", None)
+        if isinstance(event, yaml.CollectionStartEvent):
+            if len(around) >= DEEPEST:
+                raise _error(f"nested too deeply, more than {DEEPEST} levels", event)
+            around.append((anchor, 0))
+            if anchor:
+                sizes[anchor] = None
+            continue
+        size = 1
+        if isinstance(event, yaml.CollectionEndEvent):
+            anchor, values = around.pop()
+            size = values + 1
+        elif isinstance(event, yaml.AliasEvent):
+            found = sizes.get(str(anchor), 0)  # one that is not there is for the loader to name
+            if found is None:
+                raise _error(f"alias '{anchor}' stands inside what it names", event)
+            anchor, size, repeated = None, found, repeated + found
+            if repeated > MOST_REPEATED:
+                raise _error(f"aliases repeat more than {MOST_REPEATED} values: write down what is needed", event)
+        elif not isinstance(event, yaml.ScalarEvent):
+            continue
         if anchor:
-            self._anchors[anchor] = size
-        if self._open:
-            around, before = self._open[-1]
-            self._open[-1] = (around, before + size)
-
-    def _repeat(self, event: yaml.AliasEvent) -> None:
-        size = self._anchors.get(event.anchor or "", 0)  # one that is not there is for the loader to name
-        if size is None:
-            raise _error(f"alias '{event.anchor}' stands inside what it names", event)
-        self._repeated += size
-        if self._repeated > MOST_REPEATED:
-            raise _error(f"aliases repeat more than {MOST_REPEATED} values: write down what is needed", event)
-        self._add(None, size)
+            sizes[anchor] = size
+        if around:
+            name, values = around[-1]
+            around[-1] = (name, values + size)
 
 
 def _error(problem: str, event: Any) -> yaml.MarkedYAMLError:

@@ -14,10 +14,12 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
+
+    from msg_analysis.experiment.experiment import Experiment
 
 try:
     __version__ = version("msg_analysis")
@@ -41,15 +43,6 @@ SINGLE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_N
 LARGE = 500  # smallest number of agents with which more than one thread pays on a quiet machine
 
 
-class Network(Protocol):
-    """What has a number of agents: an experiment."""
-
-    @property
-    def agents(self) -> int:
-        """Their number."""
-
-
-N = TypeVar("N", bound=Network)
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -63,11 +56,9 @@ def one_blas_thread() -> AbstractContextManager[Any]:
 
 
 def blas_threads(agents: int) -> AbstractContextManager[Any]:
-    """Context in which BLAS uses one thread for networks of this size, unless they are large.
-
-    Its threads wait for each other without sleeping. Where another program keeps a core busy, every product of small
-    matrices then takes as long as a time slice: a comparison of 20 agents took 3 minutes instead of 4 s.
-    """
+    """Context in which BLAS uses one thread for networks of this size, unless they are large."""
+    # Its threads wait for each other without sleeping. Where another program keeps a core busy, every product of small
+    # matrices then takes as long as a time slice: a comparison of 20 agents took 3 minutes instead of 4 s.
     if agents >= LARGE:
         return nullcontext()
     import scipy.linalg  # noqa: F401  it brings a library of its own
@@ -75,13 +66,13 @@ def blas_threads(agents: int) -> AbstractContextManager[Any]:
     return one_blas_thread()
 
 
-def few_blas_threads(function: Callable[Concatenate[N, P], R]) -> Callable[Concatenate[N, P], R]:
+def few_blas_threads(function: Callable[Concatenate[Experiment, P], R]) -> Callable[Concatenate[Experiment, P], R]:
     """Decorator: call a function of an experiment within ``blas_threads``."""
 
     @functools.wraps(function)
-    def limited(network: N, /, *arguments: P.args, **options: P.kwargs) -> R:
-        with blas_threads(network.agents):
-            return function(network, *arguments, **options)
+    def limited(experiment: Experiment, /, *arguments: P.args, **options: P.kwargs) -> R:
+        with blas_threads(experiment.agents):
+            return function(experiment, *arguments, **options)
 
     return limited
 
@@ -126,9 +117,7 @@ def ros_distribution() -> str:
 
 
 def distribution_at(place: Path | None, sourced: str) -> str:
-    """The same, for an rclpy in the folder ``place`` and the ROS_DISTRO of a sourced ROS 2.
-
-    Wheels set no variable; ros-<name>-rclpy is installed beside theirs. ROS_DISTRO may be that of another ROS 2 then.
-    """
+    """The same, for an rclpy in the folder ``place`` and the ROS_DISTRO of a sourced ROS 2."""
+    # Wheels set no variable; ros-<name>-rclpy is installed beside theirs. ROS_DISTRO may be that of another ROS 2 then.
     wheels = sorted(place.glob("ros_*_rclpy-*.dist-info")) if place else []
     return wheels[0].name.split("_")[1] if wheels else sourced

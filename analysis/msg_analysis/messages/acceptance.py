@@ -93,8 +93,6 @@ class RunRules:
 
     def __init__(self, record: RunRecord) -> None:
         self._record = record
-        self._graphs = [(graph.name, tuple(graph.arcs)) for graph in record.experiment.graph_list]
-        self._clock = StepClock(record.experiment.step_length)
         self._path = PathWindow(record.experiment, first_graph(record.experiment))
 
     @cached_property
@@ -128,23 +126,9 @@ class RunRules:
         sojourn = self._path.sojourn(message.sequence)
         if sojourn is None:
             return Refusal.GRAPH_OUT_OF_RANGE
-        true = self.sojourn_message(sojourn)
+        true = sojourn_message(self._record, sojourn)
         same = all(getattr(message, field.name) == getattr(true, field.name) for field in fields(ActiveGraph))
         return message if same else Refusal.NOT_OF_RECORD
-
-    def sojourn_message(self, sojourn: Sojourn) -> ActiveGraph:
-        """What the switcher publishes of a sojourn."""
-        name, arcs = self._graphs[sojourn.mode]
-        return ActiveGraph(
-            stamp=self._clock.nanoseconds(sojourn.first_step),
-            run=self._record.run.bytes,
-            sequence=sojourn.sequence,
-            mode=sojourn.mode + 1,
-            name=name,
-            first_step=sojourn.first_step,
-            last_step=sojourn.last_step,
-            arcs=arcs,
-        )
 
     def progress(self, data: bytes, topic: Topic) -> Progress | str:
         """A message on one of the topics of type Progress, or a ``Refusal``."""
@@ -156,6 +140,21 @@ class RunRules:
         if message.step > self._record.experiment.steps:
             return Refusal.OUT_OF_RANGE
         return message if genuine(message, topic, self._record.key) else Refusal.NOT_SIGNED
+
+
+def sojourn_message(record: RunRecord, sojourn: Sojourn) -> ActiveGraph:
+    """What the switcher publishes of a sojourn."""
+    graph = record.experiment.graph_list[sojourn.mode]
+    return ActiveGraph(
+        stamp=StepClock(record.experiment.step_length).nanoseconds(sojourn.first_step),
+        run=record.run.bytes,
+        sequence=sojourn.sequence,
+        mode=sojourn.mode + 1,
+        name=graph.name,
+        first_step=sojourn.first_step,
+        last_step=sojourn.last_step,
+        arcs=tuple(graph.arcs),
+    )
 
 
 def decode_of_run(kind: type[Message], data: bytes, run: bytes) -> Message | str:

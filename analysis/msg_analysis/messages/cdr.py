@@ -35,10 +35,7 @@ _NUMBERS = {order: {code: struct.Struct(order + code) for code in "iIQ"} for ord
 
 
 class CdrReader:
-    """Reads fields of a message, whose name ``kind`` and field name ``what`` appear in errors; copies what it returns.
-
-    Every length is checked before it is used. All methods raise CdrError where the bytes are not what is asked for.
-    """
+    """Reads fields of a message, and copies them; CdrError, which names message and field: other bytes, or too few."""
 
     def __init__(self, data: bytes, kind: str) -> None:
         self._kind = kind
@@ -59,8 +56,7 @@ class CdrReader:
     def number(self, code: str, what: str) -> int:
         """An integer; ``code`` is a type code of ``struct``: "i", "I" or "Q"."""
         form = self._numbers[code]
-        size = form.size
-        value: int = form.unpack_from(self._data, self._take(size, size, what))[0]
+        value: int = form.unpack_from(self._data, self._take(form.size, form.size, what))[0]
         return value
 
     def raw(self, size: int, what: str) -> bytes:
@@ -88,9 +84,10 @@ class CdrReader:
         start = self._take(count * size, size, what)
         return np.frombuffer(self._data, self._order + code, count, start).astype(code)
 
-    def stamp(self) -> int:
-        """A time [ns]."""
-        return self.number("i", "header") * SECOND + self.number("I", "header")
+    def header(self) -> tuple[int, str, bytes]:
+        """Stamp [ns], frame_id and run id, which begin the network's messages."""
+        stamp = self.number("i", "header") * SECOND + self.number("I", "header")
+        return stamp, self.string("header.frame_id"), self.raw(RUN_SIZE, "run")
 
     def rest(self) -> bytes:
         """The bytes that have not been read."""

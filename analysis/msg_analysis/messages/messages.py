@@ -21,7 +21,6 @@ from importlib import resources
 import numpy as np
 
 from msg_analysis.arithmetic.reproducible import SECOND, StepClock
-from msg_analysis.arithmetic.update_law import to_payload
 from msg_analysis.common.arrays import AnyArray, FloatArray
 from msg_analysis.messages.cdr import HEADER_SIZE, LITTLE_ENDIAN, RUN_SIZE, CdrError, CdrReader, CdrWriter
 
@@ -67,22 +66,9 @@ class StateCodec:
             raise ValueError(f"run: {len(run)} bytes, expected the {RUN_SIZE} bytes of a UUID")
         self._run, self._agent, self._replicas = bytes(run), agent, replicas
         self._nanoseconds = StepClock(dt).nanoseconds
-        self._shape = (replicas,)
-
-    def encode(self, step: int, mode: int, state: FloatArray) -> bytes:
-        """One AgentState of x(k), float64 (replicas,); ``mode``: graph of the step that led here, from 1; 0 at step 0.
-
-        ValueError for a state of another shape or type: its bytes would be a different message.
-        """
-        if state.shape != self._shape or state.dtype != np.float64:
-            raise ValueError(f"state: {state.dtype} of shape {state.shape}, expected float64 of shape {self._shape}")
-        return self.wrap(step, mode, to_payload(state))
 
     def wrap(self, step: int, mode: int, payload: bytes, heard: Sequence[int] = (), stamp: int | None = None) -> bytes:
-        """One AgentState of a state that is bytes already, 8 for each replica; the length is not checked.
-
-        ``heard`` holds the steps of the neighbours' values; empty: all of k - 1. ``stamp`` is in ns; None: k dt.
-        """
+        """AgentState of x(k), 8 bytes for each replica; ``heard``: empty: all of k - 1; ``stamp`` [ns]: None: k dt."""
         seconds, nanoseconds = divmod(self._nanoseconds(step) if stamp is None else stamp, SECOND)
         fixed = (1, 0, self._run, self._agent, step, mode, len(heard), self._replicas)
         data = _STATE.pack(LITTLE_ENDIAN, seconds, nanoseconds, *fixed)
@@ -93,22 +79,16 @@ class StateCodec:
 
 
 class StateFrame:
-    """Reads states of one run (16 bytes of its id) in the layout that :class:`StateCodec` writes.
-
-    ``size`` is the number of bytes of the longest message: of one with ``most_heard`` entries in ``heard``.
-    """
+    """Reads states of one run (16 bytes of its id) in the layout that :class:`StateCodec` writes."""
 
     def __init__(self, run: bytes, replicas: int, most_heard: int = 0) -> None:
         self._fixed = b"\x01\x00\x00\x00\x00" + bytes(run)
         self.replicas, self.most_heard = replicas, most_heard
         self._least = _STATE.size + 8 * replicas
-        self.size = self._least + 8 * most_heard
+        self.size = self._least + 8 * most_heard  # bytes of the longest message
 
     def unwrap(self, data: bytes) -> tuple[int, int, int, bytes] | None:
-        """(agent, step, mode, state as a payload), or None where the bytes are not of this run and layout.
-
-        After None, :meth:`AgentState.decode` finds out whether they are a valid message at all.
-        """
+        """(agent, step, mode, state as a payload), or None where the bytes are not of this run and layout."""
         if len(data) != self._least:
             return self._unwrap_heard(data)
         header, fixed, agent, step, mode, heard, replicas = _STATE_FIXED.unpack_from(data)
@@ -169,12 +149,7 @@ class AgentState:
     frame_id: str = ""
 
     def encode(self) -> bytes:
-        """Encode the message as little-endian CDR.
-
-        Returns
-        -------
-        bytes
-            the message with its 4-byte encapsulation header
+        """The message as little-endian CDR, with its 4-byte encapsulation header.
 
         Raises
         ------
@@ -212,9 +187,8 @@ class AgentState:
             the bytes are not an AgentState; the text names the field
         """
         reader = CdrReader(data, "AgentState")
-        stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
-        run, agent = reader.raw(RUN_SIZE, "run"), reader.number("I", "agent")
-        step, mode = reader.number("Q", "step"), reader.number("I", "mode")
+        stamp, frame_id, run = reader.header()
+        agent, step, mode = reader.number("I", "agent"), reader.number("Q", "step"), reader.number("I", "mode")
         heard, state = reader.array("u8", "heard"), reader.array("f8", "state")
         reader.end()
         return cls(stamp, run, agent, step, mode, state, heard, frame_id)
@@ -252,9 +226,8 @@ class ActiveGraph:
     def decode(cls, data: bytes) -> ActiveGraph:
         """From CDR; CdrError where it is not an ActiveGraph, or its three lists of arcs differ in length."""
         reader = CdrReader(data, "ActiveGraph")
-        stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
-        run, sequence = reader.raw(RUN_SIZE, "run"), reader.number("I", "sequence")
-        mode, name = reader.number("I", "mode"), reader.string("name")
+        stamp, frame_id, run = reader.header()
+        sequence, mode, name = reader.number("I", "sequence"), reader.number("I", "mode"), reader.string("name")
         first, last = reader.number("Q", "first_step"), reader.number("Q", "last_step")
         arcs, rest = None, reader.rest()
         if len(rest) <= _MAX_KNOWN:
@@ -307,8 +280,7 @@ class Progress:
     def decode(cls, data: bytes) -> Progress:
         """From CDR; CdrError where it is not a Progress."""
         reader = CdrReader(data, "Progress")
-        stamp, frame_id = reader.stamp(), reader.string("header.frame_id")
-        run = reader.raw(RUN_SIZE, "run")
+        stamp, frame_id, run = reader.header()
         agent, step = reader.number("I", "agent"), reader.number("Q", "step")
         reader.end()
         return cls(stamp, run, agent, step, frame_id)

@@ -112,11 +112,7 @@ TOPICS = (
 
 
 def network_topics(agents: int, namespace: str = "", *, truth: bool = False, stop: bool = False) -> Sequence[Topic]:
-    """The recorded topics of so many agents, with absolute names; ``namespace`` is such as ``/lab``, empty: the root.
-
-    ``truth``: the published states are not the true, whole ones, so those are recorded too; ``stop``: the run may end
-    early.
-    """
+    """The recorded ones, absolute; ``truth``: states are published in part or with noise; ``stop``: may end early."""
     root = f"/{namespace.strip('/')}/".replace("//", "/")
     return [
         replace(topic, name=root + topic.of(agent))

@@ -39,7 +39,7 @@ from msg_analysis.theory.spectrum import Spectrum, spectrum
 from msg_analysis.theory.transient import TransientLaw, point_start, solve_transient, start_of
 
 if TYPE_CHECKING:
-    from msg_analysis.bags.files import FileInventory, Inventory
+    from msg_analysis.bags.files import FileInventory
     from msg_analysis.bags.salvage import SalvageReport
 
 
@@ -269,15 +269,12 @@ def describe_bag(path: Path) -> dict[str, Any]:
 
     InputError if no file of it can be read; a bag that is not a run has a ``problem``, and None for the run's keys.
     """
-    from msg_analysis.bags.files import (
-        Inventory,  # imported here: experiments do not need it
-        total_channels,
-    )
+    from msg_analysis.bags.files import total_channels  # imported here: experiments do not need it
     from msg_analysis.bags.writing import recording_pid
 
-    inventory = Inventory()
+    inventory: list[FileInventory] = []
     run = _describe_run(path, inventory)
-    entries = {entry.file.path: entry for entry in inventory.files}
+    entries = {entry.file.path: entry for entry in inventory}
     others = sorted(file for file in path.iterdir() if file.is_file()) if path.is_dir() else []
     files = [*entries, *(file for file in others if file not in entries)]
     return {
@@ -286,7 +283,7 @@ def describe_bag(path: Path) -> dict[str, Any]:
         **run,
         "topics": [
             {"name": topic.topic, "type": topic.type_name, "messages": topic.messages}
-            for topic in total_channels([entry.count for entry in inventory.files]).values()
+            for topic in total_channels([entry.count for entry in inventory]).values()
         ],
         "files": [
             {"name": file.name, "size": file.stat().st_size}
@@ -296,13 +293,13 @@ def describe_bag(path: Path) -> dict[str, Any]:
     }
 
 
-def _describe_run(path: Path, inventory: Inventory) -> dict[str, Any]:
+def _describe_run(path: Path, inventory: list[FileInventory]) -> dict[str, Any]:
     from msg_analysis.bags.reading import read_bag
 
     try:
         trajectory = read_bag(path, inventory)
     except InputError as error:
-        if all(entry.problem for entry in inventory.files):
+        if all(entry.problem for entry in inventory):
             raise
         keys = (
             "run",
@@ -354,9 +351,7 @@ def _describe_file(entry: FileInventory) -> dict[str, Any]:
 
 def describe_salvage(out: Path, report: SalvageReport) -> dict[str, Any]:
     """The document of ``msg-analysis salvage --json``: the report's fields, and the run read from the new bag."""
-    from msg_analysis.bags.files import Inventory
-
-    return {"bag": str(out), **dataclasses.asdict(report), **_describe_run(out, Inventory())}
+    return {"bag": str(out), **dataclasses.asdict(report), **_describe_run(out, [])}
 
 
 def _protocol(experiment: Experiment) -> dict[str, Any] | None:

@@ -27,7 +27,7 @@ from msg_agents.stepping.newest_values import Schedule
 from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.messages import topics
-from msg_analysis.messages.acceptance import Refusal
+from msg_analysis.messages.acceptance import Refusal, sojourn_message
 from msg_analysis.messages.messages import encode_string
 from msg_analysis.messages.topics import agent_node_name
 from msg_analysis.model.graph_path import Sojourn, sojourns
@@ -189,7 +189,7 @@ class Switcher(NetworkNode):
 
     def _publish_sojourn(self, sojourn: Sojourn) -> int:
         """Publish a sojourn; the size of its message [bytes]."""
-        message = self.rules.sojourn_message(sojourn).encode()
+        message = sojourn_message(self.record, sojourn).encode()
         self.publish(self._graph, message)
         return len(message)
 

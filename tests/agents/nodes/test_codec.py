@@ -159,7 +159,7 @@ def test_the_agents_own_layout(replicas: int) -> None:
     last = 20 * 2**31 - 1  # ROS counts seconds in 32 bits
     for step in [0, 1, 19, 20, last, *(rng.randrange(last) for _ in range(50))]:
         state = np.array([rng.gauss(0, 10.0 ** rng.randint(-300, 300)) for _ in range(replicas)])
-        ros = deserialize_message(codec.encode(step, 2, state), interfaces.AgentState)
+        ros = deserialize_message(codec.wrap(step, 2, state.tobytes()), interfaces.AgentState)
         assert (ros.header.stamp.sec, ros.header.stamp.nanosec) == divmod(step * 50_000_000, 10**9)
         assert (bytes(ros.run), ros.agent, ros.step, ros.mode) == (run, 7, step, 2)
         assert bits(ros.state) == bits(state)

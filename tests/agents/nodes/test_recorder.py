@@ -24,7 +24,7 @@ from msg_agents.nodes.recorder import Recorder, write_size
 from msg_agents.stepping.state_receiver import ReceivedSteps, StateReceiver
 from msg_agents.stepping.synchronizer import RESEND_LIMIT
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.messages.acceptance import Refusal
+from msg_analysis.messages.acceptance import Refusal, sojourn_message
 from msg_analysis.messages.cdr import encode_batch
 from msg_analysis.messages.messages import StateCodec
 from msg_analysis.model.graph_path import Sojourn
@@ -102,7 +102,7 @@ def test_sojourns_are_recorded_once(recorder: Recorder) -> None:
     """Of the record's path only; however often, and whatever else comes."""
     (receive,) = (s.callback for s in recorder.subscriptions if s.topic_name == "/graph")
     sojourn = Sojourn(0, 0, 0, STEPS - 1)
-    true = recorder.rules.sojourn_message(sojourn)
+    true = sojourn_message(recorder.record, sojourn)
     for forged in (replace(true, mode=0), replace(true, last_step=10**9), replace(true, sequence=5)):
         receive(forged.encode())
     for _ in range(3):

@@ -22,7 +22,7 @@ def _parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(anyreader, "get_types_from_msg", _TYPES)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_run() -> Callable[..., Run]:
     """A trajectory with random states; no theory in it."""
 

@@ -31,12 +31,17 @@ def run() -> Run:
     return simulate(line_ring(3, 2.0, noise={"broadcast": 0.3}, run={"duration": 15, "seed": 5}))
 
 
+@pytest.fixture(scope="module")
+def messages(run: Run, tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
+    bag = tmp_path_factory.mktemp("ours") / "bag"
+    write_trajectory(run, bag)
+    with AnyReader([bag]) as reader:
+        return [(c.topic, c.msgtype, bytes(raw)) for c, _, raw in reader.messages()]
+
+
 @pytest.fixture
-def record(run: Run, tmp_path: Path, typestore: Any) -> Record:
+def record(messages: list[Message], tmp_path: Path, typestore: Any) -> Record:
     """Record the run again, with rosbags, as of the wall clock: what ``select`` makes of its messages."""
-    write_trajectory(run, tmp_path / "ours")
-    with AnyReader([tmp_path / "ours"]) as reader:
-        messages = [(c.topic, c.msgtype, bytes(raw)) for c, _, raw in reader.messages()]
 
     def record_again(
         select: Callable[[list[Message]], list[Message]] = lambda messages: messages,

@@ -126,14 +126,7 @@ def test_what_is_known_of_a_bag(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("qos", "latched"),
-    [
-        ("", False),
-        (QOS.format("volatile"), False),
-        (QOS.format(1), True),
-        (QOS.format(2), False),
-        ("[", False),
-        ("3", False),
-    ],
+    [(QOS.format(1), True), *((qos, False) for qos in ("", QOS.format("volatile"), QOS.format(2), "[", "3"))],
 )
 def test_latched_in_words_and_numbers(tmp_path: Path, qos: str, latched: bool) -> None:
     write(tmp_path / "bag.mcap", [("/a", 1)], qos=qos)

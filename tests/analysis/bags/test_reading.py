@@ -4,7 +4,6 @@ import random
 import struct
 import tracemalloc
 import uuid
-import zlib
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -19,19 +18,19 @@ from hypothesis import strategies as st
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
+from mcap_by_hand import MAGIC, chunk_content, record, write
 
 from experiments import Experiment, Run, RunRecord, read_bag, write_trajectory
-from msg_analysis.bags.mcap_reading import MAGIC, McapFile, locate, unpack
+from msg_analysis.bags.mcap_reading import McapFile, locate, unpack
 from msg_analysis.bags.stored_file import DamageError
 from msg_analysis.messages.cdr import CdrError
 from msg_analysis.messages.messages import AGENT_STATE, STRING, ActiveGraph, AgentState, encode_string
 
 STEPS, AGENTS, WIDTH, LOST = 5, 3, 2, 2**64 - 1
+MESSAGE, METADATA_INDEX, FOOTER, HEAD = 5, 13, 2, 22
 NEIGHBOURS = ([0, 0, 0], [1, 2, 1], [2, 1, 1])  # how many: no graph, line, star
 KINDS = ("plain", "loss", "realtime", "late", "hold")
-thorough = settings(
-    max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+thorough = settings(max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def _record(kind: str) -> RunRecord:
@@ -189,7 +188,7 @@ def test_random_bags(tmp_path: Path, typestore: Any, data: st.DataObject) -> Non
 
     with path.open("rb") as stream:
         records = list(StreamReader(stream).records)
-    stored = [record.data for record in records if isinstance(record, Message) and record.channel_id != experiment]
+    stored = [each.data for each in records if isinstance(each, Message) and each.channel_id != experiment]
     assert stored == raw
     decoded = [
         None if len(encoded) < len(state.encode()) else typestore.deserialize_cdr(encoded, AGENT_STATE.full_name)
@@ -220,41 +219,29 @@ def test_memory_is_that_of_the_result(tmp_path: Path, make_run: Callable[..., Ru
     assert peak - result < 0.5 * result
 
 
-def _chunk(records: bytes, name: bytes = b"", packed: bytes | None = None, **wrong: int) -> bytes:
-    """Content of a chunk record, by hand."""
-    packed = records if packed is None else packed
-    size, crc = wrong.get("size", len(records)), wrong.get("crc", zlib.crc32(records))
-    head = struct.pack("<QQQII", 0, 0, size, crc, len(name)) + name
-    return head + struct.pack("<Q", wrong.get("packed_size", len(packed))) + packed
-
-
 def test_unpack() -> None:
     records = bytes(range(256)) * 40
     zstd = zstandard.ZstdDecompressor()
     whole = zstandard.ZstdCompressor().compress(records)
     sizeless = zstandard.ZstdCompressor(write_content_size=False).compress(records)
-    for name, packed in ((b"", records), (b"zstd", whole), (b"zstd", sizeless), (b"lz4", lz4.frame.compress(records))):
-        assert unpack(_chunk(records, name, packed), zstd) == records
-        assert unpack(_chunk(records, name, packed, crc=0), zstd) == records
+    for name, packed in (("", records), ("zstd", whole), ("zstd", sizeless), ("lz4", lz4.frame.compress(records))):
+        assert unpack(chunk_content(records, name, packed), zstd) == records
+        assert unpack(chunk_content(records, name, packed, crc=0), zstd) == records
         for wrong in ({"crc": 1}, {"size": 2**40}):
             with pytest.raises(DamageError):
-                unpack(_chunk(records, name, packed, **wrong), zstd)
+                unpack(chunk_content(records, name, packed, **wrong), zstd)
         with pytest.raises((DamageError, zstandard.ZstdError, RuntimeError)):
-            unpack(_chunk(records, name, packed, packed_size=len(packed) - 9), zstd)
+            unpack(chunk_content(records, name, packed, packed_size=len(packed) - 9), zstd)
     for length in range(44):
         with pytest.raises((DamageError, struct.error)):
-            unpack(_chunk(records)[:length], zstd)
+            unpack(chunk_content(records)[:length], zstd)
 
 
 def test_chunks_that_claim_too_much_are_not_unpacked() -> None:
     bomb = bytes(10**7)
-    for name, compress in ((b"zstd", zstandard.ZstdCompressor().compress), (b"lz4", lz4.frame.compress)):
+    for name, compress in (("zstd", zstandard.ZstdCompressor().compress), ("lz4", lz4.frame.compress)):
         with pytest.raises(DamageError):
-            unpack(_chunk(bomb, name, compress(bomb), size=9), zstandard.ZstdDecompressor(), limit=10**6)
-
-
-def _records(*contents: bytes, opcode: int = 5) -> bytes:
-    return b"".join(struct.pack("<BQ", opcode, len(content)) + content for content in contents)
+            unpack(chunk_content(bomb, name, compress(bomb), size=9), zstandard.ZstdDecompressor(), limit=10**6)
 
 
 def _index(*places: int, claimed: int | None = None) -> bytes:
@@ -264,8 +251,8 @@ def _index(*places: int, claimed: int | None = None) -> bytes:
 
 def test_locate_believes_no_index_that_the_records_do_not_bear_out() -> None:
     """The second message looks as if messages began in it."""
-    inner = _records(bytes(22), bytes(30))
-    data = _records(bytes(40), inner, b"x" * 25)
+    inner = record(MESSAGE, bytes(22)) + record(MESSAGE, bytes(30))
+    data = record(MESSAGE, bytes(40)) + record(MESSAGE, inner) + record(MESSAGE, b"x" * 25)
     true = [0, 49, 49 + 9 + len(inner)]
 
     def found(*index: bytes) -> list[list[int]] | None:
@@ -278,16 +265,11 @@ def test_locate_believes_no_index_that_the_records_do_not_bear_out() -> None:
     assert found(_index(*true), _index()) == expected
     for wrong in (true[:2], true[1:], [0, *true], [true[0], true[2]], [0, 58, true[2]], [2**64 - 1, *true], [1]):
         assert found(_index(*wrong)) is None, wrong
-    assert found() is None
-    assert found(_index()) is None
-    assert found(_index(*true, claimed=32)) is None
-    assert found(_index(*true)[:-1]) is None
-    assert found(b"") is None
-    assert locate(data + _records(b"channel", opcode=4), [_index(*true)]) is None
-    assert locate(_records(b"channel", opcode=4), [_index(0)]) is None
-    assert locate(data[:-1], [_index(*true)]) is None
-    assert locate(b"", [_index(0)]) is None
-    assert locate(b"\x05", [_index(0)]) is None
+    for index in ([], [_index()], [_index(*true, claimed=32)], [_index(*true)[:-1]], [b""]):
+        assert found(*index) is None
+    other = record(4, b"channel")
+    for records, places in ((data + other, true), (other, [0]), (data[:-1], true), (b"", [0]), (b"\x05", [0])):
+        assert locate(records, [_index(*places)]) is None
 
 
 def test_the_same_arcs_again_and_arcs_that_are_wrong() -> None:
@@ -305,8 +287,6 @@ def test_the_same_arcs_again_and_arcs_that_are_wrong() -> None:
                 ActiveGraph.decode(data + bytes(8))
 
 
-MESSAGE, METADATA_INDEX, FOOTER, HEAD = 5, 13, 2, 22
-
 # Runs of equal and of different lengths; of 21 bytes a message is damaged, the other opcode is none.
 runs = st.lists(
     st.tuples(
@@ -314,12 +294,6 @@ runs = st.lists(
     ),
     max_size=12,
 )
-
-
-def _loose_file(path: Path, records: list[tuple[int, bytes]]) -> bytes:
-    body = b"".join(struct.pack("<BQ", opcode, len(content)) + content for opcode, content in records)
-    path.write_bytes(MAGIC + body)
-    return MAGIC + body
 
 
 def _walked(data: bytes) -> tuple[list[bytes], int]:
@@ -344,16 +318,14 @@ def _read_loose(path: Path, **options: int) -> tuple[list[bytes], McapFile]:
     return found, file
 
 
-@settings(
-    max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@thorough
 @given(runs=runs, cut=st.integers(0, 3000), block=st.sampled_from([1, 100, 5000, 2**18]))
 def test_runs_of_any_lengths(tmp_path: Path, runs: list[tuple[int, int, int]], cut: int, block: int) -> None:
     """Cut off anywhere, and whatever the size of the blocks in which the file is read."""
     records = [(opcode, size, number) for opcode, size, count in runs for number in range(count)]
     contents = [(opcode, bytes(HEAD)[:size] + bytes([number] * (size - HEAD))) for opcode, size, number in records]
     path = tmp_path / "x.mcap"
-    data = _loose_file(path, contents)
+    data = MAGIC + b"".join(record(*each) for each in contents)
     data = data[: max(len(MAGIC), len(data) - cut)]
     path.write_bytes(data)
     wanted, end = _walked(data)
@@ -368,18 +340,16 @@ def test_long_messages(tmp_path: Path) -> None:
     sizes = [30, 2**18 - 9, 2**18, 2**20, 40, 40, 2**18 + 1]
     contents = [(MESSAGE, bytes(HEAD) + bytes([i] * (size - HEAD))) for i, size in enumerate(sizes)]
     path = tmp_path / "x.mcap"
-    data = _loose_file(path, contents)
+    data = write(path, *(record(*each) for each in contents)).read_bytes()
     assert _read_loose(path)[0] == [content[HEAD:] for _, content in contents]
     path.write_bytes(data[:-1])
     found, file = _read_loose(path)
     assert found == [content[HEAD:] for _, content in contents[:-1]]
-    assert file.torn is not None
-    assert "cut off" in file.torn
+    assert "cut off" in str(file.torn)
 
 
 def test_the_end_of_the_file(tmp_path: Path) -> None:
-    path = tmp_path / "x.mcap"
-    path.write_bytes(_loose_file(path, [(MESSAGE, bytes(98))] * 40 + [(FOOTER, bytes(20))]) + MAGIC)
-    found, file = _read_loose(path)
+    messages = record(MESSAGE, bytes(98)) * 40
+    found, file = _read_loose(write(tmp_path / "x.mcap", messages, record(FOOTER, bytes(20)), MAGIC))
     assert len(found) == 40
     assert file.torn is None

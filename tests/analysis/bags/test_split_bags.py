@@ -4,7 +4,6 @@ The messages come as from a network: agents drift apart, and sojourns are publis
 read by mcap's reader.
 """
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from msg_analysis.bags.playback import Playback
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.stored_file import Storage
 from msg_analysis.bags.writing import BagWriter
-from msg_analysis.messages.messages import ActiveGraph, stamp_ns
+from msg_analysis.messages.messages import ActiveGraph
 from msg_analysis.messages.topics import network_topics
 
 MakeRun = Callable[..., Run]
@@ -40,19 +39,25 @@ def files_of(bag: Path) -> list[Path]:
     return [bag / f"{bag.name}_{number}.mcap" for number in range(len(list(bag.glob("*.mcap"))))]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def run(make_run: MakeRun) -> Run:
     return make_run(AGENTS, STEPS, 3)
 
 
-@pytest.fixture
-def arriving(run: Run, tmp_path: Path) -> list[tuple[str, bytes, int]]:
+@pytest.fixture(scope="module")
+def unsplit(run: Run, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[str, Any]]:
+    directory = tmp_path_factory.mktemp("unsplit") / "bag"
+    write_trajectory(run, directory)
+    return messages_of(directory / "bag_0.mcap")
+
+
+@pytest.fixture(scope="module")
+def arriving(unsplit: list[tuple[str, Any]]) -> list[tuple[str, bytes, int]]:
     """As a recorder receives the run: agents are up to 15 steps apart, sojourns come up to 100 steps early."""
-    write_trajectory(run, tmp_path / "unsplit")
     # Each agent's states come in order.
     drift = {f"/agent_{i + 1}/state": 7.5 * np.sin(np.arange(STEPS + 1) / 20 + i) for i in range(AGENTS)}
     keyed = []
-    for number, (topic, message) in enumerate(messages_of(tmp_path / "unsplit/unsplit_0.mcap")):
+    for number, (topic, message) in enumerate(unsplit):
         step = message.log_time / STEP
         place = -1 if topic == "/experiment" else step - 100 if topic == "/graph" else step + drift[topic][int(step)]
         keyed.append((place, number, topic, message.data, message.log_time))
@@ -85,14 +90,19 @@ def record(bag: BagWriter, messages: list[tuple[str, bytes, int]], portion: int 
     write()
 
 
-@pytest.fixture(params=[1, 37])
-def bag(request: pytest.FixtureRequest, run: Run, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> Path:
-    storage = Storage("zstd", 12_000)
-    with BagWriter(tmp_path / "split", network_topics(AGENTS), record=run.record.to_json(), storage=storage) as writer:
+@pytest.fixture(scope="module", params=[1, 37])
+def bag(
+    request: pytest.FixtureRequest,
+    run: Run,
+    arriving: list[tuple[str, bytes, int]],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
+    storage, directory = Storage("zstd", 12_000), tmp_path_factory.mktemp("split") / "split"
+    with BagWriter(directory, network_topics(AGENTS), record=run.record.to_json(), storage=storage) as writer:
         record(writer, arriving, request.param)
         assert writer.messages == len(arriving)
-    assert len(files_of(tmp_path / "split")) > 4
-    return tmp_path / "split"
+    assert len(files_of(directory)) > 4
+    return directory
 
 
 def test_files_follow_each_other_in_time(bag: Path) -> None:
@@ -133,26 +143,24 @@ def test_repetitions_say_what_they_repeat(bag: Path) -> None:
     """Logged when the file begins, published when the original was, with its number: and only what is in force."""
     originals: dict[tuple[str, int], Any] = {}
     for number, file in enumerate(files_of(bag)):
-        begin = min(message.log_time for _, message in messages_of(file))
-        repeated: list[str] = []
-        for topic, message in messages_of(file):
-            first = originals.setdefault((topic, message.sequence), message)
-            if first is message:
-                assert message.log_time == message.publish_time
-                continue
+        messages = messages_of(file)
+        begin = min(message.log_time for _, message in messages)
+        firsts = [originals.setdefault((topic, message.sequence), message) for topic, message in messages]
+        repeated = [(*each, first) for each, first in zip(messages, firsts, strict=True) if each[1] is not first]
+        assert all(first.log_time == first.publish_time for first in firsts)
+        for topic, message, first in repeated:
             assert topic in LATCHED
             assert (message.log_time, message.publish_time) == (begin, first.publish_time)
             assert message.data == first.data
-            end = until(topic, message.data)
-            assert end is None or end >= begin
-            repeated.append(topic)
-        assert (Counter(repeated)["/experiment"], len(repeated) < 5) == (min(number, 1), True)
+            assert (until(topic, message.data) or begin) >= begin
+        assert [topic for topic, *_ in repeated].count("/experiment") == min(number, 1)
+        assert len(repeated) < 5
     for topic in ("/graph", "/agent_1/state"):
         numbers = {number for name, number in originals if name == topic}
         assert numbers == set(range(len(numbers)))
 
 
-def test_the_whole_bag_is_that_which_is_not_split(run: Run, bag: Path, tmp_path: Path) -> None:
+def test_the_whole_bag_is_that_which_is_not_split(run: Run, bag: Path) -> None:
     found = read_bag(bag)
     assert found.completeness.complete
     assert (found.completeness.duplicates, found.completeness.refused) == (0, {})
@@ -160,7 +168,7 @@ def test_the_whole_bag_is_that_which_is_not_split(run: Run, bag: Path, tmp_path:
     assert np.array_equal(found.modes, run.modes)
 
 
-def test_it_is_played_once(bag: Path, tmp_path: Path) -> None:
+def test_it_is_played_once(bag: Path, unsplit: list[tuple[str, Any]]) -> None:
     """Every topic as from the bag that is not split, with an offset too."""
     for until_time in (2**63, 7 * 10**9):
         played: dict[str, list[tuple[int, bytes]]] = {}
@@ -168,7 +176,7 @@ def test_it_is_played_once(bag: Path, tmp_path: Path) -> None:
         for message in playback.messages(list(playback.topics), until_time):
             played.setdefault(message.topic, []).append((message.time, message.data))
         wanted: dict[str, list[tuple[int, bytes]]] = {}
-        for topic, message in messages_of(tmp_path / "unsplit/unsplit_0.mcap"):
+        for topic, message in unsplit:
             if message.log_time <= until_time:
                 wanted.setdefault(topic, []).append((message.log_time, message.data))
         assert played == wanted
@@ -254,8 +262,3 @@ def test_what_others_publish_again_is_no_repetition(tmp_path: Path) -> None:
     assert [*_theirs(tmp_path / "repeated", [[(on, 1), (off, 2)], [(off, 2), (on, 3)]])] == [on, off, on]
     assert [*_theirs(tmp_path / "twice", [[(on, 1)], [(off, 2), (off, 2)]])] == [on, off, off]
     assert [*_theirs(tmp_path / "volatile", [[(on, 1)], [(on, 1)]], latched=False)] == [on, on]
-
-
-def test_stamps_are_times(arriving: list[tuple[str, bytes, int]]) -> None:
-    """The test's own messages."""
-    assert all(stamp_ns(data) == time for topic, data, time in arriving if topic not in LATCHED)

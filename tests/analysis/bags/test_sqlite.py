@@ -50,15 +50,16 @@ WORDS = {
 }
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def run(make_run: MakeRun) -> Run:
     return make_run(3, 200, 2)
 
 
-@pytest.fixture
-def messages(run: Run, tmp_path: Path) -> list[Message]:
-    write_trajectory(run, tmp_path / "ours")
-    with AnyReader([tmp_path / "ours"]) as reader:
+@pytest.fixture(scope="module")
+def messages(run: Run, tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
+    bag = tmp_path_factory.mktemp("ours") / "bag"
+    write_trajectory(run, bag)
+    with AnyReader([bag]) as reader:
         return [(c.topic, c.msgtype, time, bytes(data)) for c, time, data in reader.messages()]
 
 

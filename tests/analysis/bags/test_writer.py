@@ -3,7 +3,6 @@
 import json
 import multiprocessing
 import os
-import resource
 import signal
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from full_disk import full_disk
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
@@ -29,7 +29,7 @@ def _fill(bag: BagWriter, steps: int = 50) -> None:
     bag.write("/experiment", encode_string("text"), 0)
     codec = StateCodec(RUN, 1, 2, 0.5)
     for k in range(steps):
-        data = codec.encode(k, min(k, 1), np.array([k, -k], dtype=float))
+        data = codec.wrap(k, min(k, 1), np.array([k, -k], dtype=float).tobytes())
         bag.write("/agent_1/state", data, stamp_ns(data))
 
 
@@ -59,18 +59,12 @@ def test_many_at_once_are_the_same_bytes_as_one_by_one(tmp_path: Path, split_siz
     assert one == many
 
 
-def test_metadata_has_every_key_that_rosbag2_requires(tmp_path: Path) -> None:
+def test_metadata_is_that_of_the_channels(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "bag", network_topics(1)) as bag:
         _fill(bag)
     text = (tmp_path / "bag" / "metadata.yaml").read_text()
     assert "&id" not in text  # no YAML aliases
     information = yaml.safe_load(text)["rosbag2_bagfile_information"]
-    assert set(information) == {
-        *("version", "storage_identifier", "duration", "starting_time", "message_count", "files", "custom_data"),
-        *("topics_with_message_count", "compression_format", "compression_mode", "relative_file_paths", "ros_distro"),
-    }
-    assert information["version"] == 9
-    assert information["relative_file_paths"] == ["bag_0.mcap"]
     assert information["custom_data"]["complete"] == "true"
     with (tmp_path / "bag" / "bag_0.mcap").open("rb") as stream:
         summary = make_reader(stream).get_summary()
@@ -82,25 +76,23 @@ def test_metadata_has_every_key_that_rosbag2_requires(tmp_path: Path) -> None:
 
 
 def test_never_overwrites(tmp_path: Path) -> None:
-    (tmp_path / "bag").mkdir()
-    (tmp_path / "bag" / "thesis.txt").write_text("precious")
+    """An empty directory is a reserved name."""
+    bag = tmp_path / "bag"
+    bag.mkdir()
+    BagWriter(bag, network_topics(1)).close()
+    before = {file.name: file.read_bytes() for file in bag.iterdir()}
+    assert before.keys() == {"bag_0.mcap", "metadata.yaml"}
     with pytest.raises(BagError, match="exists already"):
-        BagWriter(tmp_path / "bag", network_topics(1))
-    assert [file.name for file in (tmp_path / "bag").iterdir()] == ["thesis.txt"]
+        BagWriter(bag, network_topics(1))
+    assert {file.name: file.read_bytes() for file in bag.iterdir()} == before
     with pytest.raises(BagError, match="cannot be made"):
-        BagWriter(tmp_path / "bag" / "thesis.txt" / "bag", network_topics(1))
-
-
-def test_an_empty_directory_is_a_reserved_name(tmp_path: Path) -> None:
-    (tmp_path / "bag").mkdir()
-    BagWriter(tmp_path / "bag", network_topics(1)).close()
-    assert (tmp_path / "bag" / "metadata.yaml").exists()
-    with pytest.raises(BagError, match="exists already"):
-        BagWriter(tmp_path / "bag", network_topics(1))
+        BagWriter(bag / "metadata.yaml" / "bag", network_topics(1))
 
 
 def test_bag_in_progress_is_recognised(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / "bag", network_topics(1))
+    with pytest.raises(BagError, match="/agent_2/state"):
+        bag.write("/agent_2/state", b"", 0)
     assert recording_pid(tmp_path / "bag") == os.getpid()
     assert not (tmp_path / "bag" / "metadata.yaml").exists()
     bag.close(complete=False)
@@ -113,14 +105,9 @@ def test_bag_in_progress_is_recognised(tmp_path: Path) -> None:
         bag.write("/graph", b"", 0)
 
 
-def test_unknown_topic(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "bag", network_topics(1)) as bag, pytest.raises(BagError, match="/agent_2/state"):
-        bag.write("/agent_2/state", b"", 0)
-
-
 def _record_until_killed(directory: str, ready: Any) -> None:
-    bag = BagWriter(Path(directory), network_topics(1), record='{"run": "abc"}', storage=Storage("none", 50_000))
-    _fill(bag, 10_000)
+    bag = BagWriter(Path(directory), network_topics(1), record='{"run": "abc"}', storage=Storage("none", 80_000))
+    _fill(bag, 3000)
     bag.flush()
     ready.set()
     signal.pause()
@@ -142,7 +129,6 @@ def test_killed_in_a_later_file(tmp_path: Path) -> None:
     assert json.loads((bag / ".recording").read_text())["pid"] == process.pid
     assert recording_pid(bag) is None
     files = [bag / f"bag_{i}.mcap" for i in range(len(list(bag.glob("*.mcap"))))]
-    assert all(file.is_file() for file in files)
     assert len(files) > 2
     assert {file.name for file in bag.iterdir()} == {".recording", *(file.name for file in files)}
     finished = {file.name: file.read_bytes() for file in files[:-1]}
@@ -154,14 +140,14 @@ def test_killed_in_a_later_file(tmp_path: Path) -> None:
     torn = [file["torn"] for file in inventory["files"] if file["name"].endswith(".mcap")]
     assert [reason is None for reason in torn] == [True] * len(finished) + [False]
     report = salvage_in_place(bag)
-    messages = 10_000 + len(files)  # the experiment is in each
+    messages = 3000 + len(files)  # the experiment is in each
     assert (report.kept_messages, report.dropped_bytes) == (messages, 0)
     assert {name: (bag / name).read_bytes() for name in finished} == finished
     assert {file.name for file in bag.iterdir()} == {"metadata.yaml", *(file.name for file in files)}
     with AnyReader([bag]) as reader:
         assert reader.message_count == messages
         found = [reader.deserialize(raw, c.msgtype).step for c, _, raw in reader.messages() if c.topic != "/experiment"]
-    assert found == list(range(10_000))
+    assert found == list(range(3000))
     information = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert information["custom_data"] == {"run": "abc", "complete": "false", "salvaged": "true"}
 
@@ -177,14 +163,10 @@ def test_a_head_larger_than_a_file_should_be(tmp_path: Path) -> None:
 def test_full_disk(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / "bag", network_topics(1), record=json.dumps({"run": "abc"}))
     file = tmp_path / "bag" / "bag_0.mcap"
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (250_000, hard))  # like a full disk, for this process only
-    try:
+    with full_disk(250_000):
         with pytest.raises(BagError, match="cannot be written"):
             _fill(bag, 10**5)
         bag.close()  # what is left to close is closed: no second error
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert {path.name for path in file.parent.iterdir()} == {".recording", "bag_0.mcap"}
     assert recording_pid(file.parent) is None
     report = salvage_in_place(file.parent)

@@ -79,11 +79,8 @@ def test_neither_file_nor_example() -> None:
 @pytest.mark.parametrize(
     "command", ["predict", "simulate", "leaders --count 1", "transient --times 1", "facts", "plan", "spectrum"]
 )
-def test_commands_of_the_analysis(command: str) -> None:
+def test_no_command_takes_another_name(command: str) -> None:
     word, *options = command.split()
-    result = CliRunner().invoke(main, [word, "discrete", *options, "--json"])
-    assert result.exit_code == 0, result.output
-    assert "discrete" in json.dumps(json.loads(result.stdout))
     result = CliRunner().invoke(main, [word, "discreet", *options])
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr.startswith("error: discreet: no such file, and no example of this name: expected a file, or")

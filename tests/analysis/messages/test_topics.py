@@ -31,20 +31,14 @@ DOCS = Path(__file__).parents[3] / "docs"
 
 
 def test_names() -> None:
-    assert [topic.name for topic in network_topics(2)] == ["/experiment", "/graph", "/agent_1/state", "/agent_2/state"]
-    assert [topic.name for topic in network_topics(2, truth=True)][2:] == [
-        "/agent_1/state",
-        "/agent_2/state",
-        "/agent_1/truth",
-        "/agent_2/truth",
-    ]
-    named = network_topics(1, "/lab/")
-    assert [topic.name for topic in named] == ["/lab/experiment", "/lab/graph", "/lab/agent_1/state"]
-    assert [topic.qos.offered()[0]["durability"] for topic in named] == [
-        "transient_local",
-        "transient_local",
-        "volatile",
-    ]
+    def names(*arguments: Any, **options: bool) -> str:
+        return " ".join(topic.name for topic in network_topics(*arguments, **options))
+
+    assert names(2) == "/experiment /graph /agent_1/state /agent_2/state"
+    assert names(1, truth=True, stop=True) == "/experiment /graph /agent_1/state /agent_1/truth /stop"
+    assert names(1, "/lab/") == "/lab/experiment /lab/graph /lab/agent_1/state"
+    durability = [topic.qos.offered()[0]["durability"] for topic in network_topics(1)]
+    assert durability == ["transient_local", "transient_local", "volatile"]
     assert (STATE.of(0), TRUTH.of(9)) == ("agent_1/state", "agent_10/truth")
 
 
@@ -60,14 +54,13 @@ def rows(page: str) -> Iterator[list[str]]:
 
 
 def test_documentation() -> None:
-    found = {name: (kind.strip("`"), qos) for name, kind, _, qos in rows("ros.md")}
-    assert found == {topic.name: (topic.type.full_name, str(topic.qos)) for topic in TOPICS}
-
-
-def test_publishers_in_the_documentation() -> None:
-    for name, _, publishers, _ in rows("ros.md"):
-        (topic,) = [topic for topic in TOPICS if topic.name == name]
-        assert all(writer in publishers for writer in topic.writers.split(", ")), name
+    """Types, quality of service, and the nodes that publish."""
+    found = {name: (kind.strip("`"), publishers, qos) for name, kind, publishers, qos in rows("ros.md")}
+    assert found.keys() == {topic.name for topic in TOPICS}
+    for topic in TOPICS:
+        kind, publishers, qos = found[topic.name]
+        assert (kind, qos) == (topic.type.full_name, str(topic.qos))
+        assert all(writer in publishers for writer in topic.writers.split(", ")), topic.name
 
 
 def test_reasons_in_the_documentation() -> None:
