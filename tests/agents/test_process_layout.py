@@ -139,7 +139,7 @@ def test_partners(agents: int, processes: int, seed: int) -> None:
     np.fill_diagonal(listens, False)
     network = layout(agents, processes)
     found = partners(network, listens)
-    of_agent = {agent: process.first_node for process in network for agent in process.agents}
+    of_agent = {agent: process.nodes[0] for process in network for agent in process.agents}
     graph = nx.quotient_graph(
         nx.from_numpy_array(listens | listens.T), lambda a, b: of_agent[a] == of_agent[b], relabel=False
     )

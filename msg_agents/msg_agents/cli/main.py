@@ -9,6 +9,7 @@ input, 3 incomplete data. Modules that take long to import are imported by the c
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -314,7 +315,7 @@ def host(
     HOSTS; start them in any order. The recorder's host compares the record with the theory, as `msg-agents run`
     does; the others end with the run.
     """
-    from msg_agents.process_layout import Hosts, this_host
+    from msg_agents.process_layout import Hosts
     from msg_agents.run.folder import temporary_directory
     from msg_agents.run.runner import run_network
     from msg_agents.watch.panel import RunView
@@ -328,7 +329,7 @@ def host(
     if only_profile:
         click.echo(places.profile(what), nl=False)
         return
-    assignment = places.assignment(name or this_host(), discovery_timeout, patience)
+    assignment = places.assignment(name or socket.gethostname(), discovery_timeout, patience)
     mine = show([agent_name(agent + 1, what.names) if what.names else agent + 1 for agent in assignment.agents])
     with temporary_directory() as folder, RunView(what) as view:
         also = " and the recorder" if assignment.has_recorder else ""

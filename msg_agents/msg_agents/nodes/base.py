@@ -46,17 +46,13 @@ class Health:
     values: dict[str, str] = field(default_factory=dict)
 
     def to_status(self, node: Node, refused: Mapping[tuple[str, str], int], repeated: int) -> DiagnosticStatus:
-        """The diagnostic message about a node; ``refused`` counts messages by (topic, reason).
-
-        Refused messages are a warning: other nodes publish on the topics of the run.
-        """
-        warn = self.waiting or bool(refused)
+        """The diagnostic message about a node; ``refused`` counts messages by (topic, reason)."""
         counts = {f"refused on {topic}: {reason}": str(count) for (topic, reason), count in refused.items()}
         values = self.values | counts
         if repeated:
             values[Refusal.REPEATED] = str(repeated)
-        return DiagnosticStatus(
-            level=DiagnosticStatus.WARN if warn else DiagnosticStatus.OK,
+        return DiagnosticStatus(  # refused messages are a warning: other nodes publish on the topics of the run
+            level=DiagnosticStatus.WARN if self.waiting or refused else DiagnosticStatus.OK,
             name=f"{node.get_fully_qualified_name().lstrip('/')}: network",
             message=self.message,
             hardware_id="",
@@ -71,10 +67,7 @@ Message = TypeVar("Message", ActiveGraph, Progress)
 
 
 class NetworkNode(LeanNode):
-    """A node of a run, whose id is in every message. ``done`` ends the node, with an error or without.
-
-    InputError: arguments of ROS 2 changed its name, by which the nodes of a run find each other.
-    """
+    """A node of a run, whose id is in every message. ``done`` ends the node, with an error or without."""
 
     def __init__(self, name: str, *, record: RunRecord) -> None:
         super().__init__(name)
@@ -89,14 +82,10 @@ class NetworkNode(LeanNode):
         self.done: Future = Future()
         self.refused: Counter[tuple[str, str]] = Counter()  # by topic and reason
         self.repeated = 0
-        self._ending: list[NetworkNode] = [self]
 
     def refuse(self, reason: str, topic: str) -> None:
-        """Count a message that is not part of this run, and warn at the first one per topic and reason.
-
-        Repeated messages are only counted: agents send again what a restarted one may have missed.
-        """
-        if reason == Refusal.REPEATED:
+        """Count a message that is not part of this run, and warn at the first one per topic and reason."""
+        if reason == Refusal.REPEATED:  # only counted: agents send again what a restarted one may have missed
             self.repeated += 1
             return
         self.refused[topic, reason] += 1
@@ -153,10 +142,8 @@ class NetworkNode(LeanNode):
         return [name for name in self._own_names() if count[name] > 1]
 
     def undiscovered(self, expected: Iterable[str]) -> list[str]:
-        """Those of the expected nodes that are not there: nodes of the run in its namespace, others in any.
-
-        Recorders such as that of ``ros2 bag record`` are always in the namespace /.
-        """
+        """Those of the expected nodes that are not there: nodes of the run in its namespace, others in any."""
+        # Recorders such as that of ``ros2 bag record`` are always in the namespace /.
         here, everywhere = self.names_in_namespace(), set(self.get_node_names())
         own = set(self._own_names())
         return [name for name in expected if name not in (here if name in own else everywhere)]
@@ -172,10 +159,7 @@ class NetworkNode(LeanNode):
         """Start: all nodes have been discovered."""
 
     def finish(self, *, complete: bool, deadline: float) -> None:
-        """The process is about to end; ``complete``: the node has done its part (False: it was interrupted).
-
-        It may wait for other nodes until ``deadline`` [s of the monotonic clock].
-        """
+        """The process is about to end, its part ``complete`` or not; it may wait until ``deadline`` [s, monotonic]."""
 
     def fail(self, error: Exception) -> None:
         """End the process with an error."""
@@ -183,18 +167,17 @@ class NetworkNode(LeanNode):
             self.done.set_exception(error)
 
     def finish_at_end(self, nodes: Iterable[NetworkNode] | None = None) -> None:
-        """End these nodes of the process (default: this one) when the switcher announces the end of the run.
+        """End these nodes of the process (default: this one) when the switcher announces the end of the run."""
+        # With a node that ends earlier, unread messages or acknowledgements that others need would be lost.
+        ending = [self] if nodes is None else list(nodes)
 
-        With a node that ends earlier, unread messages or acknowledgements that others need would be lost.
-        """
-        self._ending = [self] if nodes is None else list(nodes)
-        self.subscribe(topics.END, self._receive_end)
+        def receive(data: bytes) -> None:
+            if self.decode_progress(data, topics.END):
+                for node in ending:
+                    if not node.done.done():
+                        node.done.set_result(None)
 
-    def _receive_end(self, data: bytes) -> None:
-        if self.decode_progress(data, topics.END):
-            for node in self._ending:
-                if not node.done.done():
-                    node.done.set_result(None)
+        self.subscribe(topics.END, receive)
 
     @cached_property
     def rules(self) -> RunRules:
@@ -234,10 +217,8 @@ class NetworkNode(LeanNode):
         )
 
     def _announced_reader(self, name: str, topic: str) -> bool:
-        """Whether a node of this name has announced a reader of a topic that is known.
-
-        From Fast DDS 3 on, readers of Cyclone DDS have no node: it does not repeat to which participant each belongs.
-        """
+        """Whether a node of this name has announced a reader of a topic that is known."""
+        # From Fast DDS 3 on, readers of Cyclone DDS have no node: it does not repeat to which participant each belongs.
         for node, namespace in self.get_node_names_and_namespaces():
             if node == name:
                 with contextlib.suppress(NodeNameNonExistentError):  # it has just left
@@ -262,12 +243,9 @@ class NetworkNode(LeanNode):
 
 
 class HealthReporter:
-    """Publishes the health of all nodes of a process once a second, and writes its status file.
+    """Publishes the health of all nodes of a process once a second, and writes its status file, if it has one."""
 
-    The nodes need a method ``health() -> Health`` and the counters ``refused`` and ``repeated``.
-    """
-
-    def __init__(self, nodes: Sequence[LeanNode], status_file: Path | None = None) -> None:
+    def __init__(self, nodes: Sequence[NetworkNode], status_file: Path | None) -> None:
         self._nodes = nodes
         self._status_file = status_file
         self._waiting: dict[str, str] = {}
@@ -301,13 +279,11 @@ class PeersLostError(InputError):
 
 
 class PeerPresence:
-    """Ends the process of some nodes when one of the required peers of the first has been gone for ``timeout`` s.
+    """Ends the process of some nodes when one of the required peers of the first has been gone for ``timeout`` s."""
 
-    A peer is gone when it has left the network or its lease has ended; the timeout allows for a restart. One that has
-    said that it leaves does not come back. (RTPS says that once, best effort, so it is not enough.)
-    """
-
-    # On one machine the supervisor ends all processes when one is lost; across hosts nothing else does.
+    # On one machine the supervisor ends all processes when one is lost; across hosts nothing else does. A peer is gone
+    # when it has left the network or its lease has ended; the timeout allows for a restart. One that has said that it
+    # leaves does not come back. (RTPS says that once, best effort, so it is not enough.)
 
     def __init__(self, nodes: Sequence[NetworkNode], timeout: float) -> None:
         self._nodes, self._node, self._timeout = nodes, nodes[0], timeout
@@ -323,8 +299,7 @@ class PeerPresence:
 
     def leave(self) -> None:
         """Say that this process leaves before the end of the run."""
-        numbers = {node.number for node in self._nodes}
-        for number in numbers:
+        for number in {node.number for node in self._nodes}:
             self._node.publish(self._publisher, self._node.progress(topics.LEAVE, number, 0))
         self._publisher.wait_for_all_acked(Duration(seconds=SHUTDOWN_TIMEOUT))
 
@@ -343,7 +318,9 @@ class PeerPresence:
         now = time.monotonic()
         gone = self._node.undiscovered(required)
         if gone:
-            self._announce_again()
+            # Make ROS send the others the names of our nodes, as with every new endpoint: a node whose lease for us had
+            # ended does not ask for them, and to a reader that it takes for a known one, DDS repeats nothing.
+            self._node.destroy_publisher(self._node.publisher_of(topics.LEAVE))
         if self._since.keys() - gone:
             self._returning = list(self._nodes)
         self._since = {name: self._since.get(name, now) for name in gone}
@@ -351,17 +328,6 @@ class PeerPresence:
         if now - min(self._since.values(), default=now) > self._timeout:
             self._fail(list(self._since), f" and did not return within {self._timeout:g} s")
 
-    def _announce_again(self) -> None:
-        """Make ROS send the others the names of our nodes: a node whose lease for us had ended does not ask for them.
-
-        It does so with every new endpoint; to a reader that it takes for a known one, DDS repeats nothing.
-        """
-        self._node.destroy_publisher(self._node.publisher_of(topics.LEAVE))
-
     def _fail(self, names: Sequence[str], more: str) -> None:
-        self._node.fail(
-            PeersLostError(
-                f"{', '.join(names)} left the network before the end of the run{more}: see the messages on the host "
-                "that runs it"
-            )
-        )
+        words = f"{', '.join(names)} left the network before the end of the run{more}"
+        self._node.fail(PeersLostError(f"{words}: see the messages on the host that runs it"))

@@ -78,11 +78,8 @@ def read_clocks(path: Path) -> tuple[list[dict[str, Any]] | None, str | None]:
 
 
 def _replace(path: Path, document: Any) -> None:
-    """Whole or not at all, whatever ends this process."""
     with contextlib.suppress(OSError):
-        temporary = path.with_suffix(".part")
-        temporary.write_text(json.dumps(document), encoding="utf-8")
-        temporary.replace(path)
+        write_whole(path, json.dumps(document).encode())
 
 
 def read_status_files(paths: Iterable[Path]) -> StatusSummary:

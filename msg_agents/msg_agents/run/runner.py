@@ -146,13 +146,12 @@ def run_network(
             temporary_directory() as folder,
             run_environment(
                 folder, domain, {**(environment or {}), **(linked.environment(folder) if linked else {})}, count + 2
-            ) as around,
+            ) as (domain, variables, relay),
         ):
-            variables = around.environment
             with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 require_middleware(variables, *([fork_server.has_middleware] if fork_server else []))
                 if assignment is None and linked is None:  # tools of the user do not reach a channel
-                    view.joined(around.domain)
+                    view.joined(domain)
                 record = replace(record or new_record(experiment), until=until)
                 run_file = folder / "run.json"
                 run_file.write_text(record.to_json(with_key=True), encoding="utf-8")
@@ -166,7 +165,7 @@ def run_network(
                         variables,
                         last_step=experiment.steps,
                         fork_server=fork_server,
-                        relay=around.relay,
+                        relay=relay,
                         hung_timeout=hung_timeout,
                         ends_hung=assignment is None,  # with several hosts, the switcher waits for others at its end
                     ) as supervisor,
@@ -180,15 +179,15 @@ def run_network(
                         storage=storage,
                         assignment=assignment,
                         readers=readers,
-                        most=MOST_PROCESSES if around.relay else MOST_UNAIDED,
+                        most=MOST_PROCESSES if relay else MOST_UNAIDED,
                         hosts=linked.agents if linked else (),
                     )
                     if linked:
                         linked.start(supervisor, processes, record.model, lockstep=experiment.run.pace == "lockstep")
-                    if around.relay:
-                        around.relay.connect(partners(processes, record.model.listens()))
+                    if relay:
+                        relay.connect(partners(processes, record.model.listens()))
                     if pin and experiment.run.pace == "lockstep":
-                        supervisor.cores = assign_cores(processes, available_cores(), first=around.domain)
+                        supervisor.cores = assign_cores(processes, available_cores(), first=domain)
                     supervisor.start(processes)
                     ending = EarlyEnd(record, checkpoints) if until and checkpoints else None
                     with ending or nullcontext():
