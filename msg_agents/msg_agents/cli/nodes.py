@@ -199,16 +199,16 @@ def switcher(
     record = load_record(run_record)
 
     def report(reached: Sequence[int]) -> None:
-        from msg_agents.run.result import write_steps
+        from msg_agents.run.result import write_report
 
         if steps is not None:
-            write_steps(steps, reached)
+            write_report(steps, reached)
 
     def note_clocks(offsets: ClockOffsets, warning: str | None) -> None:
-        from msg_agents.run.result import write_clocks
+        from msg_agents.run.result import write_report
 
         if clocks is not None:
-            write_clocks(clocks, offsets.to_json(), warning)
+            write_report(clocks, {"offsets": offsets.to_json(), "warning": warning})
 
     def tell_channel(file: Path | None) -> Callable[[int], None]:
         if file is None:

@@ -24,7 +24,7 @@ from rclpy.task import Future
 from msg_agents.environment import discovery_scope
 from msg_agents.nodes.ros import LeanNode, every, until_shutdown
 from msg_agents.process_layout import RECORDER, SWITCHER
-from msg_agents.run.result import write_status
+from msg_agents.run.result import write_report
 from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.errors import InputError
 from msg_analysis.messages import topics
@@ -267,7 +267,7 @@ class HealthReporter:
         """Write the status file atomically, if there is one."""
         if self._status_file is not None:
             refused = [(node.get_name(), *what, count) for node in self._nodes for what, count in node.refused.items()]
-            write_status(self._status_file, refused, self._waiting)
+            write_report(self._status_file, {"refused": refused, "waiting": self._waiting})
 
 
 CHECK_PERIOD = 1.0  # s between two checks

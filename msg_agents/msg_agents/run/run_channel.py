@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from msg_agents.channel.channel_file import BASE, Channel
-from msg_agents.channel.links import read_counts
 from msg_agents.channel.process import ActiveGraphFile, Host, hand_over, open_hosts
 from msg_agents.discovery.rtps import LEASE, PEERS_VARIABLE, profile_for_hosts
 from msg_agents.environment import channel_environment
 from msg_agents.process_layout import SWITCHER, ProcessSpec
+from msg_agents.run.result import read_report
 from msg_agents.run.supervisor import Supervisor
 from msg_analysis.common.text import counted, percent
 from msg_analysis.errors import InputError
@@ -79,11 +79,9 @@ class RunChannel:
         hand_over(control, self.channel, self.hosts, counts, active_graph, joined)
 
     def look(self, supervisor: Supervisor) -> None:
-        """Let processes that were started again find all others, as at the start of the run; in lockstep, let it go on.
-
-        There an agent also waits for those to which the graph cuts its link for longer than the window of the lockstep,
-        and the graph changes only when all go on.
-        """
+        """Let processes that were started again find all others, as at the start, and a run in lockstep go on."""
+        # There an agent also waits for those to which the graph cuts its link for longer than the window of the
+        # lockstep, and the graph changes only when all go on.
         if self._active is None:
             return
         if supervisor.steps != self._steps or not self._lockstep:
@@ -99,7 +97,7 @@ class RunChannel:
             name: {"address": host.address, "agents": [agent + 1 for agent in self.channel.hosts[name]]}
             for name, host in self.hosts.items()
         }
-        counts = read_counts(supervisor.channel_status) or {"pairs": [], "overflowed": 0, "late_ms": None}
+        counts = read_report(supervisor.channel_status) or {"pairs": [], "overflowed": 0, "late_ms": None}
         for pair in counts["pairs"]:
             model = self.channel.links[pair["sender"], pair["receiver"]].loss
             pair |= {"loss": model.mean, "inflation": model.inflation}
@@ -110,11 +108,8 @@ class RunChannel:
 
 
 def predicted_errors(channel: Channel, experiment: Experiment) -> dict[str, Any] | None:
-    """Errors predicted before the run: in place of what the channel loses, the last value received; nothing is late.
-
-    None where that is not what happens (lockstep, reliable delivery, losses in the experiment itself, packets that the
-    graph cuts, bursts, which are of packets and not of the messages of a link), or where it has no prediction.
-    """
+    """Errors predicted before the run: in place of what the channel loses, the last value received; nothing is late."""
+    # None where that is not what happens: bursts are of packets and not of the messages of a link, for example.
     run, noise = experiment.run, experiment.noise
     if run.pace == "lockstep" or run.delivery == "reliable" or noise.loss.any or channel.graph:
         return None

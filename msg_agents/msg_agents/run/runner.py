@@ -182,30 +182,21 @@ def run_network(
                         most=MOST_PROCESSES if relay else MOST_UNAIDED,
                         hosts=linked.agents if linked else (),
                     )
+                    lockstep = experiment.run.pace == "lockstep"
                     if linked:
-                        linked.start(supervisor, processes, record.model, lockstep=experiment.run.pace == "lockstep")
+                        linked.start(supervisor, processes, record.model, lockstep=lockstep)
                     if relay:
                         relay.connect(partners(processes, record.model.listens()))
-                    if pin and experiment.run.pace == "lockstep":
+                    if pin and lockstep:
                         supervisor.cores = assign_cores(processes, available_cores(), first=domain)
                     supervisor.start(processes)
                     ending = EarlyEnd(record, checkpoints) if until and checkpoints else None
                     with ending or nullcontext():
-                        view.begin(
-                            record, checkpoints if assignment is None else None, ending.observer if ending else None
-                        )
+                        kept_here = checkpoints if assignment is None else None
+                        view.begin(record, kept_here, ending.observer if ending else None)
                         view.started(supervisor.by_node)
-                        _watch(
-                            supervisor,
-                            experiment,
-                            result,
-                            restarts,
-                            signals,
-                            view,
-                            ending,
-                            linked,
-                            follow_clock=not use_sim_time,
-                        )
+                        parts = supervisor, result, restarts, signals, view, ending, linked
+                        _watch(*parts, follow_clock=not use_sim_time)
                         view.end()
                     result.until = ending.to_json() if ending else None
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
@@ -235,10 +226,9 @@ def run_network(
 
 def _watch(
     supervisor: Supervisor,
-    experiment: Experiment,
     result: RunResult,
     restarts: int,
-    interruption: Interruption,
+    signals: Interruption,
     view: View,
     ending: EarlyEnd | None,
     linked: RunChannel | None,
@@ -247,12 +237,12 @@ def _watch(
 ) -> None:
     """Watch until all have done their part, one has failed for good, or a signal has ended the run."""
     began: float | None = None
-    stall, steps, run = StallDetector(), experiment.steps, experiment.run
-    due = run.speed / experiment.step_length  # steps per second in real time
+    stall, steps, run = StallDetector(), result.experiment.steps, result.experiment.run
+    due = run.speed / result.experiment.step_length  # steps per second in real time
     lag, clock = (LagDetector(due), ClockDetector()) if run.pace == "realtime" and follow_clock else (None, None)
     events, warned = EventLog(result.events), None
     will_begin = SWITCHER in supervisor.by_node  # with several hosts, one has it; the others do not know
-    while interruption.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
+    while signals.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
         if linked:
             linked.look(supervisor)
         time.sleep(FIRST_POLL if will_begin and began is None else POLL)
@@ -339,7 +329,8 @@ def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: I
 
 def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
     try:
-        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(STATUS_FOLDER, STEPS, CLOCKS, ROS_LOGS))
+        unwanted = shutil.ignore_patterns(STATUS_FOLDER, STEPS, CLOCKS, ROS_LOGS, ".*")  # hidden: drafts
+        shutil.copytree(folder, directory, ignore=unwanted)
     except OSError as error:
         # The argument of shutil.Error is a list of (from, to, reason).
         reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)

@@ -49,9 +49,9 @@ REPORTER = """
 import json, os, sys
 from pathlib import Path
 sys.path.remove(os.environ["PYTHONPATH"])
-from msg_agents.run.result import write_steps
+from msg_agents.run.result import write_report
 for line in open(sys.argv[2]):
-    write_steps(Path(sys.argv[sys.argv.index("--steps") + 1]), json.loads(line))
+    write_report(Path(sys.argv[sys.argv.index("--steps") + 1]), json.loads(line))
     print("written", flush=True)
 """
 INCOMPLETE = OBEDIENT.replace("exit(0)", f"exit({ExitCode.INCOMPLETE:d})")
