@@ -15,7 +15,7 @@ from msg_agents.nodes.base import CLOCK_BOUND, Health
 from msg_agents.nodes.ros import DueTimer, after
 from msg_agents.nodes.switcher import EPOCH_DELAY
 from msg_agents.stepping.newest_values import CLOCK_MARGIN, NewestReceived, NewestValues, Schedule
-from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, NOTHING, DelayedSynchronizer, Synchronizer
+from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, NOTHING, Synchronizer
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.errors import InputError
 from msg_analysis.messages import topics
@@ -34,13 +34,11 @@ class LockstepAgent(Agent):
         super().__init__(**options)
         self._turns = self._group.turns
         self._will_report = False  # whether ``_report_later`` will be called
-        reception = self._law.air
-        self.values: Synchronizer[bytes]
+        reception, options = self._law.air, self._options
         if reception and reception.looks_back:
             self._require_stored_values(reception)
-            self.values = DelayedSynchronizer(needed=reception.needed, delay=reception.delay, **self._options)
-        else:
-            self.values = Synchronizer(**self._options)
+            options |= {"needed": reception.needed, "delay": reception.delay}
+        self.values: Synchronizer[bytes] = Synchronizer(**options)
 
     def _require_stored_values(self, reception: AgentAir) -> None:
         """InputError if the agent comes back, and its peers have no longer a value that it was holding."""

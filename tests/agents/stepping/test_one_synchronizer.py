@@ -66,7 +66,6 @@ def test_another_value_is_noticed_for_as_long_as_the_true_one_can_take() -> None
         make_step(node)
     assert node.offer(1, LOCKSTEP_WINDOW, "forged") == Refusal.CONTRADICTION
     assert node.offer(1, LOCKSTEP_WINDOW - 1, "forged") == Refusal.REPEATED
-    assert node.buffered == 0
 
 
 def test_whose_states_are_lacking() -> None:
@@ -116,7 +115,6 @@ def test_refused_sojourns_change_nothing(sequence: int, first: int, last: int, r
 def test_the_farthest_possible_step_is_taken() -> None:
     node = pair(window=2)
     assert [node.offer(1, k, str(k)) for k in range(4)] == [None] * 4
-    assert node.buffered == 4
     assert node.offer(1, 4, "4") == Refusal.TOO_NEW
 
 
@@ -129,7 +127,6 @@ def test_a_peer_without_a_link_still_holds_back() -> None:
     assert node.offer(1, 0, "0") is None  # of no use any more, but it shows that the peer moves
     assert node.offer(1, 0, "0") == Refusal.REPEATED
     assert node.ready()
-    assert node.buffered == 0
 
 
 def test_alone() -> None:
