@@ -39,10 +39,7 @@ MOST_RELAYED = 206  # participants that the relay connects: they fill the ports 
 NUMBERS_OF_DOMAIN = 119  # of participants whose ports are those of their domain; from there on, of the next one
 UDP_PROFILE = Path(__file__).with_name("udp.xml")
 
-LEASE = 60.0
-"""s of silence after which a participant on another host counts as gone, and messages on their way to it are lost: the
-longest time for which a host may be cut off."""
-
+LEASE = 60.0  # s of silence after which a participant on another host, and what is on its way to it, counts as lost
 ANNOUNCEMENT = 3.0  # s between two announcements of a participant to other hosts
 _NAMESPACE = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
 
@@ -100,9 +97,7 @@ def _tag(name: str) -> str:
     return f"{{{_NAMESPACE}}}{name}"
 
 
-DOMAINS = range(1, 102)
-"""0 is the default of every ROS program; above 101 the ports are among the ephemeral ports of Linux."""
-
+DOMAINS = range(1, 102)  # 0 is the default of every ROS program; above 101 are the ephemeral ports of Linux
 PORT_BASE, PORTS_PER_DOMAIN = 7400, 250  # the RTPS rule for well-known ports
 
 
@@ -118,24 +113,10 @@ def domains_with_ports_in_use() -> set[int]:
     return {(port - PORT_BASE) // PORTS_PER_DOMAIN for port in ports}
 
 
-def _open_lock(path: Path) -> int:
-    """Open a lock file, which may belong to another user.
-
-    Such a file can be read and locked, but not opened for writing nor, in a directory like /tmp, with O_CREAT.
-    """
-    try:
-        return os.open(path, os.O_RDONLY)
-    except FileNotFoundError:
-        return os.open(path, os.O_RDONLY | os.O_CREAT, 0o644)
-
-
 @contextmanager
 def free_domain(count: int = 1, domains: Sequence[int] = DOMAINS) -> Iterator[int]:
-    """Hold a ROS_DOMAIN_ID that no other run holds and whose ports are unused; InputError if there is none.
-
-    ``count``: as many in a row, for a network that needs their ports; the first one is its domain. They are held by
-    locks on files, which the system releases when this process ends, however it ends.
-    """
+    """Hold a ROS_DOMAIN_ID, the first of ``count`` that no other run holds and whose ports are unused."""
+    # They are held by locks on files, which the system releases when this process ends, however it ends.
     busy = domains_with_ports_in_use()
     free = [domain for domain in domains if domain not in busy]
     candidates = [first for first in free if set(range(first, first + count)) <= set(free)]
@@ -166,8 +147,10 @@ def _lock_name(domain: str) -> str:
 
 def _lock(domain: int, locks: ExitStack) -> bool:
     """Lock a domain until the end of ``locks``; whether that was possible."""
+    path = Path(tempfile.gettempdir()) / _lock_name(str(domain))
     try:
-        descriptor = _open_lock(Path(tempfile.gettempdir()) / _lock_name(str(domain)))
+        # That of another user can be read and locked, but not written nor, in /tmp for example, opened with O_CREAT.
+        descriptor = os.open(path, os.O_RDONLY | (0 if path.exists() else os.O_CREAT), 0o644)
     except OSError:
         return False
     locks.callback(os.close, descriptor)
@@ -228,10 +211,7 @@ class Announcement:
 
 
 def read_announcement(datagram: bytes, reader: bytes | None = None) -> Announcement | None:
-    """The announcement in a datagram; None if there is none, or it is addressed to another one than the reader.
-
-    ``reader``: prefix of its GUID; what is addressed to it becomes an announcement to everybody.
-    """
+    """The announcement in a datagram, made one to everybody; None if there is none, or it is for another ``reader``."""
     if datagram[:4] != _MAGIC:
         return None
     with contextlib.suppress(struct.error):  # it is cut off
@@ -283,11 +263,7 @@ def _parameters(body: bytes, position: int) -> Iterator[tuple[int, int, int]]:
 
 
 def announcement_message(prefix: bytes, port: int, lease: int) -> bytes:
-    """The message by which a participant without endpoints announces itself.
-
-    ``prefix``: of its GUID, 12 bytes. ``port``: of the loopback address, for announcements of others. ``lease``: s
-    without a message after which others forget it.
-    """
+    """The message by which a participant without endpoints announces itself, with its port of the loopback address."""
     locator = struct.pack("<iI12x4s", _UDP_V4, port, socket.inet_aton(LOOPBACK))
     values = {
         _PROTOCOL_VERSION: _HEADER[4:6] + bytes(2),
@@ -316,20 +292,15 @@ def disposal_message(prefix: bytes, number: int = _LATE) -> bytes:
         + struct.pack("<HH", _SENTINEL, 0)
     )
     # Extra flags, octets to the inline QoS, any reader, the writer, its sequence number (high, low).
-    body = (
-        struct.pack("<HH4s4siI", 0, 16, bytes(4), _PARTICIPANT_WRITER, number >> 32, number & 0xFFFFFFFF) + parameters
-    )
+    body = struct.pack("<HH4s4siI", 0, 16, bytes(4), _PARTICIPANT_WRITER, 0, number) + parameters
     return _HEADER + prefix + struct.pack("<BBH", _DATA, _LITTLE_ENDIAN | _INLINE_QOS, len(body)) + body
 
 
 def remove_participant(prefix: bytes, domain: int, *, repeats: int = 3) -> None:
-    """Tell every participant on the hosts of the run that one has gone; on other machines its lease has to end.
-
-    ``repeats``: how often, since datagrams may be lost.
-    """
+    """Tell every participant on the hosts of the run that one has gone; on other machines its lease has to end."""
     addresses = {LOOPBACK, *os.environ.get(PEERS_VARIABLE, "").split()}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for repeat in range(repeats):
+        for repeat in range(repeats):  # datagrams may be lost
             message = disposal_message(prefix, _LATE + repeat)
             for place in product(addresses, discovery_ports(domain)):
                 with contextlib.suppress(OSError):  # no participant there
@@ -380,10 +351,8 @@ LOOPBACK_INTERFACES = ("lo", "lo0")  # on Linux, elsewhere
 
 
 def announce_here(datagram: bytes, domain: int) -> None:
-    """Send an announcement to the participants on this machine that receive a domain's group at an interface.
-
-    One of Cyclone DDS has no number by default, and discovers others only there.
-    """
+    """Send an announcement to the participants on this machine that receive a domain's group at an interface."""
+    # One of Cyclone DDS has no number by default, and discovers others only there.
     for index, name in socket.if_nameindex():
         if name in LOOPBACK_INTERFACES:  # the processes of the run receive the group there, and would all answer
             continue

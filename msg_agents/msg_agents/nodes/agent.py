@@ -108,11 +108,6 @@ class Agent(NetworkNode):
         """Its number, from 1."""
         return self._law.agent + 1
 
-    @property
-    def step(self) -> int:
-        """The current step."""
-        return self._law.step
-
     def connect(self, local_agents: Mapping[int, Agent]) -> None:
         """Connect to the peers in this process (by index) by direct calls."""
         self._listeners = [local_agents[j].receive for j in self._local]
@@ -120,12 +115,9 @@ class Agent(NetworkNode):
     def subscribe_to_remote(self) -> None:
         """Connect to the peers in other processes by their topics."""
         for j in self.remote:
-            refuse = partial(self._refuse_state, topics.STATE.of(j))
+            refuse = partial(self.refuse, topic=topics.STATE.of(j))
             take = state_receiver(self.record, j, self._frame, self.receive, refuse, possible=True)
             self._remote_states.append(self.subscribe(topics.STATE, take, agent=j, qos=self.state_qos))
-
-    def _refuse_state(self, topic: str, reason: str) -> None:
-        self.refuse(reason, topic)
 
     def create_shared(self, agents: Sequence[Agent]) -> None:
         """Create what a process needs only once. Called on its first agent, with all its agents."""

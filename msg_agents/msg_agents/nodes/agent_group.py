@@ -210,7 +210,14 @@ class AgentGroup:
         self._host = self.nodes[0]
         self.states = StateBatches(self._host, topics.STATES)  # as other agents receive them
         self.links = BatchLinks(self._host, self.states.publisher, agents)
-        self._connect()
+        listeners: dict[int, list[Agent]] = {}
+        for agent in self.nodes:
+            agent.connect(self._agents)
+            for j in agent.remote:
+                listeners.setdefault(j, []).append(agent)
+        if not (self._host.reads_batches and self.links.listen(listeners)):
+            for agent in self.nodes:
+                agent.subscribe_to_remote()
         self._host.create_shared(self.nodes)
         self._progress = self._host.publisher_of(topics.PROGRESS)
         self._awaits_recorder = RECORDER in readers
@@ -227,16 +234,6 @@ class AgentGroup:
         if record.until:
             self._host.subscribe(topics.STOP, self._receive_stop)
         self._host.finish_at_end(self.nodes)
-
-    def _connect(self) -> None:
-        listeners: dict[int, list[Agent]] = {}
-        for agent in self.nodes:
-            agent.connect(self._agents)
-            for j in agent.remote:
-                listeners.setdefault(j, []).append(agent)
-        if not (self._host.reads_batches and self.links.listen(listeners)):
-            for agent in self.nodes:
-                agent.subscribe_to_remote()
 
     def _end_turns(self) -> None:
         if self.links.read and not self._sending:  # other processes wait for these states
@@ -306,8 +303,8 @@ class AgentGroup:
                 agent.end_at(stop.step)
 
     def _receive_graph(self, data: bytes) -> None:
-        self._host.rules.forget(min(agent.step for agent in self.nodes))
-        graph = self._host.decode_graph(data)
+        self._host.rules.forget(min(agent.values.step for agent in self.nodes))
+        graph = self._host.accepted(self._host.rules.graph(data), topics.GRAPH)
         if graph is None:
             return
         # Agents that take over are at different steps: what is new to one may be known to another.

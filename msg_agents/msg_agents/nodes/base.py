@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.duration import Duration
-from rclpy.node import Node, NodeNameNonExistentError
+from rclpy.node import NodeNameNonExistentError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.task import Future
@@ -45,14 +45,14 @@ class Health:
     waiting: bool = False  # cannot continue, or cannot keep up, at present
     values: dict[str, str] = field(default_factory=dict)
 
-    def to_status(self, node: Node, refused: Mapping[tuple[str, str], int], repeated: int) -> DiagnosticStatus:
-        """The diagnostic message about a node; ``refused`` counts messages by (topic, reason)."""
-        counts = {f"refused on {topic}: {reason}": str(count) for (topic, reason), count in refused.items()}
+    def to_status(self, node: NetworkNode) -> DiagnosticStatus:
+        """The diagnostic message about a node."""
+        counts = {f"refused on {topic}: {reason}": str(count) for (topic, reason), count in node.refused.items()}
         values = self.values | counts
-        if repeated:
-            values[Refusal.REPEATED] = str(repeated)
+        if node.repeated:
+            values[Refusal.REPEATED] = str(node.repeated)
         return DiagnosticStatus(  # refused messages are a warning: other nodes publish on the topics of the run
-            level=DiagnosticStatus.WARN if self.waiting or refused else DiagnosticStatus.OK,
+            level=DiagnosticStatus.WARN if self.waiting or node.refused else DiagnosticStatus.OK,
             name=f"{node.get_fully_qualified_name().lstrip('/')}: network",
             message=self.message,
             hardware_id="",
@@ -184,15 +184,12 @@ class NetworkNode(LeanNode):
         """Which messages belong to the run."""
         return RunRules(self.record)
 
-    def decode_graph(self, data: bytes) -> ActiveGraph | None:
-        """A sojourn of the graph of this run; None, and counted, if the bytes are not one."""
-        return self._accepted(self.rules.graph(data), topics.GRAPH)
-
     def decode_progress(self, data: bytes, topic: Topic) -> Progress | None:
-        """The same of Progress, on one of its topics."""
-        return self._accepted(self.rules.progress(data, topic), topic)
+        """A message of this run, on one of its topics; None, and counted, if the bytes are not one."""
+        return self.accepted(self.rules.progress(data, topic), topic)
 
-    def _accepted(self, found: Message | str, topic: Topic) -> Message | None:
+    def accepted(self, found: Message | str, topic: Topic) -> Message | None:
+        """What ``rules`` give for a message; None, and counted, if it is the reason of a refusal."""
         if isinstance(found, str):
             self.refuse(found, topic.name)
             return None
@@ -254,9 +251,7 @@ class HealthReporter:
 
     def _report(self) -> None:
         healths = [(node, node.health()) for node in self._nodes]
-        array = DiagnosticArray(
-            status=[health.to_status(node, node.refused, node.repeated) for node, health in healths]
-        )
+        array = DiagnosticArray(status=[health.to_status(node) for node, health in healths])
         array.header.stamp = self._nodes[0].get_clock().now().to_msg()
         with until_shutdown(self._nodes[0]):
             self._publisher.publish(array)

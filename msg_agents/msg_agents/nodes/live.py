@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from msg_agents_interfaces.msg import Estimate as EstimateMsg
@@ -165,17 +166,10 @@ def watch(
     *,
     reliable: bool = False,
     record: RunRecord | None = None,  # None: of the topic ``experiment``
-    timeout: float | None = None,  # s to wait for a network; None: no limit
     on_report: Callable[[Watched, float], None] = lambda *_: None,
-    on_note: Callable[[str], None] = lambda _: None,  # while there is no network
     on_event: Callable[[str], None] = lambda _: None,  # about the network
-    on_look: Callable[[], None] = lambda: None,  # called a few times a second
+    **options: Any,  # of ``run_watcher``
 ) -> Watched | None:
-    """Watch a network as ``run_watcher`` does; what was seen, or None without a network."""
-    node = run_watcher(
-        lambda: Live(reliable=reliable, record=record, on_report=on_report, on_note=on_event),
-        timeout=timeout,
-        on_note=on_note,
-        on_look=on_look,
-    )
+    """Watch a network; what was seen, or None without a network."""
+    node = run_watcher(lambda: Live(reliable=reliable, record=record, on_report=on_report, on_note=on_event), **options)
     return node and node.outcome

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ import rclpy
 from builtin_interfaces.msg import Time
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidTopicNameException
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
@@ -102,22 +101,6 @@ def message_classes(topics: Iterable[BagTopic], *, all_wanted: bool, on_note: Ca
     return found
 
 
-def check_definitions(node: Node, writers: Mapping[str, Publisher], topics: Mapping[str, BagTopic]) -> None:
-    """InputError if a topic was recorded with another definition of its type: its bytes mean something else."""
-    for name, publisher in writers.items():
-        recorded = topics[name].type_hash
-        ours = {
-            str(info.topic_type_hash)
-            for info in node.get_publishers_info_by_topic(publisher.topic_name)
-            if info.node_name == node.get_name()
-        }
-        if recorded and ours and recorded not in ours:
-            raise InputError(
-                f"topic {name}: was recorded with another definition of {topics[name].type_name} ({recorded}) than the "
-                f"installed one ({ours.pop()}): install that version, or leave the topic out with --exclude"
-            )
-
-
 class Player(LeanNode):
     """Publishes the messages of a bag: the same bytes, in the same order on each topic, without loss."""
 
@@ -164,7 +147,7 @@ class Player(LeanNode):
                 self._writers[name] = self.create_publisher(kind, names[name], qos)
             except InvalidTopicNameException as error:
                 raise InputError(f"--remap: {name}:={names[name]}: {error}") from error
-        check_definitions(self, self._writers, bag.topics)
+        self._check_definitions()
         self._ticker = self.publisher_of(CLOCK) if options.clock else None
         self._time = BagClock(self._first, options.rate, paused=options.paused)
         self._sought = self._first  # messages of topics that are not latched are left out before this time [ns]
@@ -172,6 +155,17 @@ class Player(LeanNode):
         self._began = self._shown = self._looked = self._ticked = 0.0
         self._awake = time.monotonic()  # when it was last known not to be stopped
         self.played = Played(length=(bag.end - bag.start) / SECOND)
+
+    def _check_definitions(self) -> None:
+        """InputError if a topic was recorded with another definition of its type: its bytes mean something else."""
+        for name, publisher in self._writers.items():
+            topic, infos = self._bag.topics[name], self.get_publishers_info_by_topic(publisher.topic_name)
+            ours = {str(info.topic_type_hash) for info in infos if info.node_name == self.get_name()}
+            if topic.type_hash and ours and topic.type_hash not in ours:
+                raise InputError(
+                    f"topic {name}: was recorded with another definition of {topic.type_name} ({topic.type_hash}) than "
+                    f"the installed one ({ours.pop()}): install that version, or leave the topic out with --exclude"
+                )
 
     def play(self) -> None:
         """Play the bag, once or (``loop``) until a signal ends it; InputError: required readers are missing."""
@@ -359,12 +353,12 @@ class Player(LeanNode):
         except ValueError:
             self._on_note(f"{typed}: expected a time in seconds, such as 12.5")
             return
-        if here <= wanted <= end:
-            self._seek(self._bag.start + round(wanted * SECOND))
-        elif wanted > end:
+        if wanted > end:
             self._on_note(f"{typed} s: expected a time up to {end:g} s, where the bag ends")
-        else:
+        elif wanted < here:
             self._on_note(f"{typed} s: there is no way back from {here:g} s: start again with --start-offset {typed}")
+        else:
+            self._seek(self._bag.start + round(wanted * SECOND))
 
     def _seek(self, when: int) -> None:
         """Go forward to a time of the bag [ns]. Latched messages on the way are all published, at once."""

@@ -124,7 +124,7 @@ class Recorder(NetworkNode):
                 self._received_last(kind.names[agent])
 
     def _record_graph(self, data: bytes) -> None:
-        graph = self.decode_graph(data)
+        graph = self.accepted(self.rules.graph(data), topics.GRAPH)
         if graph is None:
             return
         if graph.sequence in self._sojourns:

@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from msg_agents.channel.channel_file import BASE, Channel
-from msg_agents.channel.process import ActiveGraphFile, Host, hand_over, open_hosts
+from msg_agents.channel.process import ActiveGraphFile, Host, hand_over
 from msg_agents.discovery.rtps import LEASE, PEERS_VARIABLE, profile_for_hosts
 from msg_agents.environment import channel_environment
 from msg_agents.process_layout import SWITCHER, ProcessSpec
@@ -38,21 +36,16 @@ MOST_Z = 5.0  # of the packets that a pair lost; by chance, any of 1000 pairs is
 SHOWN_PAIRS = 3
 
 
-@dataclass(slots=True)
 class RunChannel:
     """The channel of one run. The hosts are open."""
 
-    channel: Channel
-    hosts: dict[str, Host]
-    _active: ActiveGraphFile | None = field(default=None, init=False)  # if packets follow the graph
-    _lockstep: bool = field(default=False, init=False)
-    _steps: list[int] = field(default_factory=list, init=False)  # of the agents, and since when [s]
-    _since: float = field(default=0.0, init=False)
-
-    @property
-    def agents(self) -> list[tuple[int, ...]]:
-        """The agents (from 0) of each host that has any."""
-        return [agents for agents in self.channel.hosts.values() if agents]
+    def __init__(self, channel: Channel, hosts: dict[str, Host]) -> None:
+        self.channel, self.hosts = channel, hosts
+        self.agents = [agents for agents in channel.hosts.values() if agents]  # (from 0) of each host that has any
+        self._active: ActiveGraphFile | None = None  # if packets follow the graph
+        self._lockstep = False
+        self._steps: list[int] = []  # of the agents, and since when [s]
+        self._since = 0.0
 
     def environment(self, folder: Path) -> dict[str, str]:
         """Changes of the environment of all processes, with a profile in ``folder``."""
@@ -125,16 +118,6 @@ def predicted_errors(channel: Channel, experiment: Experiment) -> dict[str, Any]
     except InputError:
         return None
     return {"system_error": predicted.system_error, "node_errors": predicted.node_errors.tolist()}
-
-
-@contextmanager
-def run_channel(channel: Channel | None) -> Iterator[RunChannel | None]:
-    """Open the hosts of a channel; None: without one. NotAvailableError: this machine or user cannot have them."""
-    if channel is None:
-        yield None
-        return
-    with open_hosts(list(channel.hosts), channel.mtu) as hosts:
-        yield RunChannel(channel, hosts)
 
 
 def channel_findings(

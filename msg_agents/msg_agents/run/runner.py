@@ -9,11 +9,12 @@ import shutil
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 
 from msg_agents.channel.channel_file import Channel
+from msg_agents.channel.process import open_hosts
 from msg_agents.environment import RESTARTS, ROS_LOGS, require_middleware, run_environment, uses_relay
 from msg_agents.process_layout import (
     MOST_PROCESSES,
@@ -29,7 +30,7 @@ from msg_agents.recovery import entry_size, room_for
 from msg_agents.run.folder import make_bag_directory, temporary_directory
 from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.result import EventLog, RunResult
-from msg_agents.run.run_channel import RunChannel, run_channel
+from msg_agents.run.run_channel import RunChannel
 from msg_agents.run.supervisor import CLOCKS, CRASHED, HUNG, LATE, STATUS_FOLDER, STEPS, Supervisor
 from msg_agents.stepping.monitoring import ClockDetector, LagDetector, StallDetector
 from msg_agents.terminal import Interruption
@@ -142,12 +143,13 @@ def run_network(
     signals = interruption or Interruption()
     try:
         with (
-            run_channel(channel) as linked,
+            open_hosts(list(channel.hosts), channel.mtu) if channel else nullcontext() as opened,
             temporary_directory() as folder,
-            run_environment(
-                folder, domain, {**(environment or {}), **(linked.environment(folder) if linked else {})}, count + 2
-            ) as (domain, variables, relay),
+            ExitStack() as stack,
         ):
+            linked = RunChannel(channel, opened) if channel and opened else None
+            changes = {**(environment or {}), **(linked.environment(folder) if linked else {})}
+            domain, variables, relay = stack.enter_context(run_environment(folder, domain, changes, count + 2))
             with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 require_middleware(variables, *([fork_server.has_middleware] if fork_server else []))
                 if assignment is None and linked is None:  # tools of the user do not reach a channel
