@@ -158,6 +158,42 @@ def test_inputs_must_be_peers() -> None:
         Synchronizer(agent=0, steps=1, inputs=[[1, 3]], peers=[1])
 
 
+def lonely(held: int) -> Synchronizer[str]:
+    """Agent 0 at step 200, which hears agent 1, of which it holds the value of a step."""
+    node: Synchronizer[str] = Synchronizer(
+        needed=lambda _j, k: held if k <= 200 else k, delay=0, agent=0, steps=300, inputs=[[1]], peers=[1], start=200
+    )
+    assert node.learn(0, 0, 0, 299) is None
+    return node
+
+
+@pytest.mark.parametrize("held", [90, 150, 200])
+def test_it_waits_for_the_value_that_it_holds(held: int) -> None:
+    """Newer and older ones do not help; what comes twice must be the same."""
+    node = lonely(held)
+    assert node.waiting_for() == f"step {held} of agent 2"
+    assert node.lacking() == [1]
+    assert node.offer(1, 201, "new") is None
+    assert node.offer(1, held - 1, "old") == Refusal.REPEATED
+    assert not node.ready()
+    assert node.offer(1, held, "held") is None
+    assert node.offer(1, held, "held") == Refusal.REPEATED
+    assert node.offer(1, held, "forged") == Refusal.CONTRADICTION
+    assert node.known(1, held) == "held"
+    assert node.ready()
+    assert node.inputs() == (0, ["held"])
+    node.advance()
+    assert node.inputs() == (0, ["new"])
+
+
+def test_what_it_refuses_of_a_peer_that_is_heard_late() -> None:
+    node = lonely(200)
+    assert node.offer(2, 200, "") == Refusal.NOT_A_PEER
+    assert node.offer(1, 266, "") == Refusal.TOO_NEW
+    assert node.offer(1, 100, "") is None  # the progress of a peer that is behind
+    assert node.offer(1, 99, "") == Refusal.REPEATED
+
+
 class Player:
     """Whoever gets the ball passes it on to the next one, until it has been passed often enough."""
 
