@@ -164,6 +164,10 @@ def test_complete(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("code", "words"), [(2, "exit code 2"), (-signal.SIGKILL, "killed by SIGKILL")])
 def test_failed(tmp_path: Path, code: int, words: str) -> None:
     """Said once: the others end because of it, the recorder last. Until then they may read the run record."""
+    network = launched(tmp_path, processes="1")
+    network.ended("recorder", code)
+    assert network.to_stop() == ["agents_1_to_5", "switcher"]
+    network.close()
     network = launched(tmp_path, processes="2")
     assert network.to_stop() == []
     network.ended("agents_1_to_2", code)
@@ -176,13 +180,6 @@ def test_failed(tmp_path: Path, code: int, words: str) -> None:
     network.ended("recorder", 3)
     assert (network.over, network.to_stop(), network.analysis()) == (True, [], None)
     assert network.reason == f"agents_1_to_2: {words}: the run is not complete"
-    network.close()
-
-
-def test_a_recorder_that_failed(tmp_path: Path) -> None:
-    network = launched(tmp_path, processes="1")
-    network.ended("recorder", 2)
-    assert network.to_stop() == ["agents_1_to_5", "switcher"]
     network.close()
 
 
