@@ -156,7 +156,7 @@ def lay_out_network(
     if checkpoints is not None:
         options += ("--checkpoint", str(checkpoints))
     if assignment is not None:
-        options += ("--patience", f"{assignment.peer_timeout:g}")
+        options += ("--timeout", f"{assignment.peer_timeout:g}")
     resumes = checkpoints is not None
     central = assignment is None or assignment.has_recorder
     processes = []

@@ -211,7 +211,7 @@ def test_the_hosts_together_run_the_whole_network() -> None:
         assert numbers(process) == [agent + 1 for agent in process.agents]
         assert ("--discovery-timeout", "120") in pairwise(process.arguments)
         assert process.name == "recorder" or ("--await", "recorder") in pairwise(process.arguments)
-        assert process.name == "recorder" or ("--patience", "30") in pairwise(process.arguments)
+        assert process.name == "recorder" or ("--timeout", "30") in pairwise(process.arguments)
 
 
 def test_processes_count_for_each_host() -> None:

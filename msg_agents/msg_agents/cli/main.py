@@ -17,6 +17,7 @@ import click
 
 import msg_agents
 from msg_agents.cli import begin, nodes, replay, watching
+from msg_agents.cli.ros_command import RenamedOption
 from msg_agents.cli.run_result import finish
 from msg_agents.cli.watching import WebCommand, announce, page, web_options
 from msg_agents.environment import LAST_DOMAIN, RESTARTS, USER_TIMEOUT
@@ -269,7 +270,9 @@ def run(
     help="How long to wait for the other hosts [s].",
 )
 @click.option(
+    "--timeout",
     "--patience",
+    cls=RenamedOption,
     type=PositiveFloat(),
     metavar="SECONDS",
     default=30.0,
@@ -298,7 +301,7 @@ def host(
     name: str | None,
     out: Path,
     discovery_timeout: float,
-    patience: float,
+    timeout: float,
     restarts: int,
     no_analyse: bool,
     write_report: ReportWhen,
@@ -329,7 +332,7 @@ def host(
     if only_profile:
         click.echo(places.profile(what), nl=False)
         return
-    assignment = places.assignment(name or socket.gethostname(), discovery_timeout, patience)
+    assignment = places.assignment(name or socket.gethostname(), discovery_timeout, timeout)
     mine = show([agent_name(agent + 1, what.names) if what.names else agent + 1 for agent in assignment.agents])
     with temporary_directory() as folder, RunView(what) as view:
         also = " and the recorder" if assignment.has_recorder else ""

@@ -17,6 +17,19 @@ from msg_agents.terminal import exit_on_signals
 from msg_analysis.cli.options import PATH
 
 
+class RenamedOption(click.Option):
+    """An option whose last name is an older one, which is still taken and not shown."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        """As in click."""
+        *shown, old = self.opts
+        self.opts = shown
+        try:
+            return super().get_help_record(ctx)
+        finally:
+            self.opts = [*shown, old]
+
+
 class RosCommand(click.Command):
     """Takes arguments for ROS 2 as any ROS node does: ``--ros-args ... [--]``.
 

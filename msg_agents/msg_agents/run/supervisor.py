@@ -225,7 +225,7 @@ class Supervisor:
             return NodeStart(command, {option: int(control)}, output, None)
         status_file = self.logs / STATUS_FOLDER / f"{spec.name}.{number}.json"
         self._status_files.append(status_file)
-        arguments = [*spec.arguments, "--account", str(status_file), *self.options.get(spec.name, ())]
+        arguments = [*spec.arguments, "--status-file", str(status_file), *self.options.get(spec.name, ())]
         if spec.name == SWITCHER:
             arguments += ["--steps", str(self.logs / STEPS), "--clocks", str(self.logs / CLOCKS)]
         descriptors = {"--lifeline": self._lifeline[0]}
