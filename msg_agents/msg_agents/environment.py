@@ -11,7 +11,6 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -34,6 +33,26 @@ from msg_analysis.errors import InputError
 
 MEMORY = Path("/dev/shm")  # a page of a file on a disk costs twice as much to write, each time the system has saved it
 LEAST_FREE = 64 << 10  # bytes; where a page that ROS maps there cannot be had, the processes of a run die of SIGBUS
+# With none of these, rclpy, its libraries and its middleware can only be those of this Python.
+FOREIGN_VARIABLES = ("RMW_IMPLEMENTATION", "PYTHONPATH", "AMENT_PREFIX_PATH", "ROS_DISTRO")
+PROBE_TIMEOUT = 60.0  # s
+PROBE = """
+import importlib.util, os, warnings
+warnings.simplefilter("ignore")
+print(os.path.dirname(importlib.util.find_spec("rclpy").origin), flush=True)
+from msg_agents.nodes.ros import use_middleware
+use_middleware()
+"""
+TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
+RESTARTS = 3  # of killed processes in a run, by default
+LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants only
+DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
+USER_TIMEOUT = 120.0  # s for which they look for others that the user starts
+RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"  # older; 1 is still stronger, and adds shared memory as LOCALHOST does
+SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
+LOGS_VARIABLE = "ROS_LOG_DIR"
+ROS_LOGS = "ros"  # folder for nodes that have no other place for the log files of ROS
 
 
 def free_space(directory: Path) -> int:
@@ -52,18 +71,6 @@ def require_shared_memory(directory: Path = MEMORY) -> None:
             f"{directory}: full ({free} bytes free): ROS 2 processes would be killed by SIGBUS: remove what is not "
             "used, with `fastdds shm clean` or by hand"
         )
-
-
-# With none of these, rclpy, its libraries and its middleware can only be those of this Python.
-FOREIGN_VARIABLES = ("RMW_IMPLEMENTATION", "PYTHONPATH", "AMENT_PREFIX_PATH", "ROS_DISTRO")
-PROBE_TIMEOUT = 60.0  # s
-PROBE = """
-import importlib.util, os, warnings
-warnings.simplefilter("ignore")
-print(os.path.dirname(importlib.util.find_spec("rclpy").origin), flush=True)
-from msg_agents.nodes.ros import use_middleware
-use_middleware()
-"""
 
 
 def require_rclpy() -> Path:
@@ -105,17 +112,6 @@ def require_middleware(environment: Mapping[str, str], forked: Callable[[], bool
     )
 
 
-TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
-RESTARTS = 3  # of killed processes in a run, by default
-LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants only
-DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
-USER_TIMEOUT = 120.0  # s for which they look for others that the user starts
-RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"  # older; 1 is still stronger, and adds shared memory as LOCALHOST does
-SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
-LOGS_VARIABLE = "ROS_LOG_DIR"
-
-
 def check_domain() -> None:
     """InputError if the environment's ROS_DOMAIN_ID is not usable; to be called before the middleware starts."""
     value = os.environ.get("ROS_DOMAIN_ID") or "0"
@@ -148,11 +144,6 @@ def can_log() -> bool:
 def other_logs(directory: Path) -> dict[str, str]:
     """Changes to our environment that let ROS log to a directory, if it cannot write to the usual one."""
     return {} if can_log() else {LOGS_VARIABLE: str(directory)}
-
-
-def ensure_logs() -> None:
-    """Give this process another directory for the log files of ROS if it cannot write to the usual one."""
-    os.environ.update(other_logs(Path(tempfile.gettempdir()) / f"msg_agents_log_{os.getuid()}"))
 
 
 def require_discovery(environment: Mapping[str, str]) -> None:
@@ -206,9 +197,6 @@ def without_shared_memory() -> dict[str, str]:
     if os.environ.get(RANGE_VARIABLE) == "LOCALHOST" or os.environ.get(LOCALHOST_VARIABLE) == "1":
         return {RANGE_VARIABLE: "SYSTEM_DEFAULT", LOCALHOST_VARIABLE: "", **profile_variables(LOOPBACK_PROFILE)}
     return profile_variables(UDP_PROFILE)
-
-
-ROS_LOGS = "ros"  # folder for nodes that have no other place for the log files of ROS
 
 
 @contextmanager

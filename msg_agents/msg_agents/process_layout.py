@@ -39,6 +39,8 @@ MOST_PROCESSES = 200  # of agents, which the relay connects: with all others the
 MOST_UNAIDED = (
     90  # of agents, which look for each other: Fast DDS finds ``MOST_PARTICIPANTS``, some of which are others
 )
+SPARE_PARTICIPANTS = 8  # participants on a host besides those of the run, such as tools that watch it
+_RANGE = re.compile(r"([0-9]+)-([0-9]+)")
 
 
 class Process(Protocol):
@@ -211,10 +213,6 @@ def pin_to_core(process: int, core: int) -> None:
         os.sched_setaffinity(process, {core})
     except OSError:  # it has ended already, or the core has been taken from us
         return
-
-
-SPARE_PARTICIPANTS = 8  # participants on a host besides those of the run, such as tools that watch it
-_RANGE = re.compile(r"([0-9]+)-([0-9]+)")
 
 
 def agent_numbers(value: object) -> list[int]:

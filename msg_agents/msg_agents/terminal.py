@@ -52,7 +52,6 @@ class Interruption:
     """Keeps the first signal until somebody asks for it: from ``keep`` to ``end``, or as a context."""
 
     # An exception that a handler raises is lost in a generator that is being closed, or in a callback of an executor.
-
     def __init__(self) -> None:
         self.caught: int | None = None  # number of the first signal
         self._handlers: dict[signal.Signals, Any] = {}
@@ -104,7 +103,6 @@ class JobControl:
     """Calls ``before`` when Ctrl-Z is to stop the process, and ``after`` when it continues, as a context."""
 
     # Both are called by ``check``, not in a signal handler, which might come in the middle of drawing.
-
     def __init__(self, *, before: Callable[[], None], after: Callable[[], None]) -> None:
         self._before, self._after = before, after
         self._handlers: dict[signal.Signals, Any] = {}
@@ -158,7 +156,6 @@ class Keyboard:
     """Keys typed at the terminal, one by one and without echo, as a context; none where stdin is not a terminal."""
 
     # The system stops background processes that use the terminal. Call ``let_go`` before a stop, ``listen`` after it.
-
     def __init__(self) -> None:
         self._descriptor: int | None = None
         self._saved: list[Any] = []  # original settings; empty while they are in force

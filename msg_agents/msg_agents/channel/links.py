@@ -96,7 +96,6 @@ class Link:
 
     # Every random number is a function of seed, pair of hosts and number of the packet: the same seed loses the same
     # packets of a pair, whatever their times are.
-
     def __init__(self, settings: LinkSettings, seed: int, sender: int, receiver: int) -> None:
         self._settings, self._seed, self._pair = settings, seed, link_number(receiver, sender)
         self._number = 0  # of the next packet

@@ -49,6 +49,8 @@ REMEDY = (
     "run it as root, or in namespaces of your own: `unshare --user --map-root-user --net msg-agents run ...`; "
     "a container needs --cap-add NET_ADMIN,SYS_ADMIN and --device /dev/net/tun"
 )
+LARGEST_MESSAGE = 1 << 16  # bytes of a message that describes a host
+PRIORITY = -10  # a delay is that of the link, not that of the scheduler
 
 
 @dataclass(slots=True)
@@ -185,10 +187,6 @@ class ActiveGraphFile:
     def let_through(self, host: int, *, all_packets: bool) -> None:
         """Set whether they do."""
         self._map[_MODE.size + host] = all_packets
-
-
-LARGEST_MESSAGE = 1 << 16  # bytes of a message that describes a host
-PRIORITY = -10  # a delay is that of the link, not that of the scheduler
 
 
 def hand_over(

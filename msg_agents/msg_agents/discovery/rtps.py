@@ -42,6 +42,28 @@ UDP_PROFILE = Path(__file__).with_name("udp.xml")
 LEASE = 60.0  # s of silence after which a participant on another host, and what is on its way to it, counts as lost
 ANNOUNCEMENT = 3.0  # s between two announcements of a participant to other hosts
 _NAMESPACE = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
+DOMAINS = range(1, 102)  # 0 is the default of every ROS program; above 101 are the ephemeral ports of Linux
+PORT_BASE, PORTS_PER_DOMAIN = 7400, 250  # the RTPS rule for well-known ports
+PREFIX_SIZE = 12  # bytes of a GUID that all endpoints of a participant share
+PEERS_VARIABLE = "MSG_AGENTS_PEERS"  # addresses of the hosts, in a run on several
+LOOPBACK = "127.0.0.1"
+GROUP = "239.255.0.1"  # of announcements by multicast (9.6.1.4)
+_MAGIC, _HEADER_SIZE = b"RTPS", 20
+FAST_DDS = b"\x01\x0f"  # the vendor (8.3.3.1.3)
+_HEADER = _MAGIC + b"\x02\x03" + FAST_DDS  # version 2.3
+_DATA, _TO_ONE = 0x15, 0x0E  # submessages
+_ANYBODY = bytes(PREFIX_SIZE)  # as the addressee: all that receive it (8.3.7.6)
+_LITTLE_ENDIAN, _INLINE_QOS, _WITH_DATA = 0x01, 0x02, 0x04  # flags
+_PARTICIPANT, _PARTICIPANT_WRITER = b"\x00\x00\x01\xc1", b"\x00\x01\x00\xc2"
+_KEY_HASH, _STATUS_INFO, _SENTINEL, _DISCOVERY_LOCATOR = 0x70, 0x71, 0x01, 0x32
+_PARAMETERS_LITTLE_ENDIAN = b"\x00\x03"
+_DISPOSED_UNREGISTERED = b"\x00\x00\x00\x03"
+_PROTOCOL_VERSION, _VENDOR, _LEASE, _GUID, _DEFAULT_LOCATOR, _BUILTIN_ENDPOINTS = 0x15, 0x16, 0x02, 0x50, 0x31, 0x58
+_UDP_V4, _ANNOUNCER_AND_DETECTOR = 1, 0x03
+_LATE = 1 << 30  # sequence number: higher than that of any announcement that the participant made itself
+LOOPBACK_TIMEOUT = 1.0  # s; in the kernel, a message is there at once
+WORD = b"msg_agents"
+LOOPBACK_INTERFACES = ("lo", "lo0")  # on Linux, elsewhere
 
 
 def has_profile_for(topic: str) -> bool:
@@ -95,10 +117,6 @@ def profile_for_hosts(
 
 def _tag(name: str) -> str:
     return f"{{{_NAMESPACE}}}{name}"
-
-
-DOMAINS = range(1, 102)  # 0 is the default of every ROS program; above 101 are the ephemeral ports of Linux
-PORT_BASE, PORTS_PER_DOMAIN = 7400, 250  # the RTPS rule for well-known ports
 
 
 def domains_with_ports_in_use() -> set[int]:
@@ -159,25 +177,6 @@ def _lock(domain: int, locks: ExitStack) -> bool:
     except BlockingIOError:
         return False
     return True
-
-
-PREFIX_SIZE = 12  # bytes of a GUID that all endpoints of a participant share
-PEERS_VARIABLE = "MSG_AGENTS_PEERS"  # addresses of the hosts, in a run on several
-LOOPBACK = "127.0.0.1"
-GROUP = "239.255.0.1"  # of announcements by multicast (9.6.1.4)
-_MAGIC, _HEADER_SIZE = b"RTPS", 20
-FAST_DDS = b"\x01\x0f"  # the vendor (8.3.3.1.3)
-_HEADER = _MAGIC + b"\x02\x03" + FAST_DDS  # version 2.3
-_DATA, _TO_ONE = 0x15, 0x0E  # submessages
-_ANYBODY = bytes(PREFIX_SIZE)  # as the addressee: all that receive it (8.3.7.6)
-_LITTLE_ENDIAN, _INLINE_QOS, _WITH_DATA = 0x01, 0x02, 0x04  # flags
-_PARTICIPANT, _PARTICIPANT_WRITER = b"\x00\x00\x01\xc1", b"\x00\x01\x00\xc2"
-_KEY_HASH, _STATUS_INFO, _SENTINEL, _DISCOVERY_LOCATOR = 0x70, 0x71, 0x01, 0x32
-_PARAMETERS_LITTLE_ENDIAN = b"\x00\x03"
-_DISPOSED_UNREGISTERED = b"\x00\x00\x00\x03"
-_PROTOCOL_VERSION, _VENDOR, _LEASE, _GUID, _DEFAULT_LOCATOR, _BUILTIN_ENDPOINTS = 0x15, 0x16, 0x02, 0x50, 0x31, 0x58
-_UDP_V4, _ANNOUNCER_AND_DETECTOR = 1, 0x03
-_LATE = 1 << 30  # sequence number: higher than that of any announcement that the participant made itself
 
 
 def discovery_port(domain: int, participant: int) -> int:
@@ -307,10 +306,6 @@ def remove_participant(prefix: bytes, domain: int, *, repeats: int = 3) -> None:
                     sender.sendto(message, place)
 
 
-LOOPBACK_TIMEOUT = 1.0  # s; in the kernel, a message is there at once
-WORD = b"msg_agents"
-
-
 def require_loopback() -> None:
     """InputError unless messages over UDP arrive: the processes of a run exchange all theirs so."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
@@ -345,9 +340,6 @@ def _exchange(receiver: socket.socket, address: str) -> None:
         sender.sendto(WORD, (address, receiver.getsockname()[1]))
         while receiver.recv(len(WORD) + 1) != WORD:  # of somebody else
             pass
-
-
-LOOPBACK_INTERFACES = ("lo", "lo0")  # on Linux, elsewhere
 
 
 def announce_here(datagram: bytes, domain: int) -> None:

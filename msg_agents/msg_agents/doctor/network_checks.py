@@ -46,6 +46,14 @@ PAIR = {
     "run": {"dt": 0.01, "duration": 1000, "start": "zero", "processes": 2},
 }
 PER_ROUND_TRIP = 2  # steps: an agent waits in each for a message that the other one sent in the step before
+VARIABLES_FILE = "FASTDDS_ENVIRONMENT_FILE"
+NOT_USED = (TRANSPORTS_VARIABLE, "CYCLONEDDS_URI")  # with the run's own profile of Fast DDS
+PEERS_VARIABLE = "ROS_STATIC_PEERS"
+RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
+UNAIDED = f"its processes look for each other, at most {MOST_UNAIDED} with agents"
+WANTED = 4 << 20  # bytes of a receive buffer, as in the profiles of Fast DDS
+LEAST = 212_992  # bytes, what Linux allows by default
+SHOWN = 5  # taken domains
 
 
 class _EnoughError(Exception):
@@ -92,13 +100,6 @@ def check_round_trip() -> Check:
         return Check(name, "error", f"two processes exchange messages: {what or f'not within {LIMIT:g} s'}: {remedy}")
     duration = PER_ROUND_TRIP / watch.rate
     return Check(name, "ok", f"{duration * 1e3:.2g} ms between two processes, computing included", duration)
-
-
-VARIABLES_FILE = "FASTDDS_ENVIRONMENT_FILE"
-NOT_USED = (TRANSPORTS_VARIABLE, "CYCLONEDDS_URI")  # with the run's own profile of Fast DDS
-PEERS_VARIABLE = "ROS_STATIC_PEERS"
-RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
-UNAIDED = f"its processes look for each other, at most {MOST_UNAIDED} with agents"
 
 
 def check_profiles() -> Check:
@@ -154,11 +155,6 @@ def check_peers() -> Check:
     warning = f"{PEERS_VARIABLE}: {peers}: nodes of a run contact these machines: unset it, or {RANGE_VARIABLE}"
     text = f"{peers} (not used by a run on this machine)" if peers else "none"
     return warn_if("static_peers", warning if peers and not alone else None, text)
-
-
-WANTED = 4 << 20  # bytes of a receive buffer, as in the profiles of Fast DDS
-LEAST = 212_992  # bytes, what Linux allows by default
-SHOWN = 5  # taken domains
 
 
 def check_loopback() -> Check:

@@ -47,7 +47,6 @@ class Agent(NetworkNode):
 
     # Other agents read ``state``. Where that is not the exact state (broadcast noise, or a protocol that publishes only
     # a part of it), the exact one is published on ``truth``, for the log and the live node.
-
     state_qos: Qos | None = None  # of its subscriptions to the states of others; None: that of the topic
     reads_batches = False  # whether it may receive them in the batches of their processes instead
     values: AgentInputs[Any]  # what it has received and what its next step uses, as the pace wants it

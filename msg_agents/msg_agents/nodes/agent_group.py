@@ -33,6 +33,9 @@ from msg_analysis.model.step_model import Wiring
 BATCH_SIZE, SMALL_BATCH_SIZE = 60_000, 2**13
 BATCH_TIME = 0.1  # s of wall time after which a batch is sent with the next state, however small it is
 SEND_PERIOD = 0.5  # s of wall time after which it is sent in any case
+ONLY_TOPICS = "MSG_AGENTS_ONLY_TOPICS"  # variable that turns this off where it is set, for comparison
+FEWEST = 16  # agents elsewhere that a process must need to read batches: fewer topics cost little, and ROS shows them
+FRESH = 0.02  # s for which what was found out about other processes is not looked up again
 
 
 class StateBatches:
@@ -71,11 +74,6 @@ class StateBatches:
         return self._found
 
 
-ONLY_TOPICS = "MSG_AGENTS_ONLY_TOPICS"  # variable that turns this off where it is set, for comparison
-FEWEST = 16  # agents elsewhere that a process must need to read batches: fewer topics cost little, and ROS shows them
-FRESH = 0.02  # s for which what was found out about other processes is not looked up again
-
-
 def reads_most(remote: int, others: int) -> bool:
     """Whether a process that needs ``remote`` of ``others`` agents in other processes is to read the batches of all."""
     # It reads at most twice as many states as it needs, in as many messages as there are processes.
@@ -86,7 +84,6 @@ class BatchLinks:
     """Of one process, on the node ``host``: whose batches it reads, and which processes read those it publishes."""
 
     # Processes are distinguished by the GUIDs of their endpoints: nodes do not publish which agents they run with.
-
     def __init__(self, host: NetworkNode, publisher: Publisher, agents: Iterable[int]) -> None:
         self._host = host
         self._publisher = publisher
@@ -179,7 +176,6 @@ class AgentGroup:
 
     # Every endpoint is announced to every process. So what agents can share exists once per group, on the node of its
     # first agent: graph, progress, end, resend.
-
     def __init__(
         self,
         *,

@@ -35,6 +35,12 @@ from msg_analysis.model.run_record import RunRecord
 
 DIAGNOSTICS_PERIOD = 1.0  # s
 CLOCK_BOUND = "clock ahead of the switcher's by at most [ms]"  # a value of agents in real time
+ACK_TIMEOUT = 4.0  # s for readers to acknowledge the last messages; more than Fast DDS's default heartbeat period, 3 s
+BARE = "_CREATED_BY_BARE_DDS_APP_"  # name of the node of a reader whose participant has no known nodes
+NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
+Message = TypeVar("Message", ActiveGraph, Progress)
+CHECK_PERIOD = 1.0  # s between two checks
+SHUTDOWN_TIMEOUT = 2.0  # s that the others have to acknowledge that this process leaves
 
 
 @dataclass(slots=True)
@@ -58,12 +64,6 @@ class Health:
             hardware_id="",
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
-
-
-ACK_TIMEOUT = 4.0  # s for readers to acknowledge the last messages; more than Fast DDS's default heartbeat period, 3 s
-BARE = "_CREATED_BY_BARE_DDS_APP_"  # name of the node of a reader whose participant has no known nodes
-NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
-Message = TypeVar("Message", ActiveGraph, Progress)
 
 
 class NetworkNode(LeanNode):
@@ -107,7 +107,7 @@ class NetworkNode(LeanNode):
 
     def discovered_all(self) -> bool:
         """Whether all nodes that should read what this node publishes have been discovered; polled."""
-        return True
+        return not self.missing_nodes()
 
     @property
     def resumed(self) -> bool:
@@ -265,10 +265,6 @@ class HealthReporter:
             write_report(self._status_file, {"refused": refused, "waiting": self._waiting})
 
 
-CHECK_PERIOD = 1.0  # s between two checks
-SHUTDOWN_TIMEOUT = 2.0  # s that the others have to acknowledge that this process leaves
-
-
 class PeersLostError(InputError):
     """Nodes without which the run cannot go on left before its end."""
 
@@ -279,7 +275,6 @@ class PeerPresence:
     # On one machine the supervisor ends all processes when one is lost; across hosts nothing else does. A peer is gone
     # when it has left the network or its lease has ended; the timeout allows for a restart. One that has said that it
     # leaves does not come back. (RTPS says that once, best effort, so it is not enough.)
-
     def __init__(self, nodes: Sequence[NetworkNode], timeout: float) -> None:
         self._nodes, self._node, self._timeout = nodes, nodes[0], timeout
         self._since: dict[str, float] = {}  # monotonic time [s] since which a peer is gone, by name

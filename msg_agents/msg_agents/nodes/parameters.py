@@ -15,6 +15,7 @@ import itertools
 import os
 import re
 import sys
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from msg_agents.environment import RANGE_VARIABLE, ensure_logs
+from msg_agents.environment import RANGE_VARIABLE, other_logs
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ def _ros_value(option: click.Parameter, value: Any) -> Any:
 @contextlib.contextmanager
 def ros_arguments() -> Iterator[None]:
     """Around the start of rclpy: log files have a place, and wrong arguments for ROS 2 are an InputError."""
-    ensure_logs()
+    os.environ.update(other_logs(Path(tempfile.gettempdir()) / f"msg_agents_log_{os.getuid()}"))
     from msg_agents.nodes.ros import RCLError
 
     try:

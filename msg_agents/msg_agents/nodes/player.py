@@ -107,7 +107,6 @@ class Player(LeanNode):
     # All topics are reliable and keep-all, however they were recorded: best-effort readers match too, and a slow
     # reliable one holds the player back. Topics recorded as latched are latched. The node receives nothing, so nothing
     # spins.
-
     def __init__(
         self,
         bag: Playback,

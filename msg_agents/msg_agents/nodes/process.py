@@ -39,9 +39,8 @@ GC_THRESHOLD = 50_000  # objects; the hot path makes no cycles, so young collect
 LEAVE_GRACE = 5  # s
 INTERRUPTED_GRACE = 15  # s; longer, because a process that ends by it has failed
 USE_SIM_TIME = ["--ros-args", "-p", "use_sim_time:=true"]
-
-
 SIGEV_THREAD = 2  # of <signal.h>: the C library calls a function in a thread of its own
+_LEFT: list[object] = []  # what must not be taken down before the end of the process
 
 
 class _Event(ctypes.Structure):
@@ -72,9 +71,6 @@ def exit_after(seconds: int) -> None:
     in_time = (ctypes.c_long * 4)(0, 0, seconds, 0)  # interval and time to the end, each in s and ns
     if library.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0:
         library.timer_settime(timer, 0, in_time, None)
-
-
-_LEFT: list[object] = []  # what must not be taken down before the end of the process
 
 
 class NotFoundError(InputError):

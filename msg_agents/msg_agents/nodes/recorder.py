@@ -40,7 +40,6 @@ class Recorder(NetworkNode):
     """Records a run into ``directory`` (new or empty), and detects when the run is complete."""
 
     # Messages are stamped with simulated time, so that equal runs give equal bags whatever the load of the machine.
-
     def __init__(self, *, record: RunRecord, directory: Path, storage: Storage = DEFAULT_STORAGE) -> None:
         super().__init__("recorder", record=record)
         experiment = record.experiment

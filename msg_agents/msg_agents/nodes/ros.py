@@ -75,7 +75,6 @@ class DueTimer:
 
     # ROS 2's own timers are periodic and count from when they were made. This one is set anew for every time, so it
     # does not drift and has the phase that was asked for. The callback may come a little late.
-
     def __init__(self, node: Node, callback: Callable[[], None]) -> None:
         self._clock = cast(ROSClock, node.get_clock())
         self._callback = callback
@@ -130,7 +129,6 @@ class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy
     """A node without parameter services, type descriptions and /rosout; its parameters are declared all the same."""
 
     # Seven services and /rosout cost more than the network if there are many nodes.
-
     def __init__(self, name: str) -> None:
         self._takes_overrides = False  # rclpy cannot handle overrides yet when it makes the node's own topics
         super().__init__(

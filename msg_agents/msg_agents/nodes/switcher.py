@@ -83,10 +83,6 @@ class Switcher(NetworkNode):
         self.subscribe(topics.PROGRESS, self._receive)
         every(self, REPORT_PERIOD, self._report)
 
-    def discovered_all(self) -> bool:
-        """Whether all expected nodes have been discovered."""
-        return not self.missing_nodes()
-
     def missing_nodes(self) -> list[str]:
         """Names of nodes that have not been discovered yet; all topics are latched, so readers need not be matched."""
         return self.undiscovered(self._expected)

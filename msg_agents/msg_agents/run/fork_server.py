@@ -127,7 +127,6 @@ class ForkServer:
 
     # It imports while its user goes on; the first fork waits for that. Every forked process is a child of the process
     # that asked for it: the server may end, or be killed, at any time. Other systems than Linux cannot do it.
-
     def __init__(self, environment: Mapping[str, str], log: Path) -> None:
         self._environment = environment
         self._log = log  # of what the server itself prints

@@ -63,6 +63,11 @@ REPLAY_ARGUMENTS = {
 """The same for replay.launch.py."""
 # Arguments that launch itself reads, for any launch file.
 OF_LAUNCH = {"sigterm_timeout", "sigkill_timeout", "emulate_tty", "launch-prefix", "launch-prefix-filter"}
+ANALYSIS = "msg-analysis"
+VERDICTS: dict[int, str] = {  # of the exit codes of ``msg-analysis compare``
+    ExitCode.DISAGREES: "the run disagrees with the prediction",
+    ExitCode.INCOMPLETE: "data are incomplete: no verdict",
+}
 
 
 def check_names(context: Any, known: Collection[str]) -> None:
@@ -154,13 +159,6 @@ def player_options(arguments: Mapping[str, str]) -> list[str]:
     return options
 
 
-ANALYSIS = "msg-analysis"
-VERDICTS: dict[int, str] = {  # of the exit codes of ``msg-analysis compare``
-    ExitCode.DISAGREES: "the run disagrees with the prediction",
-    ExitCode.INCOMPLETE: "data are incomplete: no verdict",
-}
-
-
 class LaunchFailedError(Exception):
     """A process has failed: the launch is to end with a failure as exit code."""
 
@@ -170,7 +168,6 @@ class LaunchedProcesses:
 
     # The actions of ``launch`` pass on the end of each process, and ask ``to_stop`` and ``analysis`` then. Killed
     # processes are not started again here.
-
     def __init__(self, namespace: str) -> None:
         self.namespace = namespace.strip()
         self._stack = ExitStack()

@@ -47,7 +47,6 @@ class HungDetector:
 
     # It has hung when its main thread waits, and has not run for a minute, though nobody has stopped it. That of a node
     # that waits for others, for its clock, or for a slow reader still runs several times a second.
-
     def __init__(
         self, pid: int, *, clock: Callable[[], float] = time.monotonic, wall: Callable[[], float] = time.time
     ) -> None:
@@ -155,7 +154,6 @@ class Supervisor:
     """The processes of one run; at the end of the context they are ended."""
 
     # They have sessions of their own, so that Ctrl-C reaches only the parent; they end when its pipe to them closes.
-
     logs: Path  # directory for what the children print
     environment: Mapping[str, str]  # of the children
     children: list[Child] = field(default_factory=list)  # as started; a restarted one keeps its place

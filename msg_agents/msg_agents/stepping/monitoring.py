@@ -104,7 +104,6 @@ class ClockOffsets:
 
     # A message sent at s of its sender's clock and received at r of ours has taken r - s plus how far that clock is
     # ahead, which is not negative: s - r bounds the offset from below, and the other direction from above.
-
     def __init__(self) -> None:
         self._offsets: dict[str, Offset] = {}
 

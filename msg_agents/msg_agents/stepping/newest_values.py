@@ -58,7 +58,6 @@ class NewestValues(AgentInputs[Value]):
 
     # The agent makes each step when it is due: with the newest graph that it knows and the newest value that it has of
     # every neighbour under that graph. Nothing waits, so nothing is buffered.
-
     def __init__(self, *, reach: Callable[[], int], **options: Any) -> None:
         super().__init__(**options)
         self._reach = reach
@@ -142,7 +141,6 @@ class NewestReceived(NewestValues[Value]):
 
     # Of an agent with a newest state x(n), a step uses the newest of those up to x(n - delay), and the own value where
     # that one is ``lost`` (of agent and step) or nothing came; with ``holds``, the newest of these that is not lost.
-
     def __init__(self, *, delay: int, lost: Callable[[int, int], bool], holds: bool, **options: Any) -> None:
         super().__init__(**options)
         self._delay, self._lost, self._holds = delay, lost, holds

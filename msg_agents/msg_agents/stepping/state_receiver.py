@@ -21,6 +21,8 @@ from msg_analysis.model.run_record import RunRecord
 
 _MASK = 0x3FFFFFFF  # of the bits of a content that are in its hash
 CONSECUTIVE = 64  # steps in a row after which those before them are taken for lost: the reader came late, for example
+_WORD = 4  # bytes; every message in the agents' layout is a multiple of it
+_HASH_SHIFT = np.uint64(34)  # the 30 highest bits of a sum are the hash of a message
 
 
 def hashes_of(contents: IntArray) -> array[int]:
@@ -32,7 +34,6 @@ class ReceivedSteps:
     """The steps 0 to ``last`` of one agent, in any order: after a restart some come again."""
 
     # A hash of 4 bytes per step shows whether a repeated one is the same, up to RESEND_LIMIT steps around ``row``.
-
     def __init__(self, last: int) -> None:
         self.row = -1  # the newest step up to which none is to come any more
         self._last = last
@@ -92,10 +93,6 @@ class ReceivedSteps:
             self._hashes[slot : slot + count] = array("i", bytes(4 * count))
             step += count
         self.row = row
-
-
-_WORD = 4  # bytes; every message in the agents' layout is a multiple of it
-_HASH_SHIFT = np.uint64(34)  # the 30 highest bits of a sum are the hash of a message
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -68,12 +68,11 @@ class TurnQueue:
 
     # A step of one agent lets others step, and theirs others again: the queue replaces nested calls, which would go as
     # deep as the run is long.
-
     def __init__(
         self,
         members: int,
         defer: Callable[[Callable[[], None]], object],  # runs a callback after what is already waiting in the executor
-        after: Callable[[], None] = lambda: None,  # is called when turns have been given
+        after: Callable[[], None],  # is called when turns have been given
         turn: float = TURN_SLICE,  # s
     ) -> None:
         self._absent, self._defer, self._after, self._turn = members, defer, after, turn
@@ -136,7 +135,6 @@ class Synchronizer(AgentInputs[Value]):
     # With ``needed``, step k uses x_j(needed(j, k)) instead of x_j(k): an earlier one, which does not decrease with k,
     # and is at least ``delay`` steps old. Values may come in any order: those that are sent again after a restart come
     # behind newer ones.
-
     def __init__(
         self,
         *,
@@ -160,10 +158,9 @@ class Synchronizer(AgentInputs[Value]):
         # Number of the next sojourn; None: any, since a process that takes over starts in the middle.
         self._sequence: int | None = 0 if self.step == 0 else None
         self._unplanned = self.step  # first step whose graph is not known
-        self._mode = 0  # of the next step, if its graph is known
-        self._needed: _Uses | None = None  # by the next step
-        self._missing = 1  # of them; never 0 while the graph is not known
-        self._oldest: list[int] = []  # by place, the step of the value that the next step uses
+        self._needed: _Uses | None  # by the next step, if its graph is known
+        self._missing: int  # of them; never 0 while the graph is not known
+        self._oldest: list[int]  # by place, the step of the value that the next step uses
         self._prepare()
 
     def learn(self, sequence: int, mode: int, first_step: int, last_step: int) -> str | None:
@@ -230,7 +227,7 @@ class Synchronizer(AgentInputs[Value]):
     def inputs(self) -> tuple[int, list[Value]]:
         """Mode of the step that is ready, and the values of the agents that its row uses, ascending."""
         assert self._needed is not None
-        return self._mode, list(self._needed.pick(self._next_values()))
+        return self._known[0][0], list(self._needed.pick(self._next_values()))
 
     def advance(self) -> None:
         """Move on to x(step + 1): the step that was ready has been made."""
@@ -261,8 +258,7 @@ class Synchronizer(AgentInputs[Value]):
         if not self._known or self.finished:
             self._needed, self._missing = None, 1
             return
-        self._mode, _ = self._known[0]
-        self._needed = self._uses[self._mode]
+        self._needed = self._uses[self._known[0][0]]
         self._missing = self._needed.pick(self._next_values()).count(None)
 
     def _row(self, step: int) -> list[Value | None]:

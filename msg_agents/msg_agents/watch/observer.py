@@ -34,6 +34,10 @@ if TYPE_CHECKING:
 
 
 BLOCK = 2000  # steps that are taken at once: limits the memory that a large network needs
+PERIOD = 0.5  # s between two updates
+SHUTDOWN_TIMEOUT = 2.0  # s for the states that are left when the run ends
+NICE = 10  # of the thread: on a busy machine the network goes first
+MOST_NODES = 20  # agents up to which each gets a standard error: more would cost the network too much CPU time
 
 
 class CheckpointReader:
@@ -140,12 +144,6 @@ class CheckpointReader:
         return self._log.read(steps[there], data.tobytes(), start, length.reshape(-1) - self._beside, published)
 
 
-PERIOD = 0.5  # s between two updates
-SHUTDOWN_TIMEOUT = 2.0  # s for the states that are left when the run ends
-NICE = 10  # of the thread: on a busy machine the network goes first
-MOST_NODES = 20  # agents up to which each gets a standard error: more would cost the network too much CPU time
-
-
 class RunObserver:
     """Estimates the errors of a run, in a thread; ``checkpoints``: directory in which its agents keep their states."""
 
@@ -240,7 +238,6 @@ class EarlyEnd:
 
     # The request is a file, so a killed switcher that is restarted finds it again. Without an answer, the run goes on
     # to its planned end: the observer has failed, or the answer comes too late to end earlier.
-
     def __init__(self, record: RunRecord, checkpoints: Path) -> None:
         assert record.until is not None
         self._record, self._until = record, record.until
