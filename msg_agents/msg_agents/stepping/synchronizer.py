@@ -112,7 +112,7 @@ RESEND_LIMIT = 6000  # most steps that an agent keeps, and sends again when anot
 HISTORY_STEPS = LOCKSTEP_WINDOW
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Uses:
     """The places in a row of the values that a step uses."""
 

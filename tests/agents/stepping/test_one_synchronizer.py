@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import pytest
 
-from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, RESEND_LIMIT, TURN_SLICE, Synchronizer, TurnQueue
+from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, TURN_SLICE, Synchronizer, TurnQueue
 from msg_analysis.messages.acceptance import Refusal
 
 
@@ -84,12 +84,11 @@ def test_whose_states_are_lacking() -> None:
 
 
 def test_what_is_long_past_is_no_repetition() -> None:
-    node: Synchronizer[str] = Synchronizer(
-        agent=0, steps=10**6, inputs=[[1]], peers=[1], start=RESEND_LIMIT + 100, window=LOCKSTEP_WINDOW
-    )
-    assert node.offer(1, RESEND_LIMIT + 100, "now") is None
-    assert node.offer(1, 100 - LOCKSTEP_WINDOW, "the oldest that is sent again") == Refusal.REPEATED
-    assert node.offer(1, 99 - LOCKSTEP_WINDOW, "forged") == Refusal.TOO_OLD
+    """A window and 6000 steps ago, which are sent again at most."""
+    node: Synchronizer[str] = Synchronizer(agent=0, steps=10**6, inputs=[[1]], peers=[1], start=6_100)
+    assert node.offer(1, 6_100, "now") is None
+    assert node.offer(1, 36, "the oldest that is sent again") == Refusal.REPEATED
+    assert node.offer(1, 35, "forged") == Refusal.TOO_OLD
 
 
 @pytest.mark.parametrize(
@@ -184,6 +183,17 @@ def test_it_waits_for_the_value_that_it_holds(held: int) -> None:
     assert node.inputs() == (0, ["held"])
     node.advance()
     assert node.inputs() == (0, ["new"])
+
+
+def test_values_of_different_steps() -> None:
+    node: Synchronizer[str] = Synchronizer(
+        needed=lambda j, k: k - j, delay=0, agent=0, steps=300, inputs=[[1, 2]], peers=[1, 2], start=200
+    )
+    assert node.waiting_for() == "the graph of step 200"
+    node.learn(0, 0, 0, 299)
+    assert node.waiting_for() == "step 199 of agent 2, step 198 of agent 3"
+    assert [node.offer(1, 199, "one"), node.offer(2, 198, "two")] == [None, None]
+    assert node.inputs() == (0, ["one", "two"])
 
 
 def test_what_it_refuses_of_a_peer_that_is_heard_late() -> None:
