@@ -271,8 +271,8 @@ def run(
 )
 @click.option(
     "--timeout",
-    "--patience",
     cls=RenamedOption,
+    old_name="--patience",
     type=PositiveFloat(),
     metavar="SECONDS",
     default=30.0,

@@ -67,8 +67,8 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
         click.option("--namespace", type=int, hidden=True),
         click.option(
             "--status-file",
-            "--account",
             cls=RenamedOption,
+            old_name="--account",
             type=PATH,
             metavar="FILE",
             help="Status file, written every second: rejected messages, what the nodes wait for (health checks).",
@@ -90,8 +90,8 @@ _await = click.option(
 
 _timeout = click.option(
     "--timeout",
-    "--patience",
     cls=RenamedOption,
+    old_name="--patience",
     type=PositiveFloat(),
     metavar="SECONDS",
     show_default="no limit",

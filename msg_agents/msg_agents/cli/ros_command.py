@@ -18,16 +18,17 @@ from msg_analysis.cli.options import PATH
 
 
 class RenamedOption(click.Option):
-    """An option whose last name is an older one, which is still taken and not shown."""
+    """An option that is also taken by an older name, which is not shown."""
 
-    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+    def __init__(self, *args: Any, old_name: str, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._old_name = old_name
+
+    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
         """As in click."""
-        *shown, old = self.opts
-        self.opts = shown
-        try:
-            return super().get_help_record(ctx)
-        finally:
-            self.opts = [*shown, old]
+        self.opts.append(self._old_name)
+        super().add_to_parser(parser, ctx)
+        self.opts.remove(self._old_name)
 
 
 class RosCommand(click.Command):

@@ -14,9 +14,8 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
 from operator import itemgetter
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
 
 from msg_analysis.messages.acceptance import Refusal
 
@@ -112,12 +111,11 @@ RESEND_LIMIT = 6000  # most steps that an agent keeps, and sends again when anot
 HISTORY_STEPS = LOCKSTEP_WINDOW
 
 
-@dataclass(slots=True)
-class _Uses:
+class _Uses(NamedTuple):
     """The places in a row of the values that a step uses."""
 
     flags: tuple[bool, ...]  # by place, whether it is one of them
-    pick: Callable[[list[Any]], Sequence[Any]] = field(compare=False)  # the values of a row that are used
+    pick: Callable[[list[Any]], Sequence[Any]]  # the values of a row that are used
 
     @classmethod
     def of(cls, places: Sequence[int], peers: int) -> Self:
@@ -125,8 +123,7 @@ class _Uses:
         flags = tuple(place in set(places) for place in range(peers))
         if len(places) > 1:
             return cls(flags, itemgetter(*places))
-        first = places[0] if places else 0
-        return cls(flags, itemgetter(slice(first, first + len(places))))  # a list, too, of none or one
+        return cls(flags, itemgetter(slice(places[0], places[0] + 1) if places else slice(0)))  # a list, too
 
 
 class Synchronizer(AgentInputs[Value]):
@@ -145,7 +142,7 @@ class Synchronizer(AgentInputs[Value]):
     ) -> None:
         super().__init__(**options)
         self._window, self._needed_step = window, needed
-        self._history = max(HISTORY_STEPS, delay + 1)
+        self._history = max(HISTORY_STEPS, delay)
         self._places = {j: place for place, j in enumerate(self._newest)}  # of the peers in a row
         # The values of a step are in the row (step modulo the number of rows): None where there is none. The rows are
         # those of the last steps, for which values are kept, and of those to come.

@@ -28,7 +28,7 @@ def pair(window: int = 2, steps: int = 10) -> Synchronizer[str]:
 
 
 def everything(node: Synchronizer[str]) -> object:
-    return copy.deepcopy({key: value for key, value in vars(node).items() if key != "_limit"})
+    return copy.deepcopy({key: value for key, value in vars(node).items() if key not in ("_limit", "_uses", "_needed")})
 
 
 @pytest.mark.parametrize(
@@ -104,6 +104,7 @@ def test_what_is_long_past_is_no_repetition() -> None:
 )
 def test_refused_sojourns_change_nothing(sequence: int, first: int, last: int, reason: str) -> None:
     node = pair()
+    assert node.learn(1, 0, 0, 4) == Refusal.OUT_OF_SEQUENCE
     assert node.learn(0, 0, 0, 4) is None
     before = everything(node)
     assert node.learn(sequence, 1, first, last) == reason
