@@ -102,9 +102,8 @@ def test_those_who_have_to_do_with_each_other_meet(relay: DiscoveryRelay, proces
     report(relay, "agent_2", two)
     one.hears(two)
     report(relay, "switcher", switcher)
-    one.hears(switcher)
-    two.hears(switcher)
-    three.hears(switcher)
+    for each in (one, two, three):
+        each.hears(switcher)
     switcher.hears()
 
 

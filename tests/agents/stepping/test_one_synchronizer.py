@@ -259,18 +259,12 @@ def test_the_middleware_gets_its_turn() -> None:
     for player in game.players:
         game.turns.join(player)
     assert game.seen == [0]
-    slices = 0
-    while game.deferred:
-        before = len(game.seen)
+    for before in range(1, 5):
         game.turns.ask(game.players[0])
         assert len(game.seen) == before
         game.deferred.pop()()
-        assert len(game.seen) == before + 1
-        assert game.ended[-1] == before + 1
-        assert len(game.deferred) <= 1
-        slices += 1
-        if slices == 4:
-            break
+        assert len(game.seen) == game.ended[-1] == before + 1
+        assert len(game.deferred) == 1
     while game.deferred:
         game.deferred.pop()()
     assert len(game.seen) >= 6

@@ -49,6 +49,10 @@ def _get(web: WebServer, path: str, **headers: str) -> http.client.HTTPResponse:
     return connection.getresponse()
 
 
+def _dial(web: WebServer) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", int(web.address.rstrip("/").rpartition(":")[2])), timeout=20)
+
+
 class Events:
     """Reads a stream of events."""
 
@@ -169,7 +173,7 @@ def test_who_is_slow_or_goes_holds_nobody_up(web: WebServer) -> None:
     It misses those that came meanwhile. Another browser goes at once, and one reads.
     """
     web.begin({"name": "net"})
-    slow = socket.create_connection(("127.0.0.1", int(web.address.rstrip("/").rpartition(":")[2])), timeout=20)
+    slow = _dial(web)
     slow.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
     gone = _connection(web)
     gone.request("GET", "/events")
@@ -248,10 +252,6 @@ def test_dripping_requests(strict: WebServer) -> None:
         with contextlib.suppress(ConnectionResetError):
             assert browser.recv(1) == b""  # closed
         browser.close()
-
-
-def _dial(web: WebServer) -> socket.socket:
-    return socket.create_connection(("127.0.0.1", int(web.address.rstrip("/").rpartition(":")[2])), timeout=20)
 
 
 def _answers(web: WebServer) -> bool:
