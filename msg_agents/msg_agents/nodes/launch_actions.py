@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Mapping
 from typing import Any
@@ -29,8 +28,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.substitutions import ExecutableInPackage
 
-from msg_agents.run.launch import ANALYSIS, LaunchedProcesses, LaunchFailedError, check_names, flag
-from msg_analysis.common.resources import SINGLE_THREAD
+from msg_agents.run.launch import ANALYSIS, LaunchedProcesses, LaunchFailedError, check_names, environment, flag
 
 GRACE = 20.0  # s that a process has to end
 
@@ -69,7 +67,7 @@ class _Group:
                 arguments=list(spec.arguments[1:]),
                 namespace=self._launched.namespace or None,
                 exec_name=spec.name,
-                additional_env={name: os.environ.get(name, number) for name, number in SINGLE_THREAD.items()},
+                additional_env=environment(),
                 output="screen",
             )
         handlers = [self._at_end_of(name, node) for name, node in self._nodes.items()]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import atexit
 import difflib
 import math
+import os
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
@@ -23,6 +24,7 @@ from msg_agents.run.folder import load_with_overrides, make_bag_directory, tempo
 from msg_agents.run.supervisor import failure_of
 from msg_analysis.bags.stored_file import MEGABYTE, SMALLEST_SPLIT, Storage
 from msg_analysis.common.files import REPORT_FILE
+from msg_analysis.common.resources import SINGLE_THREAD
 from msg_analysis.errors import ExitCode, InputError
 from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.experiment import Experiment
@@ -302,3 +304,8 @@ class LaunchedReplay(LaunchedProcesses):
             player = (*player, "--await", "live")
         watcher = [ProcessSpec("live", ("live", "--reliable"))] if live else []
         self._set([*watcher, ProcessSpec("player", player)])
+
+
+def environment() -> dict[str, str]:
+    """Additions to the launch's environment."""
+    return {name: os.environ.get(name, number) for name, number in SINGLE_THREAD.items()}
