@@ -152,7 +152,7 @@ class MadeUpAgents(NetworkNode):
         self._tell(0)
 
     def _receive(self, data: bytes) -> None:
-        graph = self.decode_graph(data)
+        graph = self.accepted(self.rules.graph(data), GRAPH)
         self._sojourns += 1
         last = self.record.experiment.steps
         if graph and (self._sojourns % TOGETHER == 0 or graph.last_step == last - 1):

@@ -11,12 +11,11 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from msg_agents.discovery.relay import DiscoveryRelay
 from msg_agents.discovery.rtps import (
@@ -32,11 +31,28 @@ from msg_agents.discovery.rtps import (
 from msg_analysis.common.resources import SINGLE_THREAD, ros_distribution
 from msg_analysis.errors import InputError
 
-MEMORY = Path("/dev/shm")
-"""A page of a file on a disk costs about twice as much to write for the first time, and again after each time the
-system has saved it."""
-
+MEMORY = Path("/dev/shm")  # a page of a file on a disk costs twice as much to write, each time the system has saved it
 LEAST_FREE = 64 << 10  # bytes; where a page that ROS maps there cannot be had, the processes of a run die of SIGBUS
+# With none of these, rclpy, its libraries and its middleware can only be those of this Python.
+FOREIGN_VARIABLES = ("RMW_IMPLEMENTATION", "PYTHONPATH", "AMENT_PREFIX_PATH", "ROS_DISTRO")
+PROBE_TIMEOUT = 60.0  # s
+PROBE = """
+import importlib.util, os, warnings
+warnings.simplefilter("ignore")
+print(os.path.dirname(importlib.util.find_spec("rclpy").origin), flush=True)
+from msg_agents.nodes.ros import use_middleware
+use_middleware()
+"""
+TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
+RESTARTS = 3  # of killed processes in a run, by default
+LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants only
+DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
+USER_TIMEOUT = 120.0  # s for which they look for others that the user starts
+RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"  # older; 1 is still stronger, and adds shared memory as LOCALHOST does
+SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
+LOGS_VARIABLE = "ROS_LOG_DIR"
+ROS_LOGS = "ros"  # folder for nodes that have no other place for the log files of ROS
 
 
 def free_space(directory: Path) -> int:
@@ -57,18 +73,6 @@ def require_shared_memory(directory: Path = MEMORY) -> None:
         )
 
 
-# With none of these, rclpy, its libraries and its middleware can only be those of this Python.
-FOREIGN_VARIABLES = ("RMW_IMPLEMENTATION", "PYTHONPATH", "AMENT_PREFIX_PATH", "ROS_DISTRO")
-PROBE_TIMEOUT = 60.0  # s
-PROBE = """
-import importlib.util, os, warnings
-warnings.simplefilter("ignore")
-print(os.path.dirname(importlib.util.find_spec("rclpy").origin), flush=True)
-from msg_agents.nodes.ros import use_middleware
-use_middleware()
-"""
-
-
 def require_rclpy() -> Path:
     """The folder of the rclpy that this Python finds; InputError: there is none."""
     found = importlib.util.find_spec("rclpy")
@@ -80,26 +84,16 @@ def require_rclpy() -> Path:
 
 
 def require_middleware(environment: Mapping[str, str], forked: Callable[[], bool] = lambda: False) -> None:
-    """InputError, with the variable to unset, unless rclpy and the messages can be loaded in this environment.
-
-    It is tried, in a process of its own, only where a variable could lead to another ROS 2 than that of this Python.
-    ``forked``: whether a process could that was forked from one which has imported all; it saves the imports.
-    """
+    """InputError, with the variable to unset, unless rclpy and the messages can be loaded in this environment."""
     require_rclpy()
+    # Only where a variable could lead to another ROS 2 than that of this Python; a forked process saves the imports.
     present = [name for name in FOREIGN_VARIABLES if environment.get(name)]
     if not present or forked():
         return
+    command = [sys.executable, "-P", "-c", PROBE]
+    pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True, "errors": "replace"}
     try:
-        probe = subprocess.run(
-            [sys.executable, "-P", "-c", PROBE],
-            env=dict(environment),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=PROBE_TIMEOUT,
-            check=False,
-        )
+        probe = subprocess.run(command, env=dict(environment), timeout=PROBE_TIMEOUT, check=False, **pipes)
     except subprocess.TimeoutExpired:
         return  # a busy machine: the run will say what is wrong
     if probe.returncode == 0:
@@ -116,17 +110,6 @@ def require_middleware(environment: Mapping[str, str], forked: Callable[[], bool
         f"{place or 'rclpy'}: cannot be used ({reason}): {' and '.join(present)} may lead to another ROS 2: unset "
         f"{'it' if len(present) == 1 else 'them'}, or use a terminal in which no other ROS 2 is sourced"
     )
-
-
-TRANSPORTS_VARIABLE = "FASTDDS_BUILTIN_TRANSPORTS"
-RESTARTS = 3  # of killed processes in a run, by default
-LAST_DOMAIN = 231  # 232, the last of ROS, has ports for some 60 participants only
-DISCOVERY_TIMEOUT = 30.0  # s for which nodes look for each other in small networks
-USER_TIMEOUT = 120.0  # s for which they look for others that the user starts
-RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"  # older; 1 is still stronger, and adds shared memory as LOCALHOST does
-SERVER_VARIABLE = "ROS_DISCOVERY_SERVER"
-LOGS_VARIABLE = "ROS_LOG_DIR"
 
 
 def check_domain() -> None:
@@ -150,28 +133,17 @@ def log_directory() -> Path | None:
 
 
 def can_log() -> bool:
-    """Whether ROS can write its log files where the environment says: not without a home, on a read-only root, ...
-
-    Without them no node starts.
-    """
-    path = log_directory()
-    if path is None:
-        return False
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(path, os.W_OK | os.X_OK)
+    """Whether ROS can write its log files, without which no node starts: not on a read-only root, for example."""
+    with suppress(OSError):
+        if path := log_directory():
+            path.mkdir(parents=True, exist_ok=True)
+            return os.access(path, os.W_OK | os.X_OK)
+    return False
 
 
 def other_logs(directory: Path) -> dict[str, str]:
     """Changes to our environment that let ROS log to a directory, if it cannot write to the usual one."""
     return {} if can_log() else {LOGS_VARIABLE: str(directory)}
-
-
-def ensure_logs() -> None:
-    """Give this process another directory for the log files of ROS if it cannot write to the usual one."""
-    os.environ.update(other_logs(Path(tempfile.gettempdir()) / f"msg_agents_log_{os.getuid()}"))
 
 
 def require_discovery(environment: Mapping[str, str]) -> None:
@@ -185,17 +157,6 @@ def tolerate_warnings() -> None:
     warnings.filterwarnings("ignore", "module 'sre_", DeprecationWarning)
 
 
-def start_environment() -> dict[str, str]:
-    """Our environment with what is read at the start of a process of nodes, whatever its network."""
-    return {
-        **SINGLE_THREAD,
-        **os.environ,
-        "PYTHONUNBUFFERED": "1",
-        # ``python -m`` would look for msg_agents in the working directory first, and find our source tree's folder.
-        "PYTHONSAFEPATH": "1",
-    }
-
-
 def profile_variables(profile: Path, distribution: str | None = None) -> dict[str, str]:
     """What leads Fast DDS to a profile, by default that of the ROS 2 here: Fast DDS 3 warns of the old name."""
     name = ros_distribution() if distribution is None else distribution
@@ -204,26 +165,22 @@ def profile_variables(profile: Path, distribution: str | None = None) -> dict[st
 
 
 def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str, str]:
-    """Our environment with what the nodes need; another discovery range or profile of the user's is kept.
-
-    A discovery server is not used: with one, the nodes of a run on this machine would not find each other without it.
-    """
-    environment = start_environment() | {"ROS_DOMAIN_ID": str(domain)}
+    """Our environment with what the nodes need; another discovery range or profile of the user's is kept."""
+    # ``python -m`` would look for msg_agents in the working directory first, and find our source tree's folder.
+    own = {"PYTHONUNBUFFERED": "1", "PYTHONSAFEPATH": "1", "ROS_DOMAIN_ID": str(domain)}
+    environment = {**SINGLE_THREAD, **os.environ, **own}
     local = environment.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
     if local and not any(environment.get(name) for name in PROFILE_VARIABLES):
         environment[RANGE_VARIABLE] = "SYSTEM_DEFAULT"  # the profile decides
         environment.update(profile_variables(profile))
-        for name in (SERVER_VARIABLE, LOCALHOST_VARIABLE):
+        for name in (SERVER_VARIABLE, LOCALHOST_VARIABLE):  # with a server, nodes would find each other only through it
             environment.pop(name, None)
     return environment
 
 
 def channel_environment(profile: Path) -> dict[str, str]:
-    """Changes to our environment that make the middleware follow a profile, whatever the user has set.
-
-    Shared memory, a discovery server or a discovery range of the user's would lead messages past the channel.
-    """
-    return {
+    """Changes to our environment that make the middleware follow a profile, whatever the user has set."""
+    return {  # the user's shared memory, discovery server or discovery range would lead messages past the channel
         **profile_variables(profile),
         RANGE_VARIABLE: "SYSTEM_DEFAULT",
         TRANSPORTS_VARIABLE: "",
@@ -233,10 +190,7 @@ def channel_environment(profile: Path) -> dict[str, str]:
 
 
 def without_shared_memory() -> dict[str, str]:
-    """Changes to our environment that make the middleware use UDP only; the user's profile or transports are kept.
-
-    A process that ends at once would otherwise leave shared memory behind.
-    """
+    """Changes to our environment for a process that ends at once: UDP only, so that no shared memory is left behind."""
     if any(os.environ.get(name) for name in (*PROFILE_VARIABLES, TRANSPORTS_VARIABLE)):
         return {}
     # Both add shared memory to any profile.
@@ -245,26 +199,14 @@ def without_shared_memory() -> dict[str, str]:
     return profile_variables(UDP_PROFILE)
 
 
-ROS_LOGS = "ros"  # folder for nodes that have no other place for the log files of ROS
-
-
-@dataclass(frozen=True, slots=True)
-class RunEnvironment:
-    """Domain, environment variables and discovery relay of one run."""
-
-    domain: int
-    environment: dict[str, str]
-    relay: DiscoveryRelay | None  # None: the processes look for each other, by the user's profile for example
-
-
 @contextmanager
 def run_environment(
     folder: Path,  # of the run
     domain: int | None,  # None: a free one
     changes: Mapping[str, str],  # of the environment
     participants: int,  # of the run
-) -> Iterator[RunEnvironment]:
-    """Provide them for a run; InputError: no domain is free, or processes could not meet."""
+) -> Iterator[tuple[int, dict[str, str], DiscoveryRelay | None]]:
+    """Domain, environment variables and relay of a run; InputError: no free domain, or processes cannot meet."""
     with ExitStack() as stack:
         if domain is None:
             domain = stack.enter_context(free_domain(domains_for(participants)))
@@ -279,7 +221,7 @@ def run_environment(
         require_discovery(environment)
         require_shared_memory()
         environment |= other_logs(folder / ROS_LOGS)
-        yield RunEnvironment(domain, environment, relay)
+        yield domain, environment, relay
 
 
 def uses_relay(changes: Mapping[str, str]) -> bool:

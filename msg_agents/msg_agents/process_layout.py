@@ -34,14 +34,13 @@ from msg_analysis.experiment.spec import expected
 from msg_analysis.messages.topics import agent_node_name
 
 RECORDER, SWITCHER, CHANNEL = "recorder", "switcher", "channel"
-SMALL = 8
-"""Of ``processes: auto``: up to so many agents, each has a process of its own; beyond, there is one process per so many
-agents, but not more than the machine has cores."""
-MOST_PROCESSES = 200
-"""Agent processes that ``DiscoveryRelay`` connects: with switcher, recorder and the user's tools they fill the ports of
-two ROS domains."""
-MOST_UNAIDED = 90
-"""Agent processes that look for each other: Fast DDS finds ``MOST_PARTICIPANTS``, of which some are for others."""
+SMALL = 8  # agents that each have a process by ``processes: auto``; of more, so many share one, or more on few cores
+MOST_PROCESSES = 200  # of agents, which the relay connects: with all others they fill the ports of two ROS domains
+MOST_UNAIDED = (
+    90  # of agents, which look for each other: Fast DDS finds ``MOST_PARTICIPANTS``, some of which are others
+)
+SPARE_PARTICIPANTS = 8  # participants on a host besides those of the run, such as tools that watch it
+_RANGE = re.compile(r"([0-9]+)-([0-9]+)")
 
 
 class Process(Protocol):
@@ -74,11 +73,6 @@ class ProcessSpec:
     def nodes(self) -> list[str]:
         """Names of its nodes."""
         return [agent_node_name(agent) for agent in self.agents] or [self.name]
-
-    @property
-    def first_node(self) -> str:
-        """Name of its first node."""
-        return self.nodes[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,14 +123,6 @@ def process_name(agents: Sequence[int]) -> str:
     return f"agent_{first}" if first == last else f"agents_{first}_{rest}"
 
 
-def discovery_timeout(agents: int, processes: int) -> float:
-    """Seconds after which a node of a network of so many agents and processes gives up on the missing ones.
-
-    The first process waits for the last one: two or more start per second, and many endpoints take longer to discover.
-    """
-    return max(DISCOVERY_TIMEOUT, 2.0 * processes + 0.1 * agents)
-
-
 def lay_out_network(
     experiment: Experiment,
     run_file: Path,  # run record, read by every node
@@ -151,10 +137,7 @@ def lay_out_network(
     most: int = MOST_UNAIDED,
     hosts: Sequence[Sequence[int]] = (),  # agents of each host of a channel: a process is on one; empty: no channel
 ) -> list[ProcessSpec]:
-    """The processes of a run, in the order in which to start them; with ``assignment``, those of this host only.
-
-    InputError: more than ``most`` processes with agents.
-    """
+    """The processes of a run, or of this host, in the order of their starts; InputError: too many with agents."""
     here = tuple(range(experiment.agents)) if assignment is None else assignment.agents
     groups = [group for part in hosts or [here] for group in split_agents(experiment, part, most=most)]
     count = len(groups)
@@ -163,7 +146,9 @@ def lay_out_network(
     common: tuple[str, ...] = ("--use-sim-time",) if use_sim_time else ()
     if parameter_services:
         common += ("--parameter-services",)
-    timeout = discovery_timeout(experiment.agents, count) if assignment is None else assignment.discovery_timeout
+    # The first process waits for the last one: two or more start per second, and many endpoints take longer to find.
+    needed = max(DISCOVERY_TIMEOUT, 2.0 * count + 0.1 * experiment.agents)
+    timeout = needed if assignment is None else assignment.discovery_timeout
     if readers or hosts:  # what a channel loses is sent again
         timeout = max(timeout, USER_TIMEOUT)
     if timeout != DISCOVERY_TIMEOUT:
@@ -173,7 +158,7 @@ def lay_out_network(
     if checkpoints is not None:
         options += ("--checkpoint", str(checkpoints))
     if assignment is not None:
-        options += ("--patience", f"{assignment.peer_timeout:g}")
+        options += ("--timeout", f"{assignment.peer_timeout:g}")
     resumes = checkpoints is not None
     central = assignment is None or assignment.has_recorder
     processes = []
@@ -192,26 +177,20 @@ def lay_out_network(
 
 
 def partners(processes: Sequence[ProcessSpec], listens: BoolArray) -> dict[str, set[str]]:
-    """The processes that each process exchanges messages with; processes go by their first nodes.
-
-    ``listens``: (m, m), whether agent i ever listens to agent j. Recorder and switcher exchange messages with all.
-    """
+    """First nodes of the processes that each exchanges messages with; ``listens``: (m, m), whether i ever hears j."""
     exchanges = listens | listens.T
-    names = {process.first_node for process in processes}
-    of_agent = {agent: process.first_node for process in processes for agent in process.agents}
-    central = {process.first_node for process in processes if not process.agents}
+    names = {process.nodes[0] for process in processes}
+    of_agent = {agent: process.nodes[0] for process in processes for agent in process.agents}
+    central = {process.nodes[0] for process in processes if not process.agents}  # exchange messages with all
     found = {}
     for process in processes:
         peers = {of_agent[int(j)] for i in process.agents for j in exchanges[i].nonzero()[0]}
-        found[process.first_node] = (peers | central if process.agents else names) - {process.first_node}
+        found[process.nodes[0]] = (peers | central if process.agents else names) - {process.nodes[0]}
     return found
 
 
 def assign_cores(processes: Sequence[ProcessSpec], cores: Sequence[int], first: int = 0) -> dict[str, int]:
-    """A core for each agent process by name, where they and the recorder outnumber two or more cores; else empty.
-
-    ``processes``: in the order of ``lay_out_network``: neighbours share a core. ``first``: index of the first core.
-    """
+    """A core for each agent process by name, where they and the recorder outnumber two or more cores; else empty."""
     # In lockstep every message wakes the process that receives it. To wake it on another core costs an interrupt there,
     # and without pinning the scheduler spreads communicating processes over the cores: with two cores, the demo network
     # makes a third to a half fewer steps per second (docs/performance.md). Networks with successive values of ``first``
@@ -236,10 +215,6 @@ def pin_to_core(process: int, core: int) -> None:
         return
 
 
-SPARE_PARTICIPANTS = 8  # participants on a host besides those of the run, such as tools that watch it
-_RANGE = re.compile(r"([0-9]+)-([0-9]+)")
-
-
 def agent_numbers(value: object) -> list[int]:
     """Agent numbers from a list of numbers and of ranges."""
     wanted = expected("a list of numbers of agents, from 1, and of ranges such as 3-5")
@@ -251,7 +226,7 @@ def agent_numbers(value: object) -> list[int]:
         first, last = (int(found[1]), int(found[2])) if found else (entry, entry)
         if not isinstance(first, int) or isinstance(first, bool) or not 1 <= first <= last < 2**32:
             raise wanted
-        if last - first >= 1_000_000:
+        if last - first >= 1_000_000:  # a slip, which would take all memory
             raise wanted
         numbers.extend(range(first, last + 1))
     return numbers
@@ -298,29 +273,24 @@ class Hosts:
     def parse(cls, document: Any, experiment: Experiment, source: str = "hosts") -> Hosts:
         """Check a document from a YAML reader; the ExperimentError lists the mistakes, with ``source`` as place."""
         if not isinstance(document, dict):
-            raise ExperimentError(
-                source, ["expected the keys domain, recorder and hosts: see `msg-agents host --help`"]
-            )
+            keys = "expected the keys domain, recorder and hosts: see `msg-agents host --help`"
+            raise ExperimentError(source, [keys])
         try:
             spec = HostsSpec.model_validate(document)
         except ValidationError as error:
-            problems = [translate(each, root=HostsSpec) for each in error.errors()]
-            raise ExperimentError(source, problems) from error
-        problems = _mistakes(spec, experiment.agents)
+            raise ExperimentError(source, [translate(each, root=HostsSpec) for each in error.errors()]) from error
+        problems = assignment_problems({name: host.agents for name, host in spec.hosts.items()}, experiment.agents)
+        if spec.recorder not in spec.hosts:
+            wanted = f"expected one of the hosts, {', '.join(spec.hosts)}"
+            problems.insert(0, problem("recorder", spec.recorder, wanted, "name one of them"))
         addresses: dict[str, str] = {}
         for name, host in spec.hosts.items():
             try:
                 addresses[name] = socket.gethostbyname(host.address)
             except (OSError, UnicodeError) as error:
                 reason = getattr(error, "strerror", None) or "no such address"
-                problems.append(
-                    problem(
-                        f"hosts.{name}.address",
-                        host.address,
-                        f"expected an IPv4 address or a name that has one ({reason})",
-                        "give it as numbers",
-                    )
-                )
+                wanted = f"expected an IPv4 address or a name that has one ({reason})"
+                problems.append(problem(f"hosts.{name}.address", host.address, wanted, "give it as numbers"))
         problems += [
             problem(f"hosts.{name}.address", address, "duplicate address", "give each host its own")
             for place, (name, address) in enumerate(addresses.items())
@@ -358,15 +328,6 @@ class Hosts:
         return node_environment(self.domain, profile) | {PEERS_VARIABLE: " ".join(others)}
 
 
-def _mistakes(spec: HostsSpec, agents: int) -> list[str]:
-    """Mistakes in the assignment of agents and recorder to hosts."""
-    problems = []
-    if spec.recorder not in spec.hosts:
-        names = ", ".join(spec.hosts)
-        problems.append(problem("recorder", spec.recorder, f"expected one of the hosts, {names}", "name one of them"))
-    return problems + assignment_problems({name: host.agents for name, host in spec.hosts.items()}, agents)
-
-
 def assignment_problems(hosts: Mapping[str, Sequence[int]], agents: int) -> list[str]:
     """Mistakes in the numbers of the agents on each host, of an experiment with so many agents."""
     problems = []
@@ -379,21 +340,9 @@ def assignment_problems(hosts: Mapping[str, Sequence[int]], agents: int) -> list
         problems.append(problem("agents", show(unknown), f"expected numbers from 1 to {agents}", "remove the others"))
     twice = {number: names for number, names in where.items() if len(names) > 1}
     if twice:
-        number = min(twice)
-        problems.append(
-            problem(
-                "agents",
-                show(sorted(twice)),
-                "expected each agent once",
-                f"{number} is on {' and '.join(twice[number])}",
-            )
-        )
+        both = f"{min(twice)} is on {' and '.join(twice[min(twice)])}"
+        problems.append(problem("agents", show(sorted(twice)), "expected each agent once", both))
     missing = [number for number in range(1, agents + 1) if number not in where]
     if missing:
         problems.append(problem("agents", show(missing), "on no host", "name each agent on one"))
     return problems
-
-
-def this_host() -> str:
-    """Host name of this machine."""
-    return socket.gethostname()

@@ -22,6 +22,7 @@ from uuid import UUID
 
 from msg_agents.discovery.rtps import PREFIX_SIZE, remove_participant
 from msg_agents.stepping.synchronizer import RESEND_LIMIT
+from msg_analysis.common.files import write_whole
 from msg_analysis.errors import InputError
 from msg_analysis.messages.acceptance import state_frame
 from msg_analysis.model.run_record import RunRecord
@@ -42,10 +43,8 @@ class StopFiles:
         return self._asked.exists()
 
     def decide(self, step: int) -> None:
-        """Note the last step of the run, whole or not at all, before it is announced."""
-        draft = self._decided.with_suffix(".draft")
-        draft.write_text(str(step), encoding="ascii")
-        draft.replace(self._decided)
+        """Note the last step of the run before it is announced."""
+        write_whole(self._decided, str(step).encode())
 
     def decided(self) -> int | None:
         """The last step of the run; None: not decided."""
@@ -54,9 +53,9 @@ class StopFiles:
         return None
 
 
-MOST_STATES, LEAST_STATES, ROOM = RESEND_LIMIT, 256, 1 << 24
-"""States kept of each agent: as many as fit into ROOM bytes, from LEAST_STATES to MOST_STATES. If possible, more than
-the 5,000 that the middleware keeps of a writer for slow readers; always more steps than agents may be apart."""
+# States kept of each agent: as many as fit into ROOM bytes, but always more steps than agents may be apart, and at most
+# more than the 5,000 messages that the middleware keeps of a writer for slow readers.
+LEAST_STATES, ROOM = 256, 1 << 24
 
 # After each entry: its length and step + 1; 0 from before the entry is written until it is whole.
 FOOTER = struct.Struct("<QQ")
@@ -75,18 +74,14 @@ def entry_size(record: RunRecord) -> int:
 def room_for(size: int) -> int:
     """Size of the checkpoint file of an agent whose longest entry has ``size`` bytes."""
     slot = size + FOOTER.size
-    return slot * max(LEAST_STATES, min(MOST_STATES, ROOM // slot))
+    return slot * max(LEAST_STATES, min(RESEND_LIMIT, ROOM // slot))
 
 
 class Checkpoint:
-    """A ring of entries in a memory-mapped file, which survives its process, but not its machine.
+    """A ring of entries in a memory-mapped file (None: in memory only), which survives its process, not its machine."""
 
-    ``found``: the file was there, so another process has run this agent before. ``size`` is that of the longest entry
-    in bytes. Without a path it is in memory, for this process only. InputError: a file of another size, or no room.
-    """
-
-    def __init__(self, path: Path | None, size: int) -> None:
-        self.found = False
+    def __init__(self, path: Path | None, size: int) -> None:  # size: that of the longest entry in bytes
+        self.found = False  # whether the file was there: another process has run this agent before
         self._size = size
         self._slot = size + FOOTER.size
         total = room_for(size)
@@ -122,13 +117,11 @@ class Checkpoint:
         FOOTER.pack_into(self._map, start + self._size, len(entry), step + 1)
 
     def read(self, first: int = 0) -> list[tuple[int, bytes]]:
-        """(step, entry) of the newest consecutive steps, ascending, from step ``first`` on.
-
-        The slot after the newest is left out: it may be torn.
-        """
+        """(step, entry) of the newest consecutive steps, ascending, from step ``first`` on."""
         footers = [FOOTER.unpack_from(self._map, slot * self._slot + self._size) for slot in range(self.capacity)]
         newest = max(number for _, number in footers) - 1
         found: list[tuple[int, bytes]] = []
+        # Without the slot after the newest, which may be torn.
         for step in range(newest, max(first - 1, newest - self.capacity + 1, -1), -1):
             slot = step % self.capacity
             length, number = footers[slot]
@@ -140,10 +133,7 @@ class Checkpoint:
 
 
 class Takeover:
-    """The right to run a node, which one process has at a time: a lock on the file ``path``, created if missing.
-
-    ``predecessor``: GUID prefix of the last process; empty if there was none. InputError: another process has the lock.
-    """
+    """The right to run a node, which one process has at a time: a lock on a file; InputError: another one has it."""
 
     def __init__(self, path: Path) -> None:
         # Open, and locked, for as long as this process lives.
@@ -154,7 +144,7 @@ class Takeover:
             raise InputError(
                 f"--checkpoint: another process is running {path.stem}: end that process, or give another directory"
             ) from None
-        self.predecessor = os.read(self._descriptor, PREFIX_SIZE)
+        self.predecessor = os.read(self._descriptor, PREFIX_SIZE)  # its GUID prefix; empty if there was none
 
     def store_prefix(self, prefix: bytes) -> None:
         """Store the GUID prefix of this process for its successor."""
@@ -164,10 +154,7 @@ class Takeover:
 def take_over(
     directory: Path | None, names: Iterable[str], remove: Callable[[bytes, int], object] = remove_participant
 ) -> list[Takeover]:
-    """Get the right to run these nodes, and remove the processes that ran them before from the network.
-
-    ``directory`` has a file per node; None: no takeover. InputError: another process is running one of the nodes.
-    """
+    """Get the right to run these nodes, by a file each, and remove the processes that ran them before."""
     if directory is None:
         return []
     takeovers = [Takeover(directory / f"{name}.participant") for name in names]

@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
+import fnmatch
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from fnmatch import fnmatchcase
 
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.errors import InputError
@@ -23,48 +23,33 @@ def parse_rate(word: object) -> float:
 
 
 class BagClock:
-    """Time of a bag [ns], at ``rate`` seconds of the bag per second of wall time (inf: as fast as possible).
-
-    It can be paused, and held back while nothing is played.
-    """
+    """Time of a bag [ns], at ``rate`` seconds of the bag per second of wall time (inf: as fast as possible)."""
 
     def __init__(
         self, start: int, rate: float, *, paused: bool = False, wall: Callable[[], float] = time.monotonic
     ) -> None:
-        self._wall = wall
-        self._rate = rate
-        self._paused = paused
-        self._set(start)
-
-    @property
-    def rate(self) -> float:
-        """Seconds of the bag per second of wall time."""
-        return self._rate
-
-    @property
-    def paused(self) -> bool:
-        """Whether it is paused."""
-        return self._paused
+        self._wall, self.rate, self.paused = wall, rate, paused
+        self.jump(start)
 
     def now(self, limit: int) -> int:
         """Time of the bag [ns], at most ``limit`` (of the next message): no message is older than the clock."""
-        if self._paused:
+        if self.paused:
             return self._then
-        if math.isinf(self._rate):
+        if math.isinf(self.rate):
             return limit
-        return min(limit, self._then + round((self._wall() - self._since) * self._rate * SECOND))
+        return min(limit, self._then + round((self._wall() - self._since) * self.rate * SECOND))
 
     def until(self, when: int) -> float:
         """Seconds of wall time until a time of the bag [ns]: inf while paused, 0 or less if it has come."""
-        if self._paused:
+        if self.paused:
             return math.inf
-        if math.isinf(self._rate):
+        if math.isinf(self.rate):
             return 0.0
-        return (when - self._then) / (self._rate * SECOND) - (self._wall() - self._since)
+        return (when - self._then) / (self.rate * SECOND) - (self._wall() - self._since)
 
     def jump(self, when: int) -> None:
         """Go to a time of the bag [ns]."""
-        self._set(when)
+        self._then, self._since = when, self._wall()
 
     def hold(self, seconds: float) -> None:
         """Do not count the last so many seconds of wall time: nothing was played in them."""
@@ -72,50 +57,36 @@ class BagClock:
 
     def pause(self, paused: bool, limit: int) -> None:
         """Pause, or go on from the same time; ``limit`` as in ``now``."""
-        if paused != self._paused:
-            self._set(self.now(limit))
-            self._paused = paused
+        if paused != self.paused:
+            self.jump(self.now(limit))
+            self.paused = paused
 
     def change_rate(self, factor: float, limit: int) -> None:
         """Multiply the rate by ``factor`` from now on; ``limit`` as in ``now``. The rate inf stays."""
-        if not math.isinf(self._rate):
-            self._set(self.now(limit))
-            self._rate *= factor
-
-    def _set(self, when: int) -> None:
-        self._then, self._since = when, self._wall()
+        if not math.isinf(self.rate):
+            self.jump(self.now(limit))
+            self.rate *= factor
 
 
 def select_topics(topics: Iterable[str], wanted: Sequence[str], excluded: Sequence[str]) -> list[str]:
-    """Names that are wanted (none given: all) and not excluded, by name or pattern such as ``/agent_*/state``.
-
-    InputError: a name or pattern that no topic has, or no topic is left.
-    """
+    """Names that are wanted (none given: all) and not excluded, by name or pattern such as ``/agent_*/state``."""
     names = list(topics)
+    fitting: list[set[str]] = []
     for option, patterns in (("--topics", wanted), ("--exclude", excluded)):
+        fitting.append(set())
         for pattern in patterns:
-            if not any(_fits(name, pattern) for name in names):
+            found = fnmatch.filter(names, pattern if pattern.startswith("/") else f"/{pattern}")
+            if not found:
                 raise InputError(f"{option}: {pattern}: no such topic in the bag: expected one of {', '.join(names)}")
-    chosen = [
-        name
-        for name in names
-        if (not wanted or any(_fits(name, pattern) for pattern in wanted))
-        and not any(_fits(name, pattern) for pattern in excluded)
-    ]
+            fitting[-1].update(found)
+    chosen = [name for name in names if (not wanted or name in fitting[0]) and name not in fitting[1]]
     if not chosen:
         raise InputError(f"--exclude: {', '.join(excluded)}: leaves no topic to play: exclude fewer")
     return chosen
 
 
-def _fits(name: str, pattern: str) -> bool:
-    return fnmatchcase(name, pattern if pattern.startswith("/") else f"/{pattern}")
-
-
 def parse_remaps(remaps: Sequence[str], topics: Sequence[str]) -> dict[str, str]:
-    """New names of all topics that are played, by old name; each of ``remaps`` is ``old:=new``.
-
-    Names get a missing slash in front. InputError: not of this form, or a topic that is not played.
-    """
+    """New names of all topics that are played, by old name; each of ``remaps`` is ``old:=new``."""
     names = {name: name for name in topics}
     for remap in remaps:
         old, separator, new = remap.partition(":=")

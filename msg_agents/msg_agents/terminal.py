@@ -36,10 +36,7 @@ def exit_on_signals() -> None:
 
 
 def _under_nohup(number: signal.Signals) -> bool:
-    """Whether the signal stays ignored; SIGINT does not.
-
-    Scripts ignore SIGINT for what they start in the background, and then end that by ``kill -INT``.
-    """
+    # Scripts ignore SIGINT for what they start in the background, and then end that by ``kill -INT``.
     return number != signal.SIGINT and signal.getsignal(number) is signal.SIG_IGN
 
 
@@ -52,11 +49,9 @@ def raise_for(number: int | None) -> None:
 
 
 class Interruption:
-    """Keeps the first signal until somebody asks for it: from ``keep`` to ``end``, or as a context.
+    """Keeps the first signal until somebody asks for it: from ``keep`` to ``end``, or as a context."""
 
-    An exception that a handler raises is lost in a generator that is being closed, or in a callback of an executor.
-    """
-
+    # An exception that a handler raises is lost in a generator that is being closed, or in a callback of an executor.
     def __init__(self) -> None:
         self.caught: int | None = None  # number of the first signal
         self._handlers: dict[signal.Signals, Any] = {}
@@ -105,12 +100,9 @@ class Interruption:
 
 
 class JobControl:
-    """Calls ``before`` when Ctrl-Z is to stop the process, and ``after`` when it continues, as a context.
+    """Calls ``before`` when Ctrl-Z is to stop the process, and ``after`` when it continues, as a context."""
 
-    Both are called by ``check``, not in a signal handler, which might come in the middle of drawing. There is no call
-    before SIGSTOP, which no process can catch. ``after`` is called in the foreground and in the background.
-    """
-
+    # Both are called by ``check``, not in a signal handler, which might come in the middle of drawing.
     def __init__(self, *, before: Callable[[], None], after: Callable[[], None]) -> None:
         self._before, self._after = before, after
         self._handlers: dict[signal.Signals, Any] = {}
@@ -161,12 +153,9 @@ _NAMES |= {digit.encode(): digit for digit in "0123456789."}
 
 
 class Keyboard:
-    """Keys typed at the terminal, one by one and without echo, as a context; none where stdin is not a terminal.
+    """Keys typed at the terminal, one by one and without echo, as a context; none where stdin is not a terminal."""
 
-    Ctrl-C and Ctrl-Z work as usual. In the background the process does not touch the terminal. Call ``let_go`` before a
-    stop and ``listen`` after it.
-    """
-
+    # The system stops background processes that use the terminal. Call ``let_go`` before a stop, ``listen`` after it.
     def __init__(self) -> None:
         self._descriptor: int | None = None
         self._saved: list[Any] = []  # original settings; empty while they are in force
@@ -175,11 +164,6 @@ class Keyboard:
             descriptor = sys.stdin.fileno()
             if os.isatty(descriptor):
                 self._descriptor = descriptor
-
-    @property
-    def available(self) -> bool:
-        """Whether stdin is a terminal."""
-        return self._descriptor is not None
 
     def __enter__(self) -> Self:
         self.listen()
@@ -209,11 +193,7 @@ class Keyboard:
         self._saved = []
 
     def wait(self, seconds: float) -> list[str]:
-        """Wait at most so many seconds for keys: ``space``, ``step``, ``enter``, ``back``, arrows, digits, a point.
-
-        ``step`` is s, ``back`` backspace; the arrows are ``forward``, ``up``, ``down``. Others are left out. Returns as
-        soon as anything is typed.
-        """
+        """Wait at most so many seconds for keys, until any is typed: their names, without those that have none."""
         if not self._saved:
             self.listen()  # it may have been started in the background
         if self._descriptor is None or not self._saved or not self._in_front():
@@ -230,7 +210,6 @@ class Keyboard:
         return [_NAMES[key] for key in _KEYS.findall(typed) if key in _NAMES]
 
     def _in_front(self) -> bool:
-        """Whether we are in the foreground: the system stops background processes that use the terminal."""
         with contextlib.suppress(OSError):
             return self._descriptor is not None and os.tcgetpgrp(self._descriptor) == os.getpgrp()
         return False

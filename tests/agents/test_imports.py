@@ -43,12 +43,6 @@ def loaded_in_turn(lists: list[list[str]]) -> list[set[str]]:
     return [set(names) for names in json.loads(process.stdout)]
 
 
-def loaded_by(names: list[str]) -> set[str]:
-    """Every module that importing these loads."""
-    (loaded,) = loaded_in_turn([names])
-    return loaded
-
-
 @functools.cache
 def loaded_without_ros() -> dict[str, set[str]]:
     """What msg_analysis loads, and what the folders without ROS load after it and after those before them."""
@@ -91,22 +85,35 @@ def test_the_folders_without_ros() -> None:
 
 def test_ros_would_be_found() -> None:
     pytest.importorskip("rclpy")
-    loaded = loaded_by(["msg_agents.nodes.ros"])
+    (loaded,) = loaded_in_turn([["msg_agents.nodes.ros"]])
     assert {"rclpy"} <= {name for name in loaded if is_ros(name)}
 
 
 def test_the_verb_of_ros2_imports_no_other_package() -> None:
     """ros2 loads it with all its verbs, perhaps by a Python that has none of ours."""
-    loaded = loaded_by(["msg_agents.cli.entry_points"])
+    (loaded,) = loaded_in_turn([["msg_agents.cli.entry_points"]])
     assert "msg_agents" in loaded
     assert not {name for name in loaded if name.partition(".")[0] in ("msg_analysis", "numpy", "rclpy")}
 
 
-def test_help_needs_no_ros() -> None:
-    code = "import sys\nfrom msg_agents.cli.main import main\nmain(['--help'], standalone_mode=False)\n"
-    code += "print([name for name in ('rclpy', 'numpy', 'scipy', 'matplotlib', 'rich') if name in sys.modules])"
+HELP = "from msg_agents.cli.main import main; main(['--help'], standalone_mode=False)"
+PARSING = """
+from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.step_model import build_model
+document = {'name': 'two', 'graphs': {'pair': {'path': [1, 2]}, 'grid': {'grid': [1, 2]}},
+            'switching': {'generator': [[-1, 1], [1, -1]]}}
+build_model(Experiment.parse(document))"""
+
+
+@pytest.mark.parametrize(
+    ("code", "unwanted"),
+    [(HELP, "rclpy numpy scipy matplotlib rich"), (PARSING, "scipy networkx matplotlib rich rosbags")],
+    ids=["help", "parsing an experiment"],
+)
+def test_what_is_done_with_few_imports(code: str, unwanted: str) -> None:
+    code += f"\nimport sys; print([name for name in {unwanted.split()} if name in sys.modules])"
     process = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=60)
-    assert process.stdout.splitlines()[-1] == "[]", process.stderr
+    assert process.stdout.splitlines()[-1:] == ["[]"], process.stdout + process.stderr
 
 
 PROCESSES = {
@@ -123,20 +130,6 @@ def test_processes_of_a_run_import_little(process: str) -> None:
     What they import when they run: tests/integration/test_lockstep.py.
     """
     pytest.importorskip("rclpy")
-    loaded = loaded_by([*PROCESSES[process], "msg_analysis.model.step_model"])
+    (loaded,) = loaded_in_turn([[*PROCESSES[process], "msg_analysis.model.step_model"]])
     assert {"rclpy", "msg_agents.nodes.base", "msg_analysis.messages.messages"} <= loaded
     assert {name.split(".")[0] for name in loaded}.isdisjoint({"scipy", "networkx", "matplotlib", "rich", "rosbags"})
-
-
-def test_parsing_an_experiment_imports_little() -> None:
-    code = (
-        "import sys\n"
-        "from msg_analysis.experiment.experiment import Experiment\n"
-        "from msg_analysis.model.step_model import build_model\n"
-        "document = {'name': 'two', 'graphs': {'pair': {'path': [1, 2]}, 'grid': {'grid': [1, 2]}},\n"
-        "            'switching': {'generator': [[-1, 1], [1, -1]]}}\n"
-        "build_model(Experiment.parse(document))\n"
-        "print([name for name in ('scipy', 'networkx', 'matplotlib', 'rich', 'rosbags') if name in sys.modules])"
-    )
-    process = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=60)
-    assert process.stdout.splitlines()[-1:] == ["[]"], process.stdout + process.stderr

@@ -16,8 +16,7 @@ TOPICS = ["/experiment", "/graph", "/agent_1/state", "/agent_2/state", "/lab/age
 class Wall:
     """A clock that goes when told to."""
 
-    def __init__(self) -> None:
-        self.time = 100.0
+    time = 100.0
 
     def __call__(self) -> float:
         return self.time

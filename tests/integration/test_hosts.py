@@ -208,7 +208,7 @@ def rejoined(lan: Lan, duration: float, run: dict[str, Any]) -> dict[str, tuple[
     file = lan.network.directory / "short.xml"
     file.write_text(profile)
     setting = dict.fromkeys(PROFILE_VARIABLES, str(file)) | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}
-    hosts = lan.start_all("--no-analyse", "--patience", "60", **dict.fromkeys(NAMES, setting))
+    hosts = lan.start_all("--no-analyse", "--timeout", "60", **dict.fromkeys(NAMES, setting))
     lan.network.wait_until_moving("base")
     assert all(process.poll() is None for process in hosts.values()), "too fast to be cut off"
     lan.plug("left", "down", cable=True)

@@ -22,9 +22,7 @@ from msg_analysis.experiment.loading import read_yaml
 from msg_analysis.experiment.problems import ExperimentError, problem, translate
 from msg_analysis.experiment.spec import expected, is_number
 
-BASE = "base"
-"""The host of recorder and switcher."""
-
+BASE = "base"  # the host of recorder and switcher
 MOST_HOSTS = 250  # of agents
 MTU = 65535  # bytes; every message of a run is then one packet
 SECOND = 1e3  # ms
@@ -195,16 +193,13 @@ class Channel:
         return next((name for name, there in self.hosts.items() if agents and agents[0] in there), BASE)
 
     def joined(self, used: BoolArray) -> BoolArray:
-        """(n, H, H) whether a link joins two hosts in each graph, in either direction; the first host is joined to all.
-
-        ``used``: (n, m, m) whether agent i uses what agent j publishes in each graph.
-        """
+        """(n, H, H) whether a link joins two hosts in each graph, by who uses whose states, ``used`` (n, m, m)."""
         there = np.zeros((len(self.hosts), used.shape[1]), dtype=bool)
         for place, agents in enumerate(self.hosts.values()):
             there[place, list(agents)] = True
         links = np.einsum("hi,gij,kj->ghk", there, used, there) > 0
         joined: BoolArray = links | links.transpose(0, 2, 1)
-        joined[:, 0, :] = joined[:, :, 0] = True
+        joined[:, 0, :] = joined[:, :, 0] = True  # the host of recorder and switcher
         return joined
 
     def agent_loss(self, agents: int) -> FloatArray:
@@ -240,9 +235,8 @@ def _pairs(
     for number, pair in enumerate(spec.pairs, start=1):
         key = f"pairs[{number}]"
         if not pair.directions:
-            problems.append(
-                problem(key, "which pair", "expected sender and receiver, or between", "between: [left, right]")
-            )
+            wanted = "expected sender and receiver, or between"
+            problems.append(problem(key, "which pair", wanted, "between: [left, right]"))
         settings = _settings(pair, default, key, problems)
         for direction in pair.directions:
             words = f"from {direction[0]} to {direction[1]}"
@@ -273,29 +267,23 @@ def _settings(spec: LinkSpec, default: LinkSettings, key: str, problems: list[st
             problems.append(problem(f"{key}.loss.to_good", "0", "expected a number > 0", "or give a number as loss"))
     settings = replace(default, **{name: value for name, value in given.items() if value is not None})
     if spec.burst is not None:
-        number = spec.loss.good if spec.loss is not None and spec.loss.good == spec.loss.bad else None
-        problems += (found := _burst_problems(number, spec.burst, f"{key}.burst"))
-        if number is not None and not found:
-            settings = replace(settings, loss=LossModel.bursts(number, spec.burst))
+        burst = spec.burst
+        loss = spec.loss.good if spec.loss is not None and spec.loss.good == spec.loss.bad else None
+        if loss is None:
+            wanted, remedy = "expected a number as loss beside it", "give one, or remove burst"
+            problems.append(problem(f"{key}.burst", burst, wanted, remedy))
+        elif burst < (least := loss / (1 - loss)):
+            wanted, remedy = f"expected at least {least:.4g}", f"with loss {loss:g} bursts are longer"
+            problems.append(problem(f"{key}.burst", burst, wanted, remedy))
+        else:
+            settings = replace(settings, loss=LossModel.bursts(loss, burst))
     if settings.jitter > settings.delay:
-        wanted = f"expected at most delay_ms, {settings.delay * SECOND:g}"
-        problems.append(
-            problem(f"{key}.jitter_ms", settings.jitter * SECOND, wanted, "no packet arrives before it is sent")
-        )
+        jitter, wanted = settings.jitter * SECOND, f"expected at most delay_ms, {settings.delay * SECOND:g}"
+        problems.append(problem(f"{key}.jitter_ms", jitter, wanted, "no packet arrives before it is sent"))
     if spec.queue is not None and settings.rate == inf:
-        problems.append(
-            problem(f"{key}.queue", spec.queue, "has no effect without rate_mbit", "give one, or remove it")
-        )
+        without = "has no effect without rate_mbit"
+        problems.append(problem(f"{key}.queue", spec.queue, without, "give one, or remove it"))
     return settings
-
-
-def _burst_problems(loss: float | None, burst: float, key: str) -> list[str]:
-    if loss is None:
-        return [problem(key, burst, "expected a number as loss beside it", "give one, or remove burst")]
-    least = loss / (1 - loss)
-    if burst < least:
-        return [problem(key, burst, f"expected at least {least:.4g}", f"with loss {loss:g} bursts are longer")]
-    return []
 
 
 def json_schema() -> dict[str, Any]:

@@ -1,30 +1,22 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What a channel does to packets: loss, rate with a finite queue and delay of each direction, and the forwarder.
-
-Every random number is a function of (seed, pair of hosts, number of the packet): the same seed loses the same packets
-of a pair, whatever their times are.
-"""
+"""What a channel does to packets: loss, rate with a finite queue and delay of each direction, and the forwarder."""
 
 from __future__ import annotations
 
 import heapq
-import json
 import os
 import select
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from enum import Enum, auto
 from math import inf
-from pathlib import Path
 from typing import Any
 
 from msg_analysis.arithmetic.reproducible import Stream, generator, link_number
-from msg_analysis.common.files import write_whole
 
 
 @dataclass(slots=True)
@@ -39,50 +31,13 @@ class PairCounts:
     cut: int = 0  # because no active link joined the hosts
 
 
-@dataclass(slots=True)
-class ChannelCounts:
-    """Of one run."""
-
-    pairs: dict[tuple[str, str], PairCounts] = field(default_factory=dict)  # by sender and receiver
-    overflowed: int = 0  # packets that the process was too slow to take
-    late_mean: float = 0.0  # ms by which packets were passed on later than the link says
-    late_most: float = 0.0  # ms
-
-    def to_json(self) -> dict[str, Any]:
-        """As in the result of a run."""
-        names = PairCounts.__slots__
-        return {
-            "pairs": [
-                {"sender": sender, "receiver": receiver} | {name: getattr(counts, name) for name in names}
-                for (sender, receiver), counts in self.pairs.items()
-            ],
-            "overflowed": self.overflowed,
-            "late_ms": {"mean": self.late_mean, "max": self.late_most},
-        }
-
-    def write(self, path: Path) -> None:
-        """Write the file, whole or not at all."""
-        write_whole(path, json.dumps(self.to_json()).encode())
-
-
-def read_counts(path: Path) -> dict[str, Any] | None:
-    """The newest counts of a channel, as JSON; None if it has written none."""
-    with suppress(OSError, ValueError):
-        found: dict[str, Any] = json.loads(path.read_bytes())
-        return found
-    return None
-
-
 BLOCK = 256  # packets whose numbers are drawn at once; another value gives other numbers
 BITS = 8 / 1e6  # Mbit of a byte
 
 
 @dataclass(frozen=True, slots=True)
 class LossModel:
-    """Gilbert-Elliott: two states, good and bad, each with its probability of loss; with equal ones it is independent.
-
-    The state changes after every packet, and begins with its stationary law.
-    """
+    """Gilbert-Elliott: two states, each with a probability of loss; they may change after every packet."""
 
     good: float  # probability that a packet is lost in the good state
     bad: float
@@ -96,12 +51,12 @@ class LossModel:
 
     @property
     def stationary_bad(self) -> float:
-        """Share of the packets in the bad state."""
+        """Fraction of the packets in the bad state."""
         return self.to_bad / (self.to_bad + self.to_good)
 
     @property
     def mean(self) -> float:
-        """Share of the packets that is lost."""
+        """Fraction of the packets that is lost."""
         return self.good + self.stationary_bad * (self.bad - self.good)
 
     @property
@@ -139,6 +94,8 @@ class PacketOutcome(Enum):
 class Link:
     """One direction between two hosts. Packets keep their order, as on one radio link."""
 
+    # Every random number is a function of seed, pair of hosts and number of the packet: the same seed loses the same
+    # packets of a pair, whatever their times are.
     def __init__(self, settings: LinkSettings, seed: int, sender: int, receiver: int) -> None:
         self._settings, self._seed, self._pair = settings, seed, link_number(receiver, sender)
         self._number = 0  # of the next packet
@@ -213,14 +170,10 @@ class Port:
 
 
 def destinations(packet: bytes, sender: int, places: dict[bytes, int]) -> Sequence[int]:
-    """The hosts that a packet is for; ``places``: hosts by address.
-
-    Multicast datagrams are for all others. Not passed on are IPv6, which no process of a run uses, and what the kernel
-    itself says on a link: group memberships.
-    """
-    if len(packet) < 20 or packet[0] >> 4 != 4:
+    """The hosts that a packet is for; ``places``: hosts by address. Multicast datagrams are for all others."""
+    if len(packet) < 20 or packet[0] >> 4 != 4:  # IPv6, which no process of a run uses
         return ()
-    if _FIRST_GROUP <= packet[16] <= _LAST_GROUP:
+    if _FIRST_GROUP <= packet[16] <= _LAST_GROUP:  # else than UDP: group memberships, which the kernel says itself
         return [place for place in places.values() if place != sender] if packet[9] == _UDP else ()
     place = places.get(packet[16:20])
     return () if place is None or place == sender else (place,)
@@ -252,7 +205,7 @@ class Forwarder:
         self._order = 0
         self._late_sum, self._late_most, self._passed = 0.0, 0.0, 0
 
-    def run(self, stop: int, report: Callable[[ChannelCounts], None]) -> None:
+    def run(self, stop: int, report: Callable[[dict[str, Any]], None]) -> None:
         """Forward until a descriptor can be read; ``report`` is called now and then, and at the end."""
         devices = {port.device: place for place, port in enumerate(self._ports)}
         next_report = 0.0
@@ -315,12 +268,14 @@ class Forwarder:
         self._late_most = max(self._late_most, late)
         self._passed += 1
 
-    def counts(self) -> ChannelCounts:
-        """What was done so far."""
+    def counts(self) -> dict[str, Any]:
+        """What was done so far, as in the result of a run."""
         names = [port.name for port in self._ports]
-        return ChannelCounts(
-            {(names[sender], names[receiver]): counts for (sender, receiver), counts in self._pairs.items()},
-            sum(device_overflow(port.statistics) for port in self._ports),
-            1e3 * self._late_sum / max(self._passed, 1),
-            1e3 * self._late_most,
-        )
+        return {
+            "pairs": [
+                {"sender": names[sender], "receiver": names[receiver]} | asdict(counts)
+                for (sender, receiver), counts in self._pairs.items()
+            ],
+            "overflowed": sum(device_overflow(port.statistics) for port in self._ports),
+            "late_ms": {"mean": 1e3 * self._late_sum / max(self._passed, 1), "max": 1e3 * self._late_most},
+        }

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The hosts of a channel and its process.
+"""The hosts of a channel and its process. Linux only.
 
 A host is a network namespace with one TUN device, known by descriptors only: when the last process and descriptor of
-one is gone, the kernel removes it with its device, whatever was killed. Linux only. The run hands the hosts to the
-process over a socket, and the process ends when that socket is closed, for whatever reason.
+one is gone, the kernel removes it with its device, whatever was killed.
 """
 
 from __future__ import annotations
@@ -20,15 +19,16 @@ import signal
 import socket
 import struct
 import sys
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from msg_agents.channel.links import DEVICE, ChannelCounts, Forwarder, Link, LinkSettings, LossModel, Port
+from msg_agents.channel.links import DEVICE, Forwarder, Link, LinkSettings, LossModel, Port
 from msg_analysis.common.arrays import BoolArray
+from msg_analysis.common.files import write_whole
 from msg_analysis.errors import NotAvailableError
 
 if TYPE_CHECKING:
@@ -49,6 +49,8 @@ REMEDY = (
     "run it as root, or in namespaces of your own: `unshare --user --map-root-user --net msg-agents run ...`; "
     "a container needs --cap-add NET_ADMIN,SYS_ADMIN and --device /dev/net/tun"
 )
+LARGEST_MESSAGE = 1 << 16  # bytes of a message that describes a host
+PRIORITY = -10  # a delay is that of the link, not that of the scheduler
 
 
 @dataclass(slots=True)
@@ -84,28 +86,15 @@ def open_hosts(names: Sequence[str], mtu: int) -> Iterator[dict[str, Host]]:
     with ExitStack() as stack:
         hosts = {}
         for index, name in enumerate(names):
-            hosts[name] = host = _make_host(host_address(index), mtu)
+            # In a thread, which is then in the new namespace and ends: nothing else of this process moves.
+            with ThreadPoolExecutor(1) as thread:
+                made = thread.submit(_enter_new_host, host_address(index), mtu)
+            try:
+                hosts[name] = host = made.result()
+            except OSError as error:
+                raise NotAvailableError(f"--channel: {_reason(error)}: {REMEDY}") from error
             stack.callback(host.close)
         yield hosts
-
-
-def _make_host(address: str, mtu: int) -> Host:
-    """In a thread, which is then in the new namespace and ends: nothing else of this process moves."""
-    made: list[Host] = []
-    failed: list[OSError] = []
-
-    def make() -> None:
-        try:
-            made.append(_enter_new_host(address, mtu))
-        except OSError as error:
-            failed.append(error)
-
-    thread = threading.Thread(target=make, name="host")
-    thread.start()
-    thread.join()
-    if failed:
-        raise NotAvailableError(f"--channel: {_reason(failed[0])}: {REMEDY}") from failed[0]
-    return made[0]
 
 
 def _reason(error: OSError) -> str:
@@ -200,10 +189,6 @@ class ActiveGraphFile:
         self._map[_MODE.size + host] = all_packets
 
 
-LARGEST_MESSAGE = 1 << 16  # bytes of a message that describes a host
-PRIORITY = -10  # a delay is that of the link, not that of the scheduler
-
-
 def hand_over(
     control: socket.socket,
     channel: Channel,
@@ -218,9 +203,7 @@ def hand_over(
         "counts": str(counts),
         "active_graph": active_graph and str(active_graph),
         "joined": None if joined is None else joined.tolist(),
-        "links": [
-            [sender, receiver, _settings_to_json(settings)] for (sender, receiver), settings in channel.links.items()
-        ],
+        "links": [[*pair, asdict(settings)] for pair, settings in channel.links.items()],
     }
     for name, host in hosts.items():
         message = json.dumps({"name": name, "address": host.address}).encode()
@@ -229,23 +212,6 @@ def hand_over(
     file = counts.with_name("channel.json")
     file.write_text(json.dumps(orders), encoding="utf-8")
     control.send(json.dumps({"orders": str(file)}).encode())
-
-
-def _settings_to_json(settings: LinkSettings) -> dict[str, Any]:
-    loss = settings.loss
-    rate = None if settings.rate == float("inf") else settings.rate
-    return {
-        "loss": [loss.good, loss.bad, loss.to_bad, loss.to_good],
-        "delay": settings.delay,
-        "jitter": settings.jitter,
-        "rate": rate,
-        "queue": settings.queue,
-    }
-
-
-def _settings_from_json(document: dict[str, Any]) -> LinkSettings:
-    rate = float("inf") if document["rate"] is None else document["rate"]
-    return LinkSettings(**document | {"loss": LossModel(*document["loss"]), "rate": rate})
 
 
 def serve(descriptor: int) -> None:
@@ -259,17 +225,16 @@ def serve(descriptor: int) -> None:
             return
         ports, orders = received
         places = {port.name: place for place, port in enumerate(ports)}
-        links = {
-            (places[sender], places[receiver]): Link(
-                _settings_from_json(settings), orders["seed"], places[sender], places[receiver]
-            )
-            for sender, receiver, settings in orders["links"]
-        }
+        links = {}
+        for sender, receiver, settings in orders["links"]:
+            pair = places[sender], places[receiver]
+            loss = LossModel(**settings["loss"])
+            links[pair] = Link(LinkSettings(**settings | {"loss": loss}), orders["seed"], *pair)
         counts = Path(orders["counts"])
 
-        def report(found: ChannelCounts) -> None:
+        def report(found: dict[str, Any]) -> None:
             with suppress(OSError):  # a full disk, or the run was killed and its folder is gone
-                found.write(counts)
+                write_whole(counts, json.dumps(found).encode())
 
         Forwarder(ports, links, _gate(orders)).run(descriptor, report)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections import Counter
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -259,7 +259,7 @@ def doctor(*, as_json: bool) -> None:
     can_run = not counts["error"]
     if as_json:
         counted = {"errors": counts["error"], "warnings": counts["warning"]}
-        print_json({"can_run": can_run, **counted, "checks": [check.to_json() for check in found]})
+        print_json({"can_run": can_run, **counted, "checks": [asdict(check) for check in found]})
     else:
         console.print(_summary(counts["error"], counts["warning"]), soft_wrap=True)
     if not can_run:

@@ -9,6 +9,7 @@ input, 3 incomplete data. Modules that take long to import are imported by the c
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ import click
 
 import msg_agents
 from msg_agents.cli import begin, nodes, replay, watching
+from msg_agents.cli.ros_command import RenamedOption
 from msg_agents.cli.run_result import finish
 from msg_agents.cli.watching import WebCommand, announce, page, web_options
 from msg_agents.environment import LAST_DOMAIN, RESTARTS, USER_TIMEOUT
@@ -268,7 +270,9 @@ def run(
     help="How long to wait for the other hosts [s].",
 )
 @click.option(
-    "--patience",
+    "--timeout",
+    cls=RenamedOption,
+    old_name="--patience",
     type=PositiveFloat(),
     metavar="SECONDS",
     default=30.0,
@@ -297,7 +301,7 @@ def host(
     name: str | None,
     out: Path,
     discovery_timeout: float,
-    patience: float,
+    timeout: float,
     restarts: int,
     no_analyse: bool,
     write_report: ReportWhen,
@@ -314,7 +318,7 @@ def host(
     HOSTS; start them in any order. The recorder's host compares the record with the theory, as `msg-agents run`
     does; the others end with the run.
     """
-    from msg_agents.process_layout import Hosts, this_host
+    from msg_agents.process_layout import Hosts
     from msg_agents.run.folder import temporary_directory
     from msg_agents.run.runner import run_network
     from msg_agents.watch.panel import RunView
@@ -328,7 +332,7 @@ def host(
     if only_profile:
         click.echo(places.profile(what), nl=False)
         return
-    assignment = places.assignment(name or this_host(), discovery_timeout, patience)
+    assignment = places.assignment(name or socket.gethostname(), discovery_timeout, timeout)
     mine = show([agent_name(agent + 1, what.names) if what.names else agent + 1 for agent in assignment.agents])
     with temporary_directory() as folder, RunView(what) as view:
         also = " and the recorder" if assignment.has_recorder else ""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
-from msg_agents.cli.ros_command import RosCommand
+from msg_agents.cli.ros_command import RenamedOption, RosCommand
 from msg_agents.environment import DISCOVERY_TIMEOUT
 from msg_agents.run.fork_server import exit_with_pipe
 from msg_analysis.cli.console import examples
@@ -66,7 +66,9 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
         click.option("--introduction", type=int, hidden=True),
         click.option("--namespace", type=int, hidden=True),
         click.option(
-            "--account",
+            "--status-file",
+            cls=RenamedOption,
+            old_name="--account",
             type=PATH,
             metavar="FILE",
             help="Status file, written every second: rejected messages, what the nodes wait for (health checks).",
@@ -86,8 +88,10 @@ _await = click.option(
 )
 
 
-_patience = click.option(
-    "--patience",
+_timeout = click.option(
+    "--timeout",
+    cls=RenamedOption,
+    old_name="--patience",
     type=PositiveFloat(),
     metavar="SECONDS",
     show_default="no limit",
@@ -141,7 +145,7 @@ def prepare(experiment: Path) -> None:
 )
 @_await
 @_checkpoint
-@_patience
+@_timeout
 def agent(
     run_record: Path, *, agents: tuple[int, ...], readers: tuple[str, ...], checkpoint: Path | None, **options: Any
 ) -> None:
@@ -177,7 +181,7 @@ def agent(
 @_node_options
 @_await
 @_checkpoint
-@_patience
+@_timeout
 @click.option("--steps", type=PATH, hidden=True)
 @click.option("--active-graph", type=PATH, hidden=True)
 @click.option("--clocks", type=PATH, hidden=True)
@@ -189,7 +193,7 @@ def switcher(
     steps: Path | None,
     active_graph: Path | None,
     clocks: Path | None,
-    patience: float | None,
+    timeout: float | None,
     **options: Any,
 ) -> None:
     """Run the switcher.
@@ -199,16 +203,16 @@ def switcher(
     record = load_record(run_record)
 
     def report(reached: Sequence[int]) -> None:
-        from msg_agents.run.result import write_steps
+        from msg_agents.run.result import write_report
 
         if steps is not None:
-            write_steps(steps, reached)
+            write_report(steps, reached)
 
     def note_clocks(offsets: ClockOffsets, warning: str | None) -> None:
-        from msg_agents.run.result import write_clocks
+        from msg_agents.run.result import write_report
 
         if clocks is not None:
-            write_clocks(clocks, offsets.to_json(), warning)
+            write_report(clocks, {"offsets": offsets.to_json(), "warning": warning})
 
     def tell_channel(file: Path | None) -> Callable[[int], None]:
         if file is None:
@@ -233,20 +237,20 @@ def switcher(
             on_progress=report,
             on_graph=tell_channel(active_graph),
             checkpoints=directory,
-            on_clocks=None if patience is None else note_clocks,
-            ack_timeout=max(ACK_TIMEOUT, patience or 0.0),
+            on_clocks=None if timeout is None else note_clocks,
+            ack_timeout=max(ACK_TIMEOUT, timeout or 0.0),
         )
         store_participant(takeovers, node)
         return [node]
 
-    _run_nodes(nodes, record, patience=patience, **options)
+    _run_nodes(nodes, record, timeout=timeout, **options)
 
 
 @click.command(cls=RosCommand, epilog=examples("msg-agents recorder run.json --out runs/mine"))
 @_node_options
 @click.option("--out", type=PATH, metavar="BAG", required=True, help="Bag to write; must not exist.")
 @storage_options
-@_patience
+@_timeout
 def recorder(
     run_record: Path, *, out: Path, compression: Compression, split_size: float | None, **options: Any
 ) -> None:
@@ -278,9 +282,9 @@ def _run_nodes(
     lifeline: int | None,
     namespace: int | None,
     parameter_services: bool,  # noqa: ARG001  see LeanNode
-    account: Path | None,
+    status_file: Path | None,
     introduction: int | None,
-    patience: float | None = None,
+    timeout: float | None = None,
     **options: Any,  # of ``run_nodes``
 ) -> None:
     if namespace is not None:
@@ -293,7 +297,7 @@ def _run_nodes(
 
     executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")
     throughput = record.experiment.run.pace == "lockstep"
-    options |= {"status_file": account, "relay": introduction, "peer_timeout": patience}
+    options |= {"status_file": status_file, "relay": introduction, "peer_timeout": timeout}
     if not run_nodes(nodes, executor=executor, throughput=throughput, **options):
         sys.exit(ExitCode.INCOMPLETE)
 

@@ -5,9 +5,8 @@
 
 By default every process announces itself to every other, again with every process that it discovers, and then sends it
 each endpoint as it is made: messages grow with the third power of the processes. So the profile relayed.xml makes them
-announce themselves only at the first participant numbers, one of which is taken here. When a process has all its
-endpoints, its announcement is forwarded unchanged to its partners; other processes of the run never get it. Joining
-participants (the user's tools, for example) are connected to all.
+announce themselves only at the first participant numbers, one of which is taken here. Joining participants (the user's
+tools, for example) are connected to all.
 """
 
 from __future__ import annotations
@@ -45,18 +44,14 @@ LARGEST = 1 << 16  # bytes of a datagram
 
 
 def report_ready(descriptor: int, name: str, prefix: bytes) -> None:
-    """Report to the relay, once, that a process is ready: the name of its first node, and the prefix of its GUIDs.
-
-    Without a prefix it counts as a joining participant, which is connected to all.
-    """
+    """Report to the relay, once, that a process is ready: the name of its first node, and the prefix of its GUIDs."""
     with contextlib.suppress(OSError):  # it has gone, and so has the run
-        if prefix:
+        if prefix:  # without one, it counts as a joining participant
             os.write(descriptor, f"{prefix.hex()} {name}\n".encode())
     os.close(descriptor)
 
 
 def _pipe(opened: contextlib.ExitStack) -> tuple[int, int]:
-    """A new pipe, which is closed with the others."""
     ends = os.pipe()
     for end in ends:
         opened.callback(os.close, end)
@@ -74,8 +69,7 @@ class _Known:
 class DiscoveryRelay:
     """A thread that forwards announcements; a context, which takes a port of the joining participants.
 
-    ``descriptor``: where processes report that they are ready (``report_ready``). OSError: no port is left, or no
-    descriptor. The times and ``most_known`` are as the constants of this module.
+    OSError: no port is left, or no descriptor. The options are as the constants of this module.
     """
 
     def __init__(
@@ -103,7 +97,7 @@ class DiscoveryRelay:
             self._socket = opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
             self._bind()
-            self._reports, self.descriptor = _pipe(opened)
+            self._reports, self.descriptor = _pipe(opened)  # the latter for ``report_ready``
             self._stop, self._stopped = _pipe(opened)
             self._selector = opened.enter_context(selectors.DefaultSelector())
             for source in (self._socket, self._reports, self._stop):
@@ -113,14 +107,11 @@ class DiscoveryRelay:
         return self
 
     def _bind(self) -> None:
-        for participant in range(FIRST_RELAYED):
-            try:
+        for participant in range(FIRST_RELAYED - 1):
+            with contextlib.suppress(OSError):
                 self._socket.bind((LOOPBACK, discovery_port(self._domain, participant)))
-            except OSError:
-                if participant == FIRST_RELAYED - 1:
-                    raise
-            else:
                 return
+        self._socket.bind((LOOPBACK, discovery_port(self._domain, FIRST_RELAYED - 1)))
 
     def connect(self, partners: Mapping[str, Collection[str]]) -> None:
         """From now on, connect these: the names of those that a process exchanges messages with, by its name."""
@@ -136,7 +127,8 @@ class DiscoveryRelay:
         while True:
             ready = [key.fileobj for key, _ in self._selector.select(timeout=self._period)]
             if self._stop in ready:
-                self._leave()
+                if self._own_prefix is not None:
+                    self._send_to_joining(disposal_message(self._own_prefix))
                 return
             if self._socket in ready:
                 with contextlib.suppress(OSError):
@@ -157,17 +149,10 @@ class DiscoveryRelay:
         if self._own_prefix is not None:
             self._announced = time.monotonic()
             port = self._socket.getsockname()[1]
-            message = announcement_message(self._own_prefix, port, LEASE)
-            self._send_to_joining(message)
-            announce_here(message, self._domain)
-
-    def _leave(self) -> None:
-        if self._own_prefix is not None:
-            message = disposal_message(self._own_prefix)
-            self._send_to_joining(message)
-            announce_here(message, self._domain)
+            self._send_to_joining(announcement_message(self._own_prefix, port, LEASE))
 
     def _send_to_joining(self, datagram: bytes) -> None:
+        announce_here(datagram, self._domain)
         for participant in range(FIRST_RELAYED):
             with contextlib.suppress(OSError):  # nobody has that number
                 self._socket.sendto(datagram, (LOOPBACK, discovery_port(self._domain, participant)))
@@ -208,10 +193,8 @@ class DiscoveryRelay:
         return known.announcement.prefix not in self._prefixes.values()
 
     def _forward(self, known: _Known) -> None:
-        """Forward an announcement to its partners, and to a process of the run those of the joining participants.
-
-        A participant that receives one announces itself to its sender.
-        """
+        """Forward an announcement to its partners, and to a process of the run those of the joining participants."""
+        # A participant that receives one announces itself to its sender.
         names = [name for name, prefix in self._prefixes.items() if prefix == known.announcement.prefix]
         if names:
             others = {partner for name in names for partner in self._partners.get(name, ())}

@@ -39,12 +39,31 @@ MOST_RELAYED = 206  # participants that the relay connects: they fill the ports 
 NUMBERS_OF_DOMAIN = 119  # of participants whose ports are those of their domain; from there on, of the next one
 UDP_PROFILE = Path(__file__).with_name("udp.xml")
 
-LEASE = 60.0
-"""s of silence after which a participant on another host counts as gone, and messages on their way to it are lost: the
-longest time for which a host may be cut off."""
-
+LEASE = 60.0  # s of silence after which a participant on another host, and what is on its way to it, counts as lost
 ANNOUNCEMENT = 3.0  # s between two announcements of a participant to other hosts
 _NAMESPACE = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
+DOMAINS = range(1, 102)  # 0 is the default of every ROS program; above 101 are the ephemeral ports of Linux
+PORT_BASE, PORTS_PER_DOMAIN = 7400, 250  # the RTPS rule for well-known ports
+PREFIX_SIZE = 12  # bytes of a GUID that all endpoints of a participant share
+PEERS_VARIABLE = "MSG_AGENTS_PEERS"  # addresses of the hosts, in a run on several
+LOOPBACK = "127.0.0.1"
+GROUP = "239.255.0.1"  # of announcements by multicast (9.6.1.4)
+_MAGIC, _HEADER_SIZE = b"RTPS", 20
+FAST_DDS = b"\x01\x0f"  # the vendor (8.3.3.1.3)
+_HEADER = _MAGIC + b"\x02\x03" + FAST_DDS  # version 2.3
+_DATA, _TO_ONE = 0x15, 0x0E  # submessages
+_ANYBODY = bytes(PREFIX_SIZE)  # as the addressee: all that receive it (8.3.7.6)
+_LITTLE_ENDIAN, _INLINE_QOS, _WITH_DATA = 0x01, 0x02, 0x04  # flags
+_PARTICIPANT, _PARTICIPANT_WRITER = b"\x00\x00\x01\xc1", b"\x00\x01\x00\xc2"
+_KEY_HASH, _STATUS_INFO, _SENTINEL, _DISCOVERY_LOCATOR = 0x70, 0x71, 0x01, 0x32
+_PARAMETERS_LITTLE_ENDIAN = b"\x00\x03"
+_DISPOSED_UNREGISTERED = b"\x00\x00\x00\x03"
+_PROTOCOL_VERSION, _VENDOR, _LEASE, _GUID, _DEFAULT_LOCATOR, _BUILTIN_ENDPOINTS = 0x15, 0x16, 0x02, 0x50, 0x31, 0x58
+_UDP_V4, _ANNOUNCER_AND_DETECTOR = 1, 0x03
+_LATE = 1 << 30  # sequence number: higher than that of any announcement that the participant made itself
+LOOPBACK_TIMEOUT = 1.0  # s; in the kernel, a message is there at once
+WORD = b"msg_agents"
+LOOPBACK_INTERFACES = ("lo", "lo0")  # on Linux, elsewhere
 
 
 def has_profile_for(topic: str) -> bool:
@@ -100,12 +119,6 @@ def _tag(name: str) -> str:
     return f"{{{_NAMESPACE}}}{name}"
 
 
-DOMAINS = range(1, 102)
-"""0 is the default of every ROS program; above 101 the ports are among the ephemeral ports of Linux."""
-
-PORT_BASE, PORTS_PER_DOMAIN = 7400, 250  # the RTPS rule for well-known ports
-
-
 def domains_with_ports_in_use() -> set[int]:
     """Domains of which somebody has bound a UDP port on this machine."""
     ports: set[int] = set()
@@ -118,24 +131,10 @@ def domains_with_ports_in_use() -> set[int]:
     return {(port - PORT_BASE) // PORTS_PER_DOMAIN for port in ports}
 
 
-def _open_lock(path: Path) -> int:
-    """Open a lock file, which may belong to another user.
-
-    Such a file can be read and locked, but not opened for writing nor, in a directory like /tmp, with O_CREAT.
-    """
-    try:
-        return os.open(path, os.O_RDONLY)
-    except FileNotFoundError:
-        return os.open(path, os.O_RDONLY | os.O_CREAT, 0o644)
-
-
 @contextmanager
 def free_domain(count: int = 1, domains: Sequence[int] = DOMAINS) -> Iterator[int]:
-    """Hold a ROS_DOMAIN_ID that no other run holds and whose ports are unused; InputError if there is none.
-
-    ``count``: as many in a row, for a network that needs their ports; the first one is its domain. They are held by
-    locks on files, which the system releases when this process ends, however it ends.
-    """
+    """Hold a ROS_DOMAIN_ID, the first of ``count`` that no other run holds and whose ports are unused."""
+    # They are held by locks on files, which the system releases when this process ends, however it ends.
     busy = domains_with_ports_in_use()
     free = [domain for domain in domains if domain not in busy]
     candidates = [first for first in free if set(range(first, first + count)) <= set(free)]
@@ -166,8 +165,10 @@ def _lock_name(domain: str) -> str:
 
 def _lock(domain: int, locks: ExitStack) -> bool:
     """Lock a domain until the end of ``locks``; whether that was possible."""
+    path = Path(tempfile.gettempdir()) / _lock_name(str(domain))
     try:
-        descriptor = _open_lock(Path(tempfile.gettempdir()) / _lock_name(str(domain)))
+        # That of another user can be read and locked, but not written nor, in /tmp for example, opened with O_CREAT.
+        descriptor = os.open(path, os.O_RDONLY | (0 if path.exists() else os.O_CREAT), 0o644)
     except OSError:
         return False
     locks.callback(os.close, descriptor)
@@ -176,25 +177,6 @@ def _lock(domain: int, locks: ExitStack) -> bool:
     except BlockingIOError:
         return False
     return True
-
-
-PREFIX_SIZE = 12  # bytes of a GUID that all endpoints of a participant share
-PEERS_VARIABLE = "MSG_AGENTS_PEERS"  # addresses of the hosts, in a run on several
-LOOPBACK = "127.0.0.1"
-GROUP = "239.255.0.1"  # of announcements by multicast (9.6.1.4)
-_MAGIC, _HEADER_SIZE = b"RTPS", 20
-FAST_DDS = b"\x01\x0f"  # the vendor (8.3.3.1.3)
-_HEADER = _MAGIC + b"\x02\x03" + FAST_DDS  # version 2.3
-_DATA, _TO_ONE = 0x15, 0x0E  # submessages
-_ANYBODY = bytes(PREFIX_SIZE)  # as the addressee: all that receive it (8.3.7.6)
-_LITTLE_ENDIAN, _INLINE_QOS, _WITH_DATA = 0x01, 0x02, 0x04  # flags
-_PARTICIPANT, _PARTICIPANT_WRITER = b"\x00\x00\x01\xc1", b"\x00\x01\x00\xc2"
-_KEY_HASH, _STATUS_INFO, _SENTINEL, _DISCOVERY_LOCATOR = 0x70, 0x71, 0x01, 0x32
-_PARAMETERS_LITTLE_ENDIAN = b"\x00\x03"
-_DISPOSED_UNREGISTERED = b"\x00\x00\x00\x03"
-_PROTOCOL_VERSION, _VENDOR, _LEASE, _GUID, _DEFAULT_LOCATOR, _BUILTIN_ENDPOINTS = 0x15, 0x16, 0x02, 0x50, 0x31, 0x58
-_UDP_V4, _ANNOUNCER_AND_DETECTOR = 1, 0x03
-_LATE = 1 << 30  # sequence number: higher than that of any announcement that the participant made itself
 
 
 def discovery_port(domain: int, participant: int) -> int:
@@ -228,10 +210,7 @@ class Announcement:
 
 
 def read_announcement(datagram: bytes, reader: bytes | None = None) -> Announcement | None:
-    """The announcement in a datagram; None if there is none, or it is addressed to another one than the reader.
-
-    ``reader``: prefix of its GUID; what is addressed to it becomes an announcement to everybody.
-    """
+    """The announcement in a datagram, made one to everybody; None if there is none, or it is for another ``reader``."""
     if datagram[:4] != _MAGIC:
         return None
     with contextlib.suppress(struct.error):  # it is cut off
@@ -283,11 +262,7 @@ def _parameters(body: bytes, position: int) -> Iterator[tuple[int, int, int]]:
 
 
 def announcement_message(prefix: bytes, port: int, lease: int) -> bytes:
-    """The message by which a participant without endpoints announces itself.
-
-    ``prefix``: of its GUID, 12 bytes. ``port``: of the loopback address, for announcements of others. ``lease``: s
-    without a message after which others forget it.
-    """
+    """The message by which a participant without endpoints announces itself, with its port of the loopback address."""
     locator = struct.pack("<iI12x4s", _UDP_V4, port, socket.inet_aton(LOOPBACK))
     values = {
         _PROTOCOL_VERSION: _HEADER[4:6] + bytes(2),
@@ -316,28 +291,19 @@ def disposal_message(prefix: bytes, number: int = _LATE) -> bytes:
         + struct.pack("<HH", _SENTINEL, 0)
     )
     # Extra flags, octets to the inline QoS, any reader, the writer, its sequence number (high, low).
-    body = (
-        struct.pack("<HH4s4siI", 0, 16, bytes(4), _PARTICIPANT_WRITER, number >> 32, number & 0xFFFFFFFF) + parameters
-    )
+    body = struct.pack("<HH4s4siI", 0, 16, bytes(4), _PARTICIPANT_WRITER, 0, number) + parameters
     return _HEADER + prefix + struct.pack("<BBH", _DATA, _LITTLE_ENDIAN | _INLINE_QOS, len(body)) + body
 
 
 def remove_participant(prefix: bytes, domain: int, *, repeats: int = 3) -> None:
-    """Tell every participant on the hosts of the run that one has gone; on other machines its lease has to end.
-
-    ``repeats``: how often, since datagrams may be lost.
-    """
+    """Tell every participant on the hosts of the run that one has gone; on other machines its lease has to end."""
     addresses = {LOOPBACK, *os.environ.get(PEERS_VARIABLE, "").split()}
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for repeat in range(repeats):
+        for repeat in range(repeats):  # datagrams may be lost
             message = disposal_message(prefix, _LATE + repeat)
             for place in product(addresses, discovery_ports(domain)):
                 with contextlib.suppress(OSError):  # no participant there
                     sender.sendto(message, place)
-
-
-LOOPBACK_TIMEOUT = 1.0  # s; in the kernel, a message is there at once
-WORD = b"msg_agents"
 
 
 def require_loopback() -> None:
@@ -376,14 +342,9 @@ def _exchange(receiver: socket.socket, address: str) -> None:
             pass
 
 
-LOOPBACK_INTERFACES = ("lo", "lo0")  # on Linux, elsewhere
-
-
 def announce_here(datagram: bytes, domain: int) -> None:
-    """Send an announcement to the participants on this machine that receive a domain's group at an interface.
-
-    One of Cyclone DDS has no number by default, and discovers others only there.
-    """
+    """Send an announcement to the participants on this machine that receive a domain's group at an interface."""
+    # One of Cyclone DDS has no number by default, and discovers others only there.
     for index, name in socket.if_nameindex():
         if name in LOOPBACK_INTERFACES:  # the processes of the run receive the group there, and would all answer
             continue

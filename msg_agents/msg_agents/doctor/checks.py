@@ -14,9 +14,9 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from msg_agents.discovery.rtps import RELAYED_PROFILE
 from msg_agents.environment import (
@@ -40,16 +40,12 @@ Status = Literal["ok", "warning", "error"]  # error: a run cannot work
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One line of the doctor: what was found, and, unless it is ok, what to do."""
+    """One line of the doctor: what was found, and, unless it is ok, what to do; see docs/commands.md."""
 
     name: str
     status: Status
     text: str
     value: float | None = None  # what was measured, in the unit that docs/commands.md names
-
-    def to_json(self) -> dict[str, Any]:
-        """As docs/commands.md describes it."""
-        return asdict(self)
 
 
 def warn_if(name: str, warning: str | None, text: str, value: float | None = None) -> Check:
@@ -88,10 +84,9 @@ def check_cores() -> Check:
 def check_clock() -> Check:
     """How fine the clock is that wakes agents in real time."""
     resolution = max(time.get_clock_info(name).resolution for name in ("time", "monotonic"))
-    warning = None
-    if resolution > COARSE:
-        warning = f"resolution {resolution:g} s: agents in real time are late by so much: use `--pace lockstep`"
-    return warn_if("clock", warning, f"resolution {resolution:g} s", resolution)
+    text = f"resolution {resolution:g} s"
+    warning = f"{text}: agents in real time are late by so much: use `--pace lockstep`"
+    return warn_if("clock", warning if resolution > COARSE else None, text, resolution)
 
 
 def check_open_files() -> Check:
@@ -99,12 +94,11 @@ def check_open_files() -> Check:
     limit, hardest = resource.getrlimit(resource.RLIMIT_NOFILE)
     if limit == resource.RLIM_INFINITY:
         return Check("open_files", "ok", "no limit")
-    warning = None
-    if limit < FEW_FILES:
-        raisable = hardest == resource.RLIM_INFINITY or hardest >= FEW_FILES
-        remedy = f"`ulimit -n {FEW_FILES}`" if raisable else f"raise the hard limit, {hardest}, as root"
-        warning = f"at most {limit} in a process: too few for networks of many processes: {remedy}"
-    return warn_if("open_files", warning, f"at most {limit} in a process", limit)
+    text = f"at most {limit} in a process"
+    raisable = hardest == resource.RLIM_INFINITY or hardest >= FEW_FILES
+    remedy = f"`ulimit -n {FEW_FILES}`" if raisable else f"raise the hard limit, {hardest}, as root"
+    warning = f"{text}: too few for networks of many processes: {remedy}" if limit < FEW_FILES else None
+    return warn_if("open_files", warning, text, limit)
 
 
 def check_processes() -> Check:
@@ -112,10 +106,9 @@ def check_processes() -> Check:
     left = [limit - used for limit, used in (_limit_of_user(), _limit_of_container()) if limit is not None]
     if not left:
         return Check("processes", "ok", "no limit")
-    warning = None
-    if min(left) < FEW_PROCESSES:
-        warning = f"{min(left)} more can be started, threads included: raise `ulimit -u`, or pids.max of the container"
-    return warn_if("processes", warning, f"{min(left)} more can be started, threads included", min(left))
+    text = f"{min(left)} more can be started, threads included"
+    warning = f"{text}: raise `ulimit -u`, or pids.max of the container" if min(left) < FEW_PROCESSES else None
+    return warn_if("processes", warning, text, min(left))
 
 
 def _limit_of_user() -> tuple[int | None, int]:
@@ -135,10 +128,8 @@ def _limit_of_container() -> tuple[int | None, int]:
     """Limit (None: none) and use of the control group, where a container shows its own as the root of all."""
     for folder in (Path("/sys/fs/cgroup"), Path("/sys/fs/cgroup/pids")):
         with suppress(OSError, ValueError):  # "max" among others
-            return (
-                int((folder / "pids.max").read_text(encoding="ascii")),
-                int((folder / "pids.current").read_text(encoding="ascii")),
-            )
+            limit, used = (int((folder / f"pids.{what}").read_text(encoding="ascii")) for what in ("max", "current"))
+            return limit, used
     return None, 0
 
 
@@ -167,10 +158,9 @@ def check_temporary_directory() -> Check:
     except FileNotFoundError as error:
         return Check(name, "error", no_temporary_directory(error) or str(error))
     free = free_space(directory)
-    warning = None
-    if free < LITTLE_DISK:
-        warning = f"{directory}: {free / MEGABYTE:.0f} MB free: long runs need more: set TMPDIR to another directory"
-    return warn_if(name, warning, f"{directory}: {free / MEGABYTE:.0f} MB free", free)
+    text = f"{directory}: {free / MEGABYTE:.0f} MB free"
+    warning = f"{text}: long runs need more: set TMPDIR to another directory" if free < LITTLE_DISK else None
+    return warn_if(name, warning, text, free)
 
 
 def check_logs() -> Check:
@@ -178,19 +168,17 @@ def check_logs() -> Check:
     name, home, directory = "home", os.environ.get("HOME"), log_directory()
     if not can_log():
         what = f"{directory}: cannot be written" if directory else "HOME: not set"
-        return Check(
-            name,
-            "warning",
+        warning: str | None = (
             f"{what}: nodes of a run log into its temporary folder, other ROS 2 programs may not start: set HOME or "
-            f"{LOGS_VARIABLE} to a directory that can be written",
+            f"{LOGS_VARIABLE} to a directory that can be written"
         )
-    warning = None if home else f"HOME: not set (nodes log to {directory}): other programs may need it: set it"
+    else:
+        warning = None if home else f"HOME: not set (nodes log to {directory}): other programs may need it: set it"
     return warn_if(name, warning, f"{home}, nodes log to {directory}")
 
 
 PREFIXES_VARIABLE = "AMENT_PREFIX_PATH"
 PACKAGES = ("lib/python3*/site-packages", "local/lib/python3*/dist-packages", "lib/python3*/dist-packages")
-DEFAULT_MIDDLEWARE = "rmw_fastrtps_cpp"
 
 
 def check_rclpy() -> Check:
@@ -223,15 +211,13 @@ def _places() -> Iterator[Path]:
 
 def check_middleware() -> Check:
     """Whether that ROS 2 and its middleware can be loaded."""
-    name = "middleware"
-    wanted = os.environ.get("RMW_IMPLEMENTATION")
+    name, wanted, warning = "middleware", os.environ.get("RMW_IMPLEMENTATION"), None
     environment = node_environment(0, RELAYED_PROFILE) | other_logs(Path(tempfile.gettempdir()))
     if found := refusal(name, lambda: require_middleware(environment)):
         return found
-    warning = None
     if wanted and not wanted.startswith("rmw_fastrtps"):
         warning = (
             f"RMW_IMPLEMENTATION: {wanted}: the profiles of this project are for Fast DDS: processes look for each "
             "other, and may do so beyond this machine: unset it"
         )
-    return warn_if(name, warning, wanted or f"{DEFAULT_MIDDLEWARE} (RMW_IMPLEMENTATION is not set)")
+    return warn_if(name, warning, wanted or "rmw_fastrtps_cpp (RMW_IMPLEMENTATION is not set)")

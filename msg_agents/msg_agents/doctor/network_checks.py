@@ -46,6 +46,14 @@ PAIR = {
     "run": {"dt": 0.01, "duration": 1000, "start": "zero", "processes": 2},
 }
 PER_ROUND_TRIP = 2  # steps: an agent waits in each for a message that the other one sent in the step before
+VARIABLES_FILE = "FASTDDS_ENVIRONMENT_FILE"
+NOT_USED = (TRANSPORTS_VARIABLE, "CYCLONEDDS_URI")  # with the run's own profile of Fast DDS
+PEERS_VARIABLE = "ROS_STATIC_PEERS"
+RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
+UNAIDED = f"its processes look for each other, at most {MOST_UNAIDED} with agents"
+WANTED = 4 << 20  # bytes of a receive buffer, as in the profiles of Fast DDS
+LEAST = 212_992  # bytes, what Linux allows by default
+SHOWN = 5  # taken domains
 
 
 class _EnoughError(Exception):
@@ -76,31 +84,22 @@ class _Stopwatch(View):
 
 def check_round_trip() -> Check:
     """Whether two processes of a run hear each other, and how long a message takes there and back."""
-    name, watch = "round_trip", _Stopwatch()
+    name, watch, what = "round_trip", _Stopwatch(), ""
     try:
         result = run_network(Experiment.parse(PAIR), None, restarts=0, view=watch)
+        raise_for(result.interrupted_by)
+        what = next(iter(result.failures), "")
     except InputError as error:
         return Check(name, "error", str(error))
     except OSError as error:  # too few files or processes, a full disk
         return Check(name, "error", f"two processes could not be started: {error}: raise that limit")
     except _EnoughError:
-        failures = []
-    else:
-        raise_for(result.interrupted_by)
-        failures = result.failures
-    if failures or not watch.rate:
-        what = failures[0] if failures else f"not within {LIMIT:g} s"
+        pass
+    if what or not watch.rate:
         remedy = "do what the warnings above say, and see docs/troubleshooting.md"
-        return Check(name, "error", f"two processes exchange messages: {what}: {remedy}")
+        return Check(name, "error", f"two processes exchange messages: {what or f'not within {LIMIT:g} s'}: {remedy}")
     duration = PER_ROUND_TRIP / watch.rate
     return Check(name, "ok", f"{duration * 1e3:.2g} ms between two processes, computing included", duration)
-
-
-VARIABLES_FILE = "FASTDDS_ENVIRONMENT_FILE"
-NOT_USED = (TRANSPORTS_VARIABLE, "CYCLONEDDS_URI")  # with the run's own profile of Fast DDS
-PEERS_VARIABLE = "ROS_STATIC_PEERS"
-RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
-UNAIDED = f"its processes look for each other, at most {MOST_UNAIDED} with agents"
 
 
 def check_profiles() -> Check:
@@ -153,15 +152,9 @@ def check_peers() -> Check:
     """Other machines that are named."""
     peers = os.environ.get(PEERS_VARIABLE)
     alone = os.environ.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
-    warning = None
-    if peers and not alone:
-        warning = f"{PEERS_VARIABLE}: {peers}: nodes of a run contact these machines: unset it, or {RANGE_VARIABLE}"
-    return warn_if("static_peers", warning, f"{peers} (not used by a run on this machine)" if peers else "none")
-
-
-WANTED = 4 << 20  # bytes of a receive buffer, as in the profiles of Fast DDS
-LEAST = 212_992  # bytes, what Linux allows by default
-SHOWN = 5  # taken domains
+    warning = f"{PEERS_VARIABLE}: {peers}: nodes of a run contact these machines: unset it, or {RANGE_VARIABLE}"
+    text = f"{peers} (not used by a run on this machine)" if peers else "none"
+    return warn_if("static_peers", warning if peers and not alone else None, text)
 
 
 def check_loopback() -> Check:
@@ -171,23 +164,21 @@ def check_loopback() -> Check:
 
 def check_multicast() -> Check:
     """Whether ROS programs that find each other by multicast could do so here."""
-    warning = None
-    if not loopback_has_multicast():
-        warning = (
-            "not on the loopback interface: a run does not need it, but `ros2` tools and single nodes may not find "
-            "each other: `ip link set lo multicast on`, or set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST for them"
-        )
-    return warn_if("multicast", warning, "works on the loopback interface")
+    warning = (
+        "not on the loopback interface: a run does not need it, but `ros2` tools and single nodes may not find each "
+        "other: `ip link set lo multicast on`, or set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST for them"
+    )
+    return warn_if("multicast", None if loopback_has_multicast() else warning, "works on the loopback interface")
 
 
 def check_buffers() -> Check:
     """How much a socket keeps for a reader that is busy."""
+    sizes = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        sizes = {}
-        for name, option in (("rmem_max", socket.SO_RCVBUF), ("wmem_max", socket.SO_SNDBUF)):
+        for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
             probe.setsockopt(socket.SOL_SOCKET, option, WANTED)
-            sizes[name] = probe.getsockopt(socket.SOL_SOCKET, option) // 2  # Linux doubles what is asked for
-    return judge_buffers(**sizes)
+            sizes.append(probe.getsockopt(socket.SOL_SOCKET, option) // 2)  # Linux doubles what is asked for
+    return judge_buffers(*sizes)
 
 
 def judge_buffers(rmem_max: int, wmem_max: int) -> Check:
@@ -252,6 +243,7 @@ CHECKS: tuple[Callable[[], Check], ...] = (
     *(check_loopback, check_multicast, check_buffers),
     *(checks.check_rclpy, check_profiles, check_range, check_server, check_peers),
 )
+NOT_TRIED = "not tried: correct the errors above first"
 LATER = (  # each with the checks that it needs to be without an error
     ("middleware", checks.check_middleware, {"rclpy", "temporary_directory"}),
     ("ros_domain_id", check_own_domain, {"temporary_directory"}),
@@ -262,16 +254,9 @@ LATER = (  # each with the checks that it needs to be without an error
 def examine() -> Iterator[Check]:
     """Make one check after the other; the last ones are not tried where an error before says more."""
     failed: set[str] = set()
-    for check in CHECKS:
-        found = check()
-        failed |= {found.name} if found.status == "error" else set()
+    for name, make, needed in (*(("", check, set[str]()) for check in CHECKS), *LATER):
+        found = Check(name, "warning", NOT_TRIED) if needed & failed else make()
+        if found.status == "error":
+            failed.add(found.name)
         yield found
-    for name, make, needed in LATER:
-        found = _not_tried(name) if needed & failed else make()
-        failed |= {found.name} if found.status == "error" else set()
-        yield found
-    yield _not_tried("round_trip") if failed else check_round_trip()
-
-
-def _not_tried(name: str) -> Check:
-    return Check(name, "warning", "not tried: correct the errors above first")
+    yield Check("round_trip", "warning", NOT_TRIED) if failed else check_round_trip()

@@ -22,6 +22,7 @@ from msg_agents.nodes.ros import after
 from msg_agents.process_layout import RECORDER
 from msg_agents.recovery import Checkpoint, entry_size, published_size
 from msg_agents.stepping.monitoring import StallDetector
+from msg_agents.stepping.synchronizer import AgentInputs
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.protocols import ProtocolError
 from msg_analysis.messages import topics
@@ -42,14 +43,13 @@ ANSWER_PERIOD = 0.5  # s between two repetitions of states for peers
 
 
 class Agent(NetworkNode):
-    """Connects topics and law; the subclass for the pace decides when to step and with which inputs.
+    """Connects topics and law; the subclass for the pace decides when to step and with which inputs."""
 
-    Other agents read ``state``. Where that is not the exact state (broadcast noise, or a protocol that publishes only a
-    part of it), the exact one is published on ``truth``, for the log and the live node.
-    """
-
+    # Other agents read ``state``. Where that is not the exact state (broadcast noise, or a protocol that publishes only
+    # a part of it), the exact one is published on ``truth``, for the log and the live node.
     state_qos: Qos | None = None  # of its subscriptions to the states of others; None: that of the topic
     reads_batches = False  # whether it may receive them in the batches of their processes instead
+    values: AgentInputs[Any]  # what it has received and what its next step uses, as the pace wants it
 
     def __init__(
         self,
@@ -78,6 +78,13 @@ class Agent(NetworkNode):
         self._group = group
         self._inputs = [self._law.neighbours(mode) for mode in range(model.modes)]
         self._peers = list(peers)
+        self._options: dict[str, Any] = {
+            "agent": agent,
+            "steps": experiment.steps,
+            "inputs": self._inputs,
+            "peers": self._peers,
+            "start": self._law.step,
+        }
         local = set(peers).intersection(local_agents)
         self.remote = [j for j in peers if j not in local]
         self._local = [j for j in peers if j in local]
@@ -93,29 +100,12 @@ class Agent(NetworkNode):
         self._repeat_from: int | None = None  # step from which on states are to be repeated
         self._answered = -ANSWER_PERIOD  # time at which they were repeated last [s of the monotonic clock]
         self._states = self.publisher_of(topics.STATE, agent)
-        self._exact: Publisher | None = None
-        if experiment.truth:
-            self._exact = self.publisher_of(topics.TRUTH, agent)
+        self._exact: Publisher | None = self.publisher_of(topics.TRUTH, agent) if experiment.truth else None
 
     @property
     def number(self) -> int:
         """Its number, from 1."""
         return self._law.agent + 1
-
-    @property
-    def step(self) -> int:
-        """The current step."""
-        return self._law.step
-
-    def _options(self) -> dict[str, Any]:
-        """What AgentInputs takes."""
-        return {
-            "agent": self._law.agent,
-            "steps": self.record.experiment.steps,
-            "inputs": self._inputs,
-            "peers": self._peers,
-            "start": self._law.step,
-        }
 
     def connect(self, local_agents: Mapping[int, Agent]) -> None:
         """Connect to the peers in this process (by index) by direct calls."""
@@ -124,7 +114,9 @@ class Agent(NetworkNode):
     def subscribe_to_remote(self) -> None:
         """Connect to the peers in other processes by their topics."""
         for j in self.remote:
-            self._remote_states.append(self.subscribe(topics.STATE, self._receiver(j), agent=j, qos=self.state_qos))
+            refuse = partial(self.refuse, topic=topics.STATE.of(j))
+            take = state_receiver(self.record, j, self._frame, self.receive, refuse, possible=True)
+            self._remote_states.append(self.subscribe(topics.STATE, take, agent=j, qos=self.state_qos))
 
     def create_shared(self, agents: Sequence[Agent]) -> None:
         """Create what a process needs only once. Called on its first agent, with all its agents."""
@@ -179,18 +171,18 @@ class Agent(NetworkNode):
 
     def _take_over(self) -> bytes | None:
         """Resume from the last state that an earlier process published; its message, or None without one."""
-        published = self._published.read() if self._published.found else []
-        if published:
-            step, message = published[-1][0], self._parts(published[-1][1])[0]
-            frame = self._whole.unwrap(message)
-            if frame is None or frame[:2] != (self._law.agent + 1, step):
-                raise InputError(
-                    f"--checkpoint: the file of {self.get_name()} belongs to another run: remove it, or "
-                    "give another directory"
-                )
-            self._law.resume(step, frame[3])
-            return message
-        return None
+        if not self._published.found or not (published := self._published.read()):
+            return None
+        step, entry = published[-1]
+        message, _ = self._parts(entry)
+        frame = self._whole.unwrap(message)
+        if frame is None or frame[:2] != (self._law.agent + 1, step):
+            raise InputError(
+                f"--checkpoint: the file of {self.get_name()} belongs to another run: remove it, or "
+                "give another directory"
+            )
+        self._law.resume(step, frame[3])
+        return message
 
     def _publish_state(self, mode: int) -> None:
         law = self._law
@@ -209,10 +201,7 @@ class Agent(NetworkNode):
         return entry[:length], entry[length:]
 
     def _send(self, step: int, mode: int, state: bytes, message: bytes, value: bytes, *, to_peers: bool = True) -> None:
-        """Publish a state: exactly on ``truth``, if that topic is used, and to the others what they receive, ``value``.
-
-        Without ``to_peers``, to the recorder only.
-        """
+        """Publish a state as others receive it, and the exact one; without ``to_peers``, to the recorder only."""
         if self._exact is not None:
             if to_peers:
                 self.publish(self._exact, message)
@@ -234,13 +223,10 @@ class Agent(NetworkNode):
         return self._resumed is not None
 
     def resend(self, since: int) -> None:
-        """Repeat the states from step ``since`` on, for a peer that may have missed them, once all readers are there.
-
-        One that has come back, and asks, may not have been matched yet. Requests are latched, and may be old. In a
-        dense network after a stall, many ask: they are answered together.
-        """
+        """Repeat the states from step ``since`` on for a peer that may have missed them, once all readers are there."""
+        # One that has come back, and asks, may not have been matched yet. Requests are latched, and may be old.
         since = max(since, self._first_missed())
-        if self._repeat_from is not None:
+        if self._repeat_from is not None:  # in a dense network after a stall, many ask: they are answered together
             self._repeat_from = min(self._repeat_from, since)
             return
         self._repeat_from = since
@@ -258,10 +244,7 @@ class Agent(NetworkNode):
         self._repeat(since)
 
     def _repeat(self, since: int, peers_since: int = 0) -> None:
-        """Repeat the stored states from step ``since`` on, as they were published.
-
-        Those before ``peers_since`` go to the recorder only.
-        """
+        """Repeat the stored states from step ``since`` on; those before ``peers_since`` go to the recorder only."""
         for step, entry in self._published.read(since):
             message, value = self._parts(entry)
             frame = self._whole.unwrap(message)
@@ -279,13 +262,6 @@ class Agent(NetworkNode):
         """The first step whose state a peer may still need after a restart, of this agent or of itself."""
         raise NotImplementedError
 
-    def _receiver(self, peer: int) -> Callable[[bytes], None]:
-        """The callback for a peer's states."""
-        topic = topics.STATE.of(peer)
-        return state_receiver(
-            self.record, peer, self._frame, self.receive, lambda reason: self.refuse(reason, topic), possible=True
-        )
-
     def receive(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:
         """Take x_peer(step), from a topic or a direct call; the reason if refused, else None. ``peer``: from 0."""
         raise NotImplementedError
@@ -297,21 +273,23 @@ class Agent(NetworkNode):
     def end_at(self, step: int) -> None:
         """Make no step after this one: the run ends early. An agent that is beyond it stays where it is."""
         self._last = max(step, self._law.step)
-        self._limit_steps(self._last)
+        self.values.end_at(self._last)
         if self._law.step >= step:
             self._last_sent = time.monotonic()
             self._group.send_batches()
             self._report()
 
-    def _limit_steps(self, last: int) -> None:
-        """Make no step after this one."""
-        raise NotImplementedError
+    def advance(self) -> None:
+        """Make every step that can be made now; a protocol that fails ends the run."""
+        try:
+            self._make_steps()
+        except ProtocolError as error:
+            if not self.done.done():
+                traceback.print_exception(error, file=sys.stderr)  # in full in the log of the process
+            self._group.fail(error)
 
-    def _fail(self, error: ProtocolError) -> None:
-        """End the run, since a protocol has failed."""
-        if not self.done.done():
-            traceback.print_exception(error, file=sys.stderr)  # in full in the log of the process
-        self._group.fail(error)
+    def _make_steps(self) -> None:
+        raise NotImplementedError
 
     def _report(self) -> None:
         self._reported = self._law.step
@@ -319,9 +297,7 @@ class Agent(NetworkNode):
         self._next_progress = time.monotonic() + self._group.progress_period
 
     def _report_if_due(self) -> None:
-        """Report, unless that was just done; once more where nothing is new.
-
-        In one of some 600 networks of 90 processes, the switcher was not given the last reports of four.
-        """
+        """Report, unless that was just done; once more where nothing is new."""
+        # In one of some 600 networks of 90 processes, the switcher was not given the last reports of four.
         if time.monotonic() >= self._next_progress:
             self._report()

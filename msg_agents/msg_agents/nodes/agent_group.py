@@ -1,17 +1,13 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The agents of a process: states pass directly between them, and in batches to the recorder.
-
-A batch is a message with many states. Processes that need most of the states of a network read them, too.
-"""
+"""The agents of a process: states pass directly between them, and in batches (messages with many) to the recorder."""
 
 from __future__ import annotations
 
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from rclpy.publisher import Publisher
@@ -32,12 +28,14 @@ from msg_analysis.messages.topics import STATE, STATES, Topic, agent_node_name
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import Wiring
 
+# Bytes after which a batch is sent. Before the agents wait for a recorder that has stopped, the middleware keeps 680
+# batches for it by our profiles for one machine, and 5,000 by others: 40 MB in either case. One fits into a datagram.
 BATCH_SIZE, SMALL_BATCH_SIZE = 60_000, 2**13
-"""Bytes after which a batch is sent. Before the agents wait for a recorder that has stopped, the middleware keeps 680
-batches for it by our profiles for one machine, and 5,000 by others: 40 MB in either case. One fits into a datagram."""
-
 BATCH_TIME = 0.1  # s of wall time after which a batch is sent with the next state, however small it is
 SEND_PERIOD = 0.5  # s of wall time after which it is sent in any case
+ONLY_TOPICS = "MSG_AGENTS_ONLY_TOPICS"  # variable that turns this off where it is set, for comparison
+FEWEST = 16  # agents elsewhere that a process must need to read batches: fewer topics cost little, and ROS shows them
+FRESH = 0.02  # s for which what was found out about other processes is not looked up again
 
 
 class StateBatches:
@@ -70,42 +68,22 @@ class StateBatches:
             self._size = 0
             self._node.publish(self.publisher, batch)
 
-    def missing_nodes(self) -> list[str]:
-        """The recorder, until it has been discovered."""
+    def recorder_found(self) -> bool:
+        """Whether the recorder has been discovered."""
         self._found = self._found or self._node.has_readers(self.publisher, [RECORDER])
-        return [] if self._found else [RECORDER]
-
-
-ONLY_TOPICS = "MSG_AGENTS_ONLY_TOPICS"  # variable that turns this off where it is set, for comparison
-FEWEST = 16
-"""Agents of other processes whose states a process must need to read batches: below, it reads a topic of each, which is
-seen in the ROS graph, and costs little."""
-
-FRESH = 0.02  # s for which what was found out about other processes is not looked up again
-
-
-@dataclass(frozen=True, slots=True)
-class Listener:
-    """An agent of this process that receives the states of one of another process."""
-
-    receive: Callable[[int, int, int, bytes, bytes], str | None]  # see ``Agent.receive``
-    refuse: Callable[[str, str], None]  # see ``NetworkNode.refuse``
+        return self._found
 
 
 def reads_most(remote: int, others: int) -> bool:
-    """Whether a process that needs ``remote`` of ``others`` agents in other processes is to read the batches of all.
-
-    It then reads at most twice as many states as it needs, in as many messages as there are processes.
-    """
+    """Whether a process that needs ``remote`` of ``others`` agents in other processes is to read the batches of all."""
+    # It reads at most twice as many states as it needs, in as many messages as there are processes.
     return remote >= FEWEST and 2 * remote > others and ONLY_TOPICS not in os.environ
 
 
 class BatchLinks:
-    """Of one process, on the node ``host``: whose batches it reads, and which processes read those it publishes.
+    """Of one process, on the node ``host``: whose batches it reads, and which processes read those it publishes."""
 
-    Processes are distinguished by the GUIDs of their endpoints: nodes do not publish which agents they run with.
-    """
-
+    # Processes are distinguished by the GUIDs of their endpoints: nodes do not publish which agents they run with.
     def __init__(self, host: NetworkNode, publisher: Publisher, agents: Iterable[int]) -> None:
         self._host = host
         self._publisher = publisher
@@ -113,13 +91,13 @@ class BatchLinks:
         self._names = [STATE.of(agent) for agent in range(host.record.experiment.agents)]
         self._frame = state_frame(host.record, whole=False)
         self._graphs = len(host.record.experiment.graph_list)
-        self._listeners: Mapping[int, Sequence[Listener]] = {}
+        self._listeners: Mapping[int, Sequence[Agent]] = {}  # of this process, by the agent that they hear
         self._subscription: Subscription | None = None
         self.read = False  # whether another process has ever been found to read the batches of this one
         self._reached: frozenset[str] = frozenset()
         self._looked = -FRESH
 
-    def listen(self, listeners: Mapping[int, Sequence[Listener]]) -> bool:
+    def listen(self, listeners: Mapping[int, Sequence[Agent]]) -> bool:
         """Read the states of these agents (indices from 0) in batches, if that pays; otherwise False."""
         if not reads_most(len(listeners), len(self._others)):
             return False
@@ -182,12 +160,10 @@ class BatchLinks:
         listeners = self._listeners.get(number - 1)
         if not listeners:  # of this process, or of no interest to it
             return
-        topic = self._names[number - 1]
         fault = fault_of(step, mode, state, self._graphs)
         for listener in listeners:
-            reason = fault or listener.receive(number - 1, step, mode, state, message)
-            if reason:
-                listener.refuse(reason, topic)
+            if reason := fault or listener.receive(number - 1, step, mode, state, message):
+                listener.refuse(reason, self._names[number - 1])
 
 
 AGENTS: dict[str, type[Agent]] = {"lockstep": LockstepAgent, "realtime": RealtimeAgent}  # by pace
@@ -200,7 +176,6 @@ class AgentGroup:
 
     # Every endpoint is announced to every process. So what agents can share exists once per group, on the node of its
     # first agent: graph, progress, end, resend.
-
     def __init__(
         self,
         *,
@@ -231,12 +206,20 @@ class AgentGroup:
         self._host = self.nodes[0]
         self.states = StateBatches(self._host, topics.STATES)  # as other agents receive them
         self.links = BatchLinks(self._host, self.states.publisher, agents)
-        self._connect()
+        listeners: dict[int, list[Agent]] = {}
+        for agent in self.nodes:
+            agent.connect(self._agents)
+            for j in agent.remote:
+                listeners.setdefault(j, []).append(agent)
+        if not (self._host.reads_batches and self.links.listen(listeners)):
+            for agent in self.nodes:
+                agent.subscribe_to_remote()
         self._host.create_shared(self.nodes)
         self._progress = self._host.publisher_of(topics.PROGRESS)
         self._awaits_recorder = RECORDER in readers
         exact = record.experiment.truth  # whether the exact states are others
         self.exact_states = StateBatches(self._host, topics.TRUTHS) if exact else None
+        self._batches = [each for each in (self.states, self.exact_states) if each]
         self._resend: Publisher | None = None
         self._sending = False  # whether ``_send_states`` will be called
         self._asked: dict[int, int] = {}  # agents (from 0) that are to be asked for their states from a step on
@@ -247,16 +230,6 @@ class AgentGroup:
         if record.until:
             self._host.subscribe(topics.STOP, self._receive_stop)
         self._host.finish_at_end(self.nodes)
-
-    def _connect(self) -> None:
-        listeners: dict[int, list[Listener]] = {}
-        for agent in self.nodes:
-            agent.connect(self._agents)
-            for j in agent.remote:
-                listeners.setdefault(j, []).append(Listener(agent.receive, agent.refuse))
-        if not (self._host.reads_batches and self.links.listen(listeners)):
-            for agent in self.nodes:
-                agent.subscribe_to_remote()
 
     def _end_turns(self) -> None:
         if self.links.read and not self._sending:  # other processes wait for these states
@@ -276,24 +249,20 @@ class AgentGroup:
             agent.fail(error)
 
     def record_contradiction(self, message: bytes, state: bytes) -> None:
-        """Send the recorder both states of one step that an agent has received: this message, and another ``state``.
-
-        One of them is forged, and nobody can know which: with both in the bag, the step counts as missing.
-        """
+        """Send the recorder both states of one step that an agent has received: this message, and another ``state``."""
+        # One of them is forged, and nobody can know which: with both in the bag, the step counts as missing.
         self.states.add(with_state(message, state))
         self.states.add(message)
 
     def send_batches(self) -> None:
         """Send to the recorder at once what has been collected for it."""
-        for batches in (self.states, self.exact_states):
-            if batches is not None:
-                batches.send()
+        for batches in self._batches:
+            batches.send()
 
     def missing_recorder(self) -> list[str]:
         """The recorder, if it is awaited and has not been discovered."""
-        if not self._awaits_recorder:
-            return []
-        return self.states.missing_nodes() + (self.exact_states.missing_nodes() if self.exact_states else [])
+        missing = self._awaits_recorder and not all(batches.recorder_found() for batches in self._batches)
+        return [RECORDER] if missing else []
 
     def report(self, agent: int, step: int) -> None:
         """Tell the switcher which step an agent (index from 0) has reached."""
@@ -330,8 +299,8 @@ class AgentGroup:
                 agent.end_at(stop.step)
 
     def _receive_graph(self, data: bytes) -> None:
-        self._host.rules.forget(min(agent.step for agent in self.nodes))
-        graph = self._host.decode_graph(data)
+        self._host.rules.forget(min(agent.values.step for agent in self.nodes))
+        graph = self._host.accepted(self._host.rules.graph(data), topics.GRAPH)
         if graph is None:
             return
         # Agents that take over are at different steps: what is new to one may be known to another.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.duration import Duration
-from rclpy.node import Node, NodeNameNonExistentError
+from rclpy.node import NodeNameNonExistentError
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.task import Future
@@ -24,7 +24,7 @@ from rclpy.task import Future
 from msg_agents.environment import discovery_scope
 from msg_agents.nodes.ros import LeanNode, every, until_shutdown
 from msg_agents.process_layout import RECORDER, SWITCHER
-from msg_agents.run.result import write_status
+from msg_agents.run.result import write_report
 from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.errors import InputError
 from msg_analysis.messages import topics
@@ -35,6 +35,12 @@ from msg_analysis.model.run_record import RunRecord
 
 DIAGNOSTICS_PERIOD = 1.0  # s
 CLOCK_BOUND = "clock ahead of the switcher's by at most [ms]"  # a value of agents in real time
+ACK_TIMEOUT = 4.0  # s for readers to acknowledge the last messages; more than Fast DDS's default heartbeat period, 3 s
+BARE = "_CREATED_BY_BARE_DDS_APP_"  # name of the node of a reader whose participant has no known nodes
+NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
+Message = TypeVar("Message", ActiveGraph, Progress)
+CHECK_PERIOD = 1.0  # s between two checks
+SHUTDOWN_TIMEOUT = 2.0  # s that the others have to acknowledge that this process leaves
 
 
 @dataclass(slots=True)
@@ -45,18 +51,14 @@ class Health:
     waiting: bool = False  # cannot continue, or cannot keep up, at present
     values: dict[str, str] = field(default_factory=dict)
 
-    def to_status(self, node: Node, refused: Mapping[tuple[str, str], int], repeated: int) -> DiagnosticStatus:
-        """The diagnostic message about a node; ``refused`` counts messages by (topic, reason).
-
-        Refused messages are a warning: other nodes publish on the topics of the run.
-        """
-        warn = self.waiting or bool(refused)
-        counts = {f"refused on {topic}: {reason}": str(count) for (topic, reason), count in refused.items()}
+    def to_status(self, node: NetworkNode) -> DiagnosticStatus:
+        """The diagnostic message about a node."""
+        counts = {f"refused on {topic}: {reason}": str(count) for (topic, reason), count in node.refused.items()}
         values = self.values | counts
-        if repeated:
-            values[Refusal.REPEATED] = str(repeated)
-        return DiagnosticStatus(
-            level=DiagnosticStatus.WARN if warn else DiagnosticStatus.OK,
+        if node.repeated:
+            values[Refusal.REPEATED] = str(node.repeated)
+        return DiagnosticStatus(  # refused messages are a warning: other nodes publish on the topics of the run
+            level=DiagnosticStatus.WARN if self.waiting or node.refused else DiagnosticStatus.OK,
             name=f"{node.get_fully_qualified_name().lstrip('/')}: network",
             message=self.message,
             hardware_id="",
@@ -64,17 +66,8 @@ class Health:
         )
 
 
-ACK_TIMEOUT = 4.0  # s for readers to acknowledge the last messages; more than Fast DDS's default heartbeat period, 3 s
-BARE = "_CREATED_BY_BARE_DDS_APP_"  # name of the node of a reader whose participant has no known nodes
-NOT_AN_AGENT = 0  # in Progress: the recorder or the switcher
-Message = TypeVar("Message", ActiveGraph, Progress)
-
-
 class NetworkNode(LeanNode):
-    """A node of a run, whose id is in every message. ``done`` ends the node, with an error or without.
-
-    InputError: arguments of ROS 2 changed its name, by which the nodes of a run find each other.
-    """
+    """A node of a run, whose id is in every message. ``done`` ends the node, with an error or without."""
 
     def __init__(self, name: str, *, record: RunRecord) -> None:
         super().__init__(name)
@@ -89,14 +82,10 @@ class NetworkNode(LeanNode):
         self.done: Future = Future()
         self.refused: Counter[tuple[str, str]] = Counter()  # by topic and reason
         self.repeated = 0
-        self._ending: list[NetworkNode] = [self]
 
     def refuse(self, reason: str, topic: str) -> None:
-        """Count a message that is not part of this run, and warn at the first one per topic and reason.
-
-        Repeated messages are only counted: agents send again what a restarted one may have missed.
-        """
-        if reason == Refusal.REPEATED:
+        """Count a message that is not part of this run, and warn at the first one per topic and reason."""
+        if reason == Refusal.REPEATED:  # only counted: agents send again what a restarted one may have missed
             self.repeated += 1
             return
         self.refused[topic, reason] += 1
@@ -118,7 +107,7 @@ class NetworkNode(LeanNode):
 
     def discovered_all(self) -> bool:
         """Whether all nodes that should read what this node publishes have been discovered; polled."""
-        return True
+        return not self.missing_nodes()
 
     @property
     def resumed(self) -> bool:
@@ -153,10 +142,8 @@ class NetworkNode(LeanNode):
         return [name for name in self._own_names() if count[name] > 1]
 
     def undiscovered(self, expected: Iterable[str]) -> list[str]:
-        """Those of the expected nodes that are not there: nodes of the run in its namespace, others in any.
-
-        Recorders such as that of ``ros2 bag record`` are always in the namespace /.
-        """
+        """Those of the expected nodes that are not there: nodes of the run in its namespace, others in any."""
+        # Recorders such as that of ``ros2 bag record`` are always in the namespace /.
         here, everywhere = self.names_in_namespace(), set(self.get_node_names())
         own = set(self._own_names())
         return [name for name in expected if name not in (here if name in own else everywhere)]
@@ -172,10 +159,7 @@ class NetworkNode(LeanNode):
         """Start: all nodes have been discovered."""
 
     def finish(self, *, complete: bool, deadline: float) -> None:
-        """The process is about to end; ``complete``: the node has done its part (False: it was interrupted).
-
-        It may wait for other nodes until ``deadline`` [s of the monotonic clock].
-        """
+        """The process is about to end, its part ``complete`` or not; it may wait until ``deadline`` [s, monotonic]."""
 
     def fail(self, error: Exception) -> None:
         """End the process with an error."""
@@ -183,33 +167,29 @@ class NetworkNode(LeanNode):
             self.done.set_exception(error)
 
     def finish_at_end(self, nodes: Iterable[NetworkNode] | None = None) -> None:
-        """End these nodes of the process (default: this one) when the switcher announces the end of the run.
+        """End these nodes of the process (default: this one) when the switcher announces the end of the run."""
+        # With a node that ends earlier, unread messages or acknowledgements that others need would be lost.
+        ending = [self] if nodes is None else list(nodes)
 
-        With a node that ends earlier, unread messages or acknowledgements that others need would be lost.
-        """
-        self._ending = [self] if nodes is None else list(nodes)
-        self.subscribe(topics.END, self._receive_end)
+        def receive(data: bytes) -> None:
+            if self.decode_progress(data, topics.END):
+                for node in ending:
+                    if not node.done.done():
+                        node.done.set_result(None)
 
-    def _receive_end(self, data: bytes) -> None:
-        if self.decode_progress(data, topics.END):
-            for node in self._ending:
-                if not node.done.done():
-                    node.done.set_result(None)
+        self.subscribe(topics.END, receive)
 
     @cached_property
     def rules(self) -> RunRules:
         """Which messages belong to the run."""
         return RunRules(self.record)
 
-    def decode_graph(self, data: bytes) -> ActiveGraph | None:
-        """A sojourn of the graph of this run; None, and counted, if the bytes are not one."""
-        return self._accepted(self.rules.graph(data), topics.GRAPH)
-
     def decode_progress(self, data: bytes, topic: Topic) -> Progress | None:
-        """The same of Progress, on one of its topics."""
-        return self._accepted(self.rules.progress(data, topic), topic)
+        """A message of this run, on one of its topics; None, and counted, if the bytes are not one."""
+        return self.accepted(self.rules.progress(data, topic), topic)
 
-    def _accepted(self, found: Message | str, topic: Topic) -> Message | None:
+    def accepted(self, found: Message | str, topic: Topic) -> Message | None:
+        """What ``rules`` give for a message; None, and counted, if it is the reason of a refusal."""
         if isinstance(found, str):
             self.refuse(found, topic.name)
             return None
@@ -234,10 +214,8 @@ class NetworkNode(LeanNode):
         )
 
     def _announced_reader(self, name: str, topic: str) -> bool:
-        """Whether a node of this name has announced a reader of a topic that is known.
-
-        From Fast DDS 3 on, readers of Cyclone DDS have no node: it does not repeat to which participant each belongs.
-        """
+        """Whether a node of this name has announced a reader of a topic that is known."""
+        # From Fast DDS 3 on, readers of Cyclone DDS have no node: it does not repeat to which participant each belongs.
         for node, namespace in self.get_node_names_and_namespaces():
             if node == name:
                 with contextlib.suppress(NodeNameNonExistentError):  # it has just left
@@ -262,12 +240,9 @@ class NetworkNode(LeanNode):
 
 
 class HealthReporter:
-    """Publishes the health of all nodes of a process once a second, and writes its status file.
+    """Publishes the health of all nodes of a process once a second, and writes its status file, if it has one."""
 
-    The nodes need a method ``health() -> Health`` and the counters ``refused`` and ``repeated``.
-    """
-
-    def __init__(self, nodes: Sequence[LeanNode], status_file: Path | None = None) -> None:
+    def __init__(self, nodes: Sequence[NetworkNode], status_file: Path | None) -> None:
         self._nodes = nodes
         self._status_file = status_file
         self._waiting: dict[str, str] = {}
@@ -276,9 +251,7 @@ class HealthReporter:
 
     def _report(self) -> None:
         healths = [(node, node.health()) for node in self._nodes]
-        array = DiagnosticArray(
-            status=[health.to_status(node, node.refused, node.repeated) for node, health in healths]
-        )
+        array = DiagnosticArray(status=[health.to_status(node) for node, health in healths])
         array.header.stamp = self._nodes[0].get_clock().now().to_msg()
         with until_shutdown(self._nodes[0]):
             self._publisher.publish(array)
@@ -289,11 +262,7 @@ class HealthReporter:
         """Write the status file atomically, if there is one."""
         if self._status_file is not None:
             refused = [(node.get_name(), *what, count) for node in self._nodes for what, count in node.refused.items()]
-            write_status(self._status_file, refused, self._waiting)
-
-
-CHECK_PERIOD = 1.0  # s between two checks
-SHUTDOWN_TIMEOUT = 2.0  # s that the others have to acknowledge that this process leaves
+            write_report(self._status_file, {"refused": refused, "waiting": self._waiting})
 
 
 class PeersLostError(InputError):
@@ -301,14 +270,11 @@ class PeersLostError(InputError):
 
 
 class PeerPresence:
-    """Ends the process of some nodes when one of the required peers of the first has been gone for ``timeout`` s.
+    """Ends the process of some nodes when one of the required peers of the first has been gone for ``timeout`` s."""
 
-    A peer is gone when it has left the network or its lease has ended; the timeout allows for a restart. One that has
-    said that it leaves does not come back. (RTPS says that once, best effort, so it is not enough.)
-    """
-
-    # On one machine the supervisor ends all processes when one is lost; across hosts nothing else does.
-
+    # On one machine the supervisor ends all processes when one is lost; across hosts nothing else does. A peer is gone
+    # when it has left the network or its lease has ended; the timeout allows for a restart. One that has said that it
+    # leaves does not come back. (RTPS says that once, best effort, so it is not enough.)
     def __init__(self, nodes: Sequence[NetworkNode], timeout: float) -> None:
         self._nodes, self._node, self._timeout = nodes, nodes[0], timeout
         self._since: dict[str, float] = {}  # monotonic time [s] since which a peer is gone, by name
@@ -323,8 +289,7 @@ class PeerPresence:
 
     def leave(self) -> None:
         """Say that this process leaves before the end of the run."""
-        numbers = {node.number for node in self._nodes}
-        for number in numbers:
+        for number in {node.number for node in self._nodes}:
             self._node.publish(self._publisher, self._node.progress(topics.LEAVE, number, 0))
         self._publisher.wait_for_all_acked(Duration(seconds=SHUTDOWN_TIMEOUT))
 
@@ -343,7 +308,9 @@ class PeerPresence:
         now = time.monotonic()
         gone = self._node.undiscovered(required)
         if gone:
-            self._announce_again()
+            # Make ROS send the others the names of our nodes, as with every new endpoint: a node whose lease for us had
+            # ended does not ask for them, and to a reader that it takes for a known one, DDS repeats nothing.
+            self._node.destroy_publisher(self._node.publisher_of(topics.LEAVE))
         if self._since.keys() - gone:
             self._returning = list(self._nodes)
         self._since = {name: self._since.get(name, now) for name in gone}
@@ -351,17 +318,6 @@ class PeerPresence:
         if now - min(self._since.values(), default=now) > self._timeout:
             self._fail(list(self._since), f" and did not return within {self._timeout:g} s")
 
-    def _announce_again(self) -> None:
-        """Make ROS send the others the names of our nodes: a node whose lease for us had ended does not ask for them.
-
-        It does so with every new endpoint; to a reader that it takes for a known one, DDS repeats nothing.
-        """
-        self._node.destroy_publisher(self._node.publisher_of(topics.LEAVE))
-
     def _fail(self, names: Sequence[str], more: str) -> None:
-        self._node.fail(
-            PeersLostError(
-                f"{', '.join(names)} left the network before the end of the run{more}: see the messages on the host "
-                "that runs it"
-            )
-        )
+        words = f"{', '.join(names)} left the network before the end of the run{more}"
+        self._node.fail(PeersLostError(f"{words}: see the messages on the host that runs it"))

@@ -34,16 +34,13 @@ GRACE = 20.0  # s that a process has to end
 
 
 def describe(arguments: Mapping[str, tuple[str, str]], start: Any) -> LaunchDescription:
-    """The description of a launch file: default and description of its arguments, then what ``start`` makes of them.
-
-    ``start`` takes their values by name. An exception in it ends the launch with exit code 1.
-    """
+    """The description of a launch file: arguments, with default and description, and what ``start`` makes of them."""
 
     def begin(context: LaunchContext) -> list[Action]:
         check_names(context, list(arguments))
         values = {name: LaunchConfiguration(name).perform(context) for name in arguments}
         shutdown = flag(values, "shutdown")
-        return _Group(start(values), shutdown=shutdown).actions()
+        return _Group(start(values), shutdown=shutdown).actions()  # an exception: the exit code of launch is 1
 
     declared = [
         DeclareLaunchArgument(name, default_value=default, description=description)
@@ -53,10 +50,7 @@ def describe(arguments: Mapping[str, tuple[str, str]], start: Any) -> LaunchDesc
 
 
 class _Group:
-    """Processes that are started together; other ones of the same launch are left alone, unless ``shutdown``.
-
-    A launch in which nothing else runs ends by itself when they have ended.
-    """
+    """Processes that are started together; other ones of the same launch are left alone, unless ``shutdown``."""
 
     def __init__(self, launched: LaunchedProcesses, *, shutdown: bool) -> None:
         self._launched = launched
@@ -127,10 +121,8 @@ class _Group:
         return []
 
     def _failure(self) -> Action:
-        """The last error that launch prints, and a failure as its exit code.
-
-        Raised as an event of its own: an exception keeps other handlers from seeing the event that it is raised for.
-        """
+        """The last error that launch prints, and a failure as its exit code."""
+        # As an event of its own: an exception keeps other handlers from seeing the event that it is raised for.
 
         def fail(_: LaunchContext) -> None:
             raise LaunchFailedError(self._launched.reason)

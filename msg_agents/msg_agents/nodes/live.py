@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from msg_agents_interfaces.msg import Estimate as EstimateMsg
@@ -35,20 +36,17 @@ class Watched:
     report: LiveReport
     finished: bool  # followed to its last step
     steps: list[int]  # newest step of each agent that has arrived, by index; -1: none
-    last_step: int  # of the run, as far as it is known that it ends early
+    last_step: int  # see ``Watcher``
 
 
 class Live(Watcher):
-    """Reads the states of the run whose record is given, or of the first network, and publishes its running estimates.
-
-    With ``reliable`` it misses no state, and the network waits for this node where it is too slow.
-    """
+    """Reads the states of the run whose record is given, or of the first one, and publishes its running estimates."""
 
     def __init__(
         self,
         *,
-        reliable: bool,
-        record: RunRecord | None = None,
+        reliable: bool,  # miss no state: the network waits for this node where it is too slow
+        record: RunRecord | None,
         on_report: Callable[[Watched, float], None],  # the float: steps per second
         on_note: Callable[[str], None],
     ) -> None:
@@ -134,13 +132,9 @@ class Live(Watcher):
         with until_shutdown(self):
             self._writer.publish(self._message(watched))
         self._on_report(watched, (newest - before) / max(now - then, 1e-9) if before >= 0 else 0.0)
-        last = self.last_step
         self._silent = self._silent + 1 if newest == before else 0
-        # All states have arrived, or no more will, because the run has ended or its publishers have gone.
         quiet = self._silent >= (1 if newest >= 0 else MOST_SILENT)
-        over = self._estimate.steps.whole >= last or (quiet and (self._ended or not self._has_publishers()))
-        if over and not self.done.done():
-            self.done.set_result(None)
+        self._finish_if_over(all_there=self._estimate.steps.whole >= self.last_step, quiet=quiet)
 
     def take_outcome(self) -> None:
         """See Watcher."""
@@ -149,7 +143,7 @@ class Live(Watcher):
     def _message(self, watched: Watched) -> EstimateMsg:
         report = watched.report
         seconds, nanoseconds = divmod(self._clock_of_steps.nanoseconds(max(report.last, 0)), SECOND)
-        message = EstimateMsg(
+        return EstimateMsg(
             header=Header(stamp=Time(sec=seconds, nanosec=nanoseconds)),
             run=list(watched.record.run.bytes),
             first_step=max(report.first, 0),
@@ -158,11 +152,10 @@ class Live(Watcher):
             node_errors=[_number(node.measured) for node in report.nodes],
             node_predicted=[_number(node.predicted) for node in report.nodes],
             node_standard_errors=[_number(node.standard_error) for node in report.nodes],
+            system_error=_number(report.system.measured),
+            system_predicted=_number(report.system.predicted),
+            system_standard_error=_number(report.system.standard_error),
         )
-        message.system_error = _number(report.system.measured)
-        message.system_predicted = _number(report.system.predicted)
-        message.system_standard_error = _number(report.system.standard_error)
-        return message
 
 
 def _number(value: float | None) -> float:
@@ -173,21 +166,10 @@ def watch(
     *,
     reliable: bool = False,
     record: RunRecord | None = None,  # None: of the topic ``experiment``
-    timeout: float | None = None,  # s to wait for a network; None: no limit
     on_report: Callable[[Watched, float], None] = lambda *_: None,
-    on_note: Callable[[str], None] = lambda _: None,  # while there is no network
     on_event: Callable[[str], None] = lambda _: None,  # about the network
-    on_look: Callable[[], None] = lambda: None,  # called a few times a second
+    **options: Any,  # of ``run_watcher``
 ) -> Watched | None:
-    """Watch a network until it is over or a signal ends it; what was seen, or None without a network.
-
-    If the run is over, the node still exists: end the process at once. InputError: no network in time, or its
-    prediction fails.
-    """
-    node = run_watcher(
-        lambda: Live(reliable=reliable, record=record, on_report=on_report, on_note=on_event),
-        timeout=timeout,
-        on_note=on_note,
-        on_look=on_look,
-    )
+    """Watch a network; what was seen, or None without a network."""
+    node = run_watcher(lambda: Live(reliable=reliable, record=record, on_report=on_report, on_note=on_event), **options)
     return node and node.outcome

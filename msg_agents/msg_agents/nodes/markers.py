@@ -47,10 +47,7 @@ def colour(value: float) -> Colour:
 
 
 class Markers(Watcher):
-    """Draws the newest state of every agent, and the links of the step that led to it.
-
-    ``rate``: pictures per second of wall time. ``replica`` counts from 0. ``frame``: frame id of the markers.
-    """
+    """Draws the newest state of every agent, and the links of the step that led to it; ``replica`` counts from 0."""
 
     ack_timeout = 2.0
 
@@ -81,7 +78,7 @@ class Markers(Watcher):
         self._moved = time.monotonic()
         every(self, 1.0 / self._rate, self._draw)
 
-    def _take(self, agent: int, step: int, mode: int, state: bytes, message: bytes) -> None:  # noqa: ARG002  see Watcher
+    def _take(self, agent: int, step: int, mode: int, state: bytes, message: bytes) -> None:  # noqa: ARG002
         self._newest[agent] = message
 
     def _draw(self) -> None:
@@ -93,9 +90,7 @@ class Markers(Watcher):
             with until_shutdown(self):
                 self._writer.publish(self._picture(states))
         quiet = time.monotonic() - self._moved > SILENT_TIME
-        over = min(steps) >= self.last_step or (quiet and (self._ended or not self._has_publishers()))
-        if over and not self.done.done():
-            self.done.set_result(None)
+        self._finish_if_over(all_there=min(steps) >= self.last_step, quiet=quiet)
 
     def _picture(self, states: Sequence[AgentState | None]) -> MarkerArray:
         markers = [self._agents(states), self._edges(states), self._title(states)]
@@ -180,10 +175,7 @@ def show_markers(
     timeout: float | None = None,  # s to wait for a network; None: no limit
     on_note: Callable[[str], None] = lambda _: None,
 ) -> bool:
-    """Publish markers of the network until it is over or a signal ends it; whether it was seen to be over.
-
-    In that case the node still exists: end the process at once. InputError: no network in time, or no such replica.
-    """
+    """Publish markers of the network as ``run_watcher`` does; whether it was seen to be over."""
     node = run_watcher(
         lambda: Markers(rate=rate, replica=replica, frame=frame, on_note=on_note), timeout=timeout, on_note=on_note
     )

@@ -15,10 +15,9 @@ from msg_agents.nodes.base import CLOCK_BOUND, Health
 from msg_agents.nodes.ros import DueTimer, after
 from msg_agents.nodes.switcher import EPOCH_DELAY
 from msg_agents.stepping.newest_values import CLOCK_MARGIN, NewestReceived, NewestValues, Schedule
-from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, NOTHING, DelayedSynchronizer, Synchronizer
+from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, NOTHING, Synchronizer
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.protocols import ProtocolError
 from msg_analysis.messages import topics
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.messages import ActiveGraph, stamp_ns
@@ -35,13 +34,11 @@ class LockstepAgent(Agent):
         super().__init__(**options)
         self._turns = self._group.turns
         self._will_report = False  # whether ``_report_later`` will be called
-        reception, options = self._law.air, self._options()
-        self._synchronizer: Synchronizer[bytes]
+        reception, options = self._law.air, self._options
         if reception and reception.looks_back:
             self._require_stored_values(reception)
-            self._synchronizer = DelayedSynchronizer(needed=reception.needed, delay=reception.delay, **options)
-        else:
-            self._synchronizer = Synchronizer(**options)
+            options |= {"needed": reception.needed, "delay": reception.delay}
+        self.values: Synchronizer[bytes] = Synchronizer(**options)
 
     def _require_stored_values(self, reception: AgentAir) -> None:
         """InputError if the agent comes back, and its peers have no longer a value that it was holding."""
@@ -70,47 +67,36 @@ class LockstepAgent(Agent):
         if step > self._reported or stall.stalled:
             self._report_if_due()  # a channel that follows the graph opens the link that this agent waits for
         values = {"step": str(step), "steps per second": f"{stall.rate:.1f}"}
-        if self._synchronizer.finished:
+        if self.values.finished:
             return Health("has made all steps", values=values)
         if not stall.stalled:
             return Health(f"at step {step}", values=values)
-        waiting = self._synchronizer.waiting_for()
+        waiting = self.values.waiting_for()
         if overdue and step == 0 and self.get_name() in self.duplicate_names():
             self._group.fail(self.duplicate_name_error([self.get_name()], stall.stalled))  # others have started
         elif overdue:
             self.get_logger().warning(f"no step for {stall.stalled:.0f} s at step {step}: waiting for {waiting}")
-            self._request_states(self._synchronizer.lacking())
+            self._request_states(self.values.lacking())
         return Health(f"at step {step}, waiting for {waiting}", waiting=True, values=values | {"waiting for": waiting})
 
     def receive(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:  # noqa: ARG002
         """See Agent."""
-        reason = self._synchronizer.offer(peer, step, state)
+        reason = self.values.offer(peer, step, state)
         if reason == Refusal.CONTRADICTION:
-            self._group.record_contradiction(message, self._synchronizer.known(peer, step))
-        if not reason and self._synchronizer.ready():
-            self._turns.ask(self)
-        return reason
-
-    def _limit_steps(self, last: int) -> None:
-        """See Agent."""
-        self._synchronizer.end_at(last)
+            self._group.record_contradiction(message, self.values.known(peer, step))
+        return self._go_on(reason)
 
     def learn(self, graph: ActiveGraph) -> str | None:
         """See Agent."""
-        reason = self._synchronizer.learn(graph.sequence, graph.mode - 1, graph.first_step, graph.last_step)
-        if not reason and self._synchronizer.ready():
+        return self._go_on(self.values.learn(graph.sequence, graph.mode - 1, graph.first_step, graph.last_step))
+
+    def _go_on(self, reason: str | None) -> str | None:
+        if not reason and self.values.ready():
             self._turns.ask(self)
         return reason
 
-    def advance(self) -> None:
-        """Make every step that can be made."""
-        try:
-            self._advance()
-        except ProtocolError as error:
-            self._fail(error)
-
-    def _advance(self) -> None:
-        synchronizer, law = self._synchronizer, self._law
+    def _make_steps(self) -> None:
+        synchronizer, law = self.values, self._law
         while synchronizer.ready():
             mode, values = synchronizer.inputs()
             law.advance(mode, values)
@@ -129,8 +115,7 @@ class LockstepAgent(Agent):
             self._report()
 
 
-MOST_AT_ONCE = 8
-"""Late steps that are made in a row before the executor gets its turn: messages, timers, signals."""
+MOST_AT_ONCE = 8  # late steps in a row before the executor gets its turn: messages, timers, signals
 
 Value = tuple[bytes, int]  # a state, and the simulated time [ns] at which it was made
 
@@ -147,14 +132,14 @@ class RealtimeAgent(Agent):
         self._speed = experiment.run.speed
         self._dt = experiment.step_length
         self._schedule: Schedule | None = None
-        self._timer = DueTimer(self, self._advance)
-        reception, options = self._law.air, self._options() | {"reach": self._reach}
-        self._newest: NewestValues[Value]
+        self._timer = DueTimer(self, self.advance)
+        reception, options = self._law.air, self._options | {"reach": self._reach}
+        self.values: NewestValues[Value]
         if reception and (reception.loss or reception.delay):
             holds = experiment.noise.holds
-            self._newest = NewestReceived(delay=reception.delay, lost=reception.lost, holds=holds, **options)
+            self.values = NewestReceived(delay=reception.delay, lost=reception.lost, holds=holds, **options)
         else:
-            self._newest = NewestValues(**options)
+            self.values = NewestValues(**options)
         self._made = stamp_ns(self._resumed) if self._resumed else 0  # simulated time [ns] of the newest state
         # The stamps of others may be so much ahead of our clock.
         self._margin = round(CLOCK_MARGIN * SECOND * self._speed)
@@ -190,7 +175,7 @@ class RealtimeAgent(Agent):
         self._schedule = Schedule(epoch=epoch, speed=self._speed, step_length=self._dt, phase=self._phase)
         self._common = Schedule(epoch=epoch, speed=self._speed, step_length=self._dt)
         self._bound_clock(epoch - EPOCH_DELAY)
-        self._newest.review()
+        self.values.review()
         # After a takeover steps are overdue; by the time of the next step all others have published their state.
         self._set_timer(self._timer.now())
 
@@ -200,19 +185,12 @@ class RealtimeAgent(Agent):
 
     def _set_timer(self, now: int) -> None:
         assert self._schedule is not None
-        if not self._newest.finished:
+        if not self.values.finished:
             self._timer.set(self._schedule.clock_time(self._schedule.next_step(now, after=self._law.step)))
 
-    def _advance(self) -> None:
-        """Make every step that is due."""
-        try:
-            self._make_due_steps()
-        except ProtocolError as error:
-            self._fail(error)
-
-    def _make_due_steps(self) -> None:
+    def _make_steps(self) -> None:
         """Hot path."""
-        schedule, newest, law = self._schedule, self._newest, self._law
+        schedule, newest, law = self._schedule, self.values, self._law
         assert schedule is not None
         now = self._timer.now()
         simulated = schedule.simulated(now)
@@ -248,14 +226,10 @@ class RealtimeAgent(Agent):
 
     def receive(self, peer: int, step: int, mode: int, state: bytes, message: bytes) -> str | None:  # noqa: ARG002
         """See Agent."""
-        reason = self._newest.offer(peer, step, (state, stamp_ns(message)))
+        reason = self.values.offer(peer, step, (state, stamp_ns(message)))
         if reason == Refusal.CONTRADICTION:
-            self._group.record_contradiction(message, self._newest.known(peer)[0])
+            self._group.record_contradiction(message, self.values.known(peer)[0])
         return reason
-
-    def _limit_steps(self, last: int) -> None:
-        """See Agent."""
-        self._newest.end_at(last)
 
     def learn(self, graph: ActiveGraph) -> str | None:
         """See Agent."""
@@ -265,7 +239,7 @@ class RealtimeAgent(Agent):
             self._graph_late = max(self._graph_late, late)
         if self._common and graph.first_step:  # the first one comes before its time
             self._bound_clock(self._common.clock_time(graph.first_step))
-        return self._newest.learn(graph.mode - 1, graph.first_step)
+        return self.values.learn(graph.mode - 1, graph.first_step)
 
     def health(self) -> Health:
         """How late the agent is, or what it waits for."""
@@ -282,19 +256,18 @@ class RealtimeAgent(Agent):
             "largest lateness [ms]": f"{late:.3f}",
             "largest lateness of a graph [ms]": f"{graph_late:.3f}",
             "deadlines missed": str(self._missed),
-            "oldest value of a neighbour [steps]": str(max(self._newest.behind.values(), default=0)),
+            "oldest value of a neighbour [steps]": str(max(self.values.behind.values(), default=0)),
         }
         if math.isfinite(self._ahead_at_most):
             values[CLOCK_BOUND] = f"{self._ahead_at_most / 1e6:.6f}"
-        if self._newest.finished:
+        if self.values.finished:
             return Health("has made all steps", values=values)
         waiting = self._waiting_for()
         if overdue and waiting:
             self.get_logger().warning(f"no step for {stall.stalled:.0f} s at step {step}: waiting for {waiting}")
         if stall.stalled and waiting:
-            return Health(
-                f"at step {step}, waiting for {waiting}", waiting=True, values=values | {"waiting for": waiting}
-            )
+            values["waiting for"] = waiting
+            return Health(f"at step {step}, waiting for {waiting}", waiting=True, values=values)
         message = f"at step {step}, late by {late:.1f} ms" + (f", {missed} deadlines missed" if missed else "")
         return Health(message, waiting=missed > 0, values=values)
 
@@ -308,4 +281,4 @@ class RealtimeAgent(Agent):
         if self._schedule.simulated(now) < self._schedule.due(self._law.step):
             stopped, self._looked = self._looked == now, now
             return f"its clock, which has stopped at {now / 1e9:g} s" if stopped else None
-        return self._newest.waiting_for()
+        return self.values.waiting_for()

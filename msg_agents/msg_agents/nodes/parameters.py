@@ -15,6 +15,7 @@ import itertools
 import os
 import re
 import sys
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from msg_agents.environment import ensure_logs
+from msg_agents.environment import RANGE_VARIABLE, other_logs
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,14 +33,13 @@ if TYPE_CHECKING:
     from rclpy.parameter import Parameter
 
 
+# Parameters that have another name than the argument of the command's function.
 NAMES = {"run_record": "run", "readers": "await", "subscribers": "wait_for_subscribers", "remaps": "remap"}
-"""Parameters that have another name than the argument of the command's function."""
+# Options that rclpy declares itself, that are used before there is a node, or that concern the terminal.
 NO_PARAMETERS = {"use_sim_time", "domain", "as_json", "help"}
-"""Options that rclpy declares itself, that are used before there is a node, or that concern the terminal."""
 QOS_OVERRIDES = "qos_overrides"
 ROS_OWN = {"use_sim_time", "start_type_description_service"}
 GIVES_PARAMETERS = {"-p", "--param", "--params-file"}
-LARGEST_INTEGER = 2**63 - 1
 
 
 @dataclass(slots=True)
@@ -61,8 +61,7 @@ class ProcessParameters:
         node.declare_parameters("", self._declarations, ignore_override=True)
 
 
-PROCESS = ProcessParameters()
-"""One per process, as rclpy's default context: a process has one command line."""
+PROCESS = ProcessParameters()  # a process has one command line
 
 
 def options_of(command: click.Command) -> list[click.Parameter]:
@@ -84,18 +83,17 @@ def describe(option: click.Parameter) -> ParameterDescriptor:
     """Type, range and description; all are read-only, because a node does not change during a run."""
     from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
-    kind, constraints = option.type, ""
+    kind = option.type
     descriptor = ParameterDescriptor(name=name_of(option), type=_type_of(option).value, read_only=True)
     descriptor.description = getattr(option, "help", None) or f"The same as the argument {option.human_readable_name}."
     if isinstance(kind, click.IntRange):
-        most = LARGEST_INTEGER if kind.max is None else int(kind.max)
+        most = 2**63 - 1 if kind.max is None else int(kind.max)
         descriptor.integer_range = [IntegerRange(from_value=int(kind.min or 0), to_value=most)]
     elif isinstance(kind, click.FloatRange):
         largest = sys.float_info.max if kind.max is None else float(kind.max)
         descriptor.floating_point_range = [FloatingPointRange(from_value=float(kind.min or 0.0), to_value=largest)]
     elif isinstance(kind, click.Choice):
-        constraints = f"one of {', '.join(kind.choices)}"
-    descriptor.additional_constraints = constraints
+        descriptor.additional_constraints = f"one of {', '.join(kind.choices)}"
     return descriptor
 
 
@@ -124,7 +122,7 @@ def _ros_value(option: click.Parameter, value: Any) -> Any:
 @contextlib.contextmanager
 def ros_arguments() -> Iterator[None]:
     """Around the start of rclpy: log files have a place, and wrong arguments for ROS 2 are an InputError."""
-    ensure_logs()
+    os.environ.update(other_logs(Path(tempfile.gettempdir()) / f"msg_agents_log_{os.getuid()}"))
     from msg_agents.nodes.ros import RCLError
 
     try:
@@ -154,19 +152,16 @@ def mention_qos(arguments: Sequence[str]) -> bool:
 
 
 def given(node_name: str, arguments: Sequence[str]) -> dict[str, Parameter]:
-    """The parameters that arguments of ROS 2 (from ``--ros-args`` on) give to a node; InputError: rcl rejects them.
-
-    Only rcl resolves namespaces and remappings, and only for a node: this makes one without discovery, in a context of
-    its own, and destroys it. ``os.environ`` is changed meanwhile.
-    """
+    """The parameters that arguments of ROS 2 (from ``--ros-args`` on) give to a node; InputError: rcl rejects them."""
+    # Only rcl resolves namespaces and remappings, and only for a node: this makes one without discovery, in a context
+    # of its own, and destroys it. ``os.environ`` is changed meanwhile.
     import rclpy
     from rclpy.context import Context
     from rclpy.node import Node
     from rclpy.signals import SignalHandlerOptions
 
-    reach = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-    before = os.environ.get(reach)
-    os.environ[reach] = "OFF"
+    before = os.environ.get(RANGE_VARIABLE)
+    os.environ[RANGE_VARIABLE] = "OFF"
     context = Context()
     try:
         with ros_arguments():
@@ -186,20 +181,17 @@ def given(node_name: str, arguments: Sequence[str]) -> dict[str, Parameter]:
         node.destroy_node()
     finally:
         context.try_shutdown()
-        if before is None:
-            del os.environ[reach]
-        else:
-            os.environ[reach] = before
+        del os.environ[RANGE_VARIABLE]
+        if before is not None:
+            os.environ[RANGE_VARIABLE] = before
     return {name: parameter for name, parameter in found.items() if name not in ROS_OWN}
 
 
 def merge(
     ctx: click.Context, options: Sequence[click.Parameter], parameters: Mapping[str, Parameter], known: Iterable[str]
 ) -> dict[str, Any]:
-    """Values of the options that are given as parameters and not on the command line, by argument name.
-
-    ``known``: parameters of all our nodes, since one file may be for several. InputError: unknown name or bad value.
-    """
+    """Values of the options that are given as parameters and not on the command line, by argument name."""
+    # One file may be for several of our nodes, whose parameters are ``known``.
     own = {name_of(option): option for option in options}
     known = set(known) | own.keys()
     values: dict[str, Any] = {}

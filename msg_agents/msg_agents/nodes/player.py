@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ import rclpy
 from builtin_interfaces.msg import Time
 from rclpy.duration import Duration
 from rclpy.exceptions import InvalidTopicNameException
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
@@ -32,6 +31,10 @@ from msg_analysis.bags.playback import BagTopic, Message, Playback
 from msg_analysis.errors import InputError
 from msg_analysis.messages.topics import CLOCK, LATCHED, STREAM
 
+SETTLED = 0.8  # s without a change in the readers, after which discovery counts as finished
+SETTLE_LIMIT = 5.0  # s after which it counts as finished in any case
+NOTE_DELAY = 2.0  # s after which a note says what is missing
+LONGEST_POLL = 1.0  # s; a longer gap between two looks counts as this much: the process was stopped
 DISCOVERY_POLL = 0.2  # s; a tighter loop on the ROS graph starves discovery on a small machine
 CHECK_PERIOD = 0.05  # s between two checks of keyboard and clock
 STOPPED_AFTER = 1.0  # s without a check, after which the process is taken to have been stopped
@@ -79,10 +82,7 @@ class Played:
 
 
 def message_classes(topics: Iterable[BagTopic], *, all_wanted: bool, on_note: Callable[[str], None]) -> dict[str, Any]:
-    """Message classes by topic name, without the topics that cannot be played; a note names those.
-
-    InputError: none can be played, or not all where ``all_wanted`` says that the user chose these topics.
-    """
+    """Message classes by name of the topics that can be played: of all if the user chose them (``all_wanted``)."""
     found, unplayable = {}, []
     for topic in topics:
         if topic.encoding != "cdr":
@@ -101,106 +101,14 @@ def message_classes(topics: Iterable[BagTopic], *, all_wanted: bool, on_note: Ca
     return found
 
 
-def check_definitions(node: Node, writers: Mapping[str, Publisher], topics: Mapping[str, BagTopic]) -> None:
-    """InputError if a topic was recorded with another definition of its type: its bytes mean something else."""
-    for name, publisher in writers.items():
-        recorded = topics[name].type_hash
-        ours = {
-            str(info.topic_type_hash)
-            for info in node.get_publishers_info_by_topic(publisher.topic_name)
-            if info.node_name == node.get_name()
-        }
-        if recorded and ours and recorded not in ours:
-            raise InputError(
-                f"topic {name}: was recorded with another definition of {topics[name].type_name} ({recorded}) than the "
-                f"installed one ({ours.pop()}): install that version, or leave the topic out with --exclude"
-            )
-
-
-SETTLED = 0.8  # s without a change in the readers, after which discovery counts as finished
-SETTLE_LIMIT = 5.0  # s after which it counts as finished in any case
-NOTE_DELAY = 2.0  # s after which a note says what is missing
-LONGEST_POLL = 1.0  # s; a longer gap between two looks counts as this much: the process was stopped
-
-
-class RequiredReaders:
-    """The readers of a player's topics. Latched topics are not waited for, unless all are latched."""
-
-    def __init__(
-        self,
-        node: Node,
-        writers: Mapping[str, Publisher],
-        latched: Iterable[str],  # keys of ``writers``
-        *,
-        subscribers: int,  # readers that every awaited topic must have
-        readers: Sequence[str],  # names of nodes that must read every awaited topic
-        timeout: float,  # s
-    ) -> None:
-        self._node, self._subscribers, self._readers, self._timeout = node, subscribers, readers, timeout
-        self._writers = list(writers.values())
-        self._awaited = [writers[name] for name in sorted(writers.keys() - set(latched) or writers.keys())]
-
-    def wait(self, pause: Callable[[], None], on_note: Callable[[str], None]) -> None:
-        """Wait for the required readers, and in any case until no more readers are being discovered.
-
-        ``pause`` takes some time between two looks. InputError: required readers are missing after the timeout.
-        """
-        looked = time.monotonic()
-        waited = changed = 0.0
-        counts: list[int] = []
-        noted = False
-        while True:
-            now = time.monotonic()
-            waited, looked = waited + min(now - looked, LONGEST_POLL), now
-            missing = self._missing()
-            before, counts = counts, [each.get_subscription_count() for each in self._writers]
-            if counts != before:
-                changed = waited
-            if not missing and (waited > changed + SETTLED or waited > SETTLE_LIMIT):
-                break
-            if missing and waited > self._timeout:
-                raise InputError(
-                    f"after {self._timeout:g} s {'; '.join(missing)}. Are they running {discovery_scope()}?"
-                )
-            if missing and not noted and waited > NOTE_DELAY:
-                noted = True
-                on_note(f"waiting for readers, {self._timeout:g} s at most: {'; '.join(missing)}")
-            pause()
-        others = [each.topic_name for each in self._writers if self._node.count_publishers(each.topic_name) > 1]
-        if others:
-            on_note(f"other nodes publish as well: {', '.join(others)}")
-
-    def _missing(self) -> list[str]:
-        """Unmet requirements in words."""
-        few, without = [], dict[str, list[str]]()
-        for writer in self._awaited:
-            count = writer.get_subscription_count()
-            if count < self._subscribers:
-                few.append(f"{writer.topic_name} ({count})")
-            if self._readers:
-                infos = self._node.get_subscriptions_info_by_topic(writer.topic_name)
-                here = {info.node_name for info in infos}
-                here |= {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos}
-                for reader in self._readers:
-                    if reader not in here or count < 1:
-                        without.setdefault(reader, []).append(writer.topic_name)
-        lines = [f"fewer than {self._subscribers} read {', '.join(few)}"] if few else []
-        return lines + [f"{reader} does not read {', '.join(topics)}" for reader, topics in without.items()]
-
-
 class Player(LeanNode):
-    """Publishes the messages of a bag: the same bytes, in the same order on each topic, without loss.
-
-    InputError: nothing to play from ``start_offset`` on or among the topics, or a bad remapping.
-    """
+    """Publishes the messages of a bag: the same bytes, in the same order on each topic, without loss."""
 
     # All topics are reliable and keep-all, however they were recorded: best-effort readers match too, and a slow
     # reliable one holds the player back. Topics recorded as latched are latched. The node receives nothing, so nothing
     # spins.
-
     def __init__(
         self,
-        *,
         bag: Playback,
         options: PlayOptions,
         keyboard: Keyboard,
@@ -238,7 +146,7 @@ class Player(LeanNode):
                 self._writers[name] = self.create_publisher(kind, names[name], qos)
             except InvalidTopicNameException as error:
                 raise InputError(f"--remap: {name}:={names[name]}: {error}") from error
-        check_definitions(self, self._writers, bag.topics)
+        self._check_definitions()
         self._ticker = self.publisher_of(CLOCK) if options.clock else None
         self._time = BagClock(self._first, options.rate, paused=options.paused)
         self._sought = self._first  # messages of topics that are not latched are left out before this time [ns]
@@ -247,32 +155,31 @@ class Player(LeanNode):
         self._awake = time.monotonic()  # when it was last known not to be stopped
         self.played = Played(length=(bag.end - bag.start) / SECOND)
 
+    def _check_definitions(self) -> None:
+        """InputError if a topic was recorded with another definition of its type: its bytes mean something else."""
+        for name, publisher in self._writers.items():
+            topic, infos = self._bag.topics[name], self.get_publishers_info_by_topic(publisher.topic_name)
+            ours = {str(info.topic_type_hash) for info in infos if info.node_name == self.get_name()}
+            if topic.type_hash and ours and topic.type_hash not in ours:
+                raise InputError(
+                    f"topic {name}: was recorded with another definition of {topic.type_name} ({topic.type_hash}) than "
+                    f"the installed one ({ours.pop()}): install that version, or leave the topic out with --exclude"
+                )
+
     def play(self) -> None:
         """Play the bag, once or (``loop``) until a signal ends it; InputError: required readers are missing."""
         early = self._publish_early()
         self._on_progress(self.played)
-        options = self._options
-        required = RequiredReaders(
-            self,
-            self._writers,
-            self._latched,
-            subscribers=options.subscribers,
-            readers=options.readers,
-            timeout=options.wait_timeout,
-        )
-        required.wait(self._pause, self._on_note)
+        self._wait_for_readers()
         self.played.begun = True
         self._jobs.continued()
         self._time.jump(self._first)
         self._began = self._awake = time.monotonic()
-        skip = early
-        while True:
-            self._play_once(skip)
-            skip = 0
-            if not self._options.loop:
-                break
+        self._play_once(early)
+        while self._options.loop:
             self._sought = self._first
             self._time.jump(self._first)
+            self._play_once(0)
         self._wait_for_acknowledgements()
 
     def _check_signals(self) -> None:
@@ -280,17 +187,54 @@ class Player(LeanNode):
         self._interruption.check()
         self._jobs.check()
 
-    def _pause(self) -> None:
-        """Wait a little before the start: signals, keyboard, progress."""
-        self._check_signals()
-        self._press(self._keyboard.wait(DISCOVERY_POLL), self._first)
-        self._on_progress(self.played)
+    def _wait_for_readers(self) -> None:
+        """Wait for the required readers, and in any case until no more readers are being discovered."""
+        looked, timeout = time.monotonic(), self._options.wait_timeout
+        waited = changed = 0.0
+        counts: list[int] = []
+        noted = False
+        while True:
+            now = time.monotonic()
+            waited, looked = waited + min(now - looked, LONGEST_POLL), now
+            missing = self._missing_readers()
+            before, counts = counts, [each.get_subscription_count() for each in self._writers.values()]
+            if counts != before:
+                changed = waited
+            if not missing and (waited > changed + SETTLED or waited > SETTLE_LIMIT):
+                break
+            if missing and waited > timeout:
+                raise InputError(f"after {timeout:g} s {'; '.join(missing)}. Are they running {discovery_scope()}?")
+            if missing and not noted and waited > NOTE_DELAY:
+                noted = True
+                self._on_note(f"waiting for readers, {timeout:g} s at most: {'; '.join(missing)}")
+            self._check_signals()
+            self._press(self._keyboard.wait(DISCOVERY_POLL), self._first)
+            self._on_progress(self.played)
+        topics = [each.topic_name for each in self._writers.values()]
+        if others := [topic for topic in topics if self.count_publishers(topic) > 1]:
+            self._on_note(f"other nodes publish as well: {', '.join(others)}")
+
+    def _missing_readers(self) -> list[str]:
+        """Unmet requirements in words. Latched topics are not waited for, unless all are latched."""
+        few, without, least = [], dict[str, list[str]](), self._options.subscribers
+        for name in sorted(self._writers.keys() - self._latched or self._writers.keys()):
+            writer = self._writers[name]
+            count = writer.get_subscription_count()
+            if count < least:
+                few.append(f"{writer.topic_name} ({count})")
+            if self._options.readers:
+                infos = self.get_subscriptions_info_by_topic(writer.topic_name)
+                here = {info.node_name for info in infos}
+                here |= {f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in infos}
+                for reader in self._options.readers:
+                    if reader not in here or count < 1:
+                        without.setdefault(reader, []).append(writer.topic_name)
+        lines = [f"fewer than {least} read {', '.join(few)}"] if few else []
+        return lines + [f"{reader} does not read {', '.join(topics)}" for reader, topics in without.items()]
 
     def _publish_early(self) -> int:
-        """Publish what latched topics hold at the start, before anything else; the number of messages.
-
-        A reader that needs it to set up its other subscriptions (which run it is, for example) gets it in time.
-        """
+        """Publish what latched topics hold at the start, before anything else; the number of messages."""
+        # A reader that needs it to set up its other subscriptions (which run it is, for example) gets it in time.
         count = 0
         if self._latched:
             for message in self._bag.messages(self._latched, self._first):
@@ -349,16 +293,14 @@ class Player(LeanNode):
                 return
             self._update(now, message.time)
             wait = self._time.until(message.time)
-            if self._steps and wait > 0:
+            if wait <= 0:
+                return
+            if self._steps:
                 self._steps -= 1
                 self._time.jump(message.time)
                 return
-            if wait <= 0:
-                return
-            soonest = (
-                min(wait, CHECK_PERIOD) if self._ticker is None else min(wait, CHECK_PERIOD, self._next_tick() - now)
-            )
-            self._press(self._keyboard.wait(soonest), message.time)
+            next_tick = math.inf if self._ticker is None else self._next_tick() - now
+            self._press(self._keyboard.wait(min(wait, CHECK_PERIOD, next_tick)), message.time)
             self._check_signals()
 
     def _update(self, now: float, next_time: int) -> None:
@@ -410,12 +352,12 @@ class Player(LeanNode):
         except ValueError:
             self._on_note(f"{typed}: expected a time in seconds, such as 12.5")
             return
-        if here <= wanted <= end:
-            self._seek(self._bag.start + round(wanted * SECOND))
-        elif wanted > end:
+        if wanted > end:
             self._on_note(f"{typed} s: expected a time up to {end:g} s, where the bag ends")
-        else:
+        elif wanted < here:
             self._on_note(f"{typed} s: there is no way back from {here:g} s: start again with --start-offset {typed}")
+        else:
+            self._seek(self._bag.start + round(wanted * SECOND))
 
     def _seek(self, when: int) -> None:
         """Go forward to a time of the bag [ns]. Latched messages on the way are all published, at once."""
@@ -454,10 +396,8 @@ def play(
     on_stop: Callable[[], None] = lambda: None,  # before Ctrl-Z stops the process
     on_continue: Callable[[], None] = lambda: None,  # when it goes on
 ) -> Played:
-    """Play a bag (or one of its files) in this process; BagError or InputError: not a bag, or not playable like that.
-
-    Ctrl-C raises KeyboardInterrupt, another signal SystemExit: only ``on_progress`` then has said how far it came.
-    """
+    """Play a bag (or one of its files) in this process; BagError, InputError: not a bag, or not playable like that."""
+    # Ctrl-C raises KeyboardInterrupt, another signal SystemExit: only ``on_progress`` then has said how far it came.
     bag = Playback(path)
     for line in bag.damage:
         on_note(line)
@@ -478,17 +418,8 @@ def play(
                 on_continue()
 
             with JobControl(before=before, after=after) as jobs:
-                player = Player(
-                    bag=bag,
-                    options=options,
-                    keyboard=keyboard,
-                    jobs=jobs,
-                    interruption=interruption,
-                    on_progress=on_progress,
-                    on_note=on_note,
-                )
-                nodes = [player]
-                player.play()
+                nodes = [Player(bag, options, keyboard, jobs, interruption, on_progress, on_note)]
+                nodes[0].play()
                 complete = True
     finally:
         for line in bag.damage[known:]:

@@ -39,9 +39,8 @@ GC_THRESHOLD = 50_000  # objects; the hot path makes no cycles, so young collect
 LEAVE_GRACE = 5  # s
 INTERRUPTED_GRACE = 15  # s; longer, because a process that ends by it has failed
 USE_SIM_TIME = ["--ros-args", "-p", "use_sim_time:=true"]
-
-
 SIGEV_THREAD = 2  # of <signal.h>: the C library calls a function in a thread of its own
+_LEFT: list[object] = []  # what must not be taken down before the end of the process
 
 
 class _Event(ctypes.Structure):
@@ -58,10 +57,8 @@ class _Event(ctypes.Structure):
 
 
 def exit_after(seconds: int) -> None:
-    """End this process with exit code 0 in so many seconds, unless it has ended by then.
-
-    Neither the interpreter's lock nor the interpreter is needed. C libraries without such timers do nothing.
-    """
+    """End this process with exit code 0 in so many seconds, unless it has ended by then."""
+    # Neither the interpreter's lock nor the interpreter is needed. C libraries without such timers do nothing.
     library = ctypes.CDLL(None, use_errno=True)
     if not hasattr(library, "timer_create"):
         return
@@ -76,34 +73,24 @@ def exit_after(seconds: int) -> None:
         library.timer_settime(timer, 0, in_time, None)
 
 
-_LEFT: list[object] = []  # what must not be taken down before the end of the process
-
-
 class NotFoundError(InputError):
     """Some nodes of the run were not discovered in time."""
 
 
 def make_executor(kind: str = "events") -> Executor:
-    """The events executor where this rclpy has it (a third of the CPU time per message), else the single-threaded one.
-
-    ``kind``: "events" or "single"; "single" is for comparison.
-    """
+    """The events executor where this rclpy has it, else or for comparison ("single") the single-threaded one."""
     if kind == "events":
-        try:
+        with contextlib.suppress(ImportError):  # a third of the CPU time per message
             from rclpy.experimental.events_executor import EventsExecutor
-        except ImportError:
-            pass
-        else:
+
             return EventsExecutor()
     return SingleThreadedExecutor()
 
 
 def prefer_throughput() -> None:
-    """Ask the scheduler for throughput instead of immediate wake-ups (Linux: SCHED_BATCH).
-
-    In lockstep all cores are busy with processes that wake each other with every message; if each wake-up preempts the
-    running process, a third of the time goes into the switches. Threads made later inherit the policy.
-    """
+    """Ask the scheduler for throughput instead of immediate wake-ups (Linux: SCHED_BATCH)."""
+    # In lockstep all cores are busy with processes that wake each other with every message; if each wake-up preempts
+    # the running process, a third of the time goes into the switches. Threads made later inherit the policy.
     with contextlib.suppress(AttributeError, OSError):  # other systems have no such policy
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
@@ -119,10 +106,7 @@ def run_nodes(
     relay: int | None = None,  # descriptor of ``DiscoveryRelay``
     peer_timeout: float | None = None,  # s, see ``PeerPresence``; None: no limit
 ) -> bool:
-    """Run nodes until each has done its part; False if the process was stopped (SIGINT, SIGTERM) before.
-
-    NotFoundError: names the missing nodes. InputError: names that several nodes have, or what a node failed with.
-    """
+    """Run nodes until each has done its part; False if the process was stopped (SIGINT, SIGTERM) before."""
     show_stacks_when_asked()
     # Python's own handler would raise KeyboardInterrupt anywhere, in the middle of a write for example. ROS's handler,
     # installed on top, ends the spin between two callbacks.
@@ -184,7 +168,11 @@ def run_nodes(
             node.finish(complete=complete, deadline=deadline)
         if reporter:
             reporter.write_status_file()
-        _ignore_interrupts()
+        # Launchers without a terminal pass on a SIGINT that all have got. Python gives it its default action while it
+        # ends, unless it is ignored: the process would be killed before the middleware has removed its shared memory.
+        # The C library first: a signal that came while Python replaces its handler would be printed as an error.
+        ctypes.CDLL(None).signal(signal.SIGINT, ctypes.c_void_p(signal.SIG_IGN))
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         if prefix and ends_at_once():
             leave_at_once(nodes, spinner, prefix)
         else:
@@ -192,20 +180,8 @@ def run_nodes(
     return complete
 
 
-def _ignore_interrupts() -> None:
-    """Ignore SIGINT until the process has ended."""
-    # Launchers without a terminal pass on a SIGINT that all have got. Python gives it its default action while it ends,
-    # unless it is ignored: the process would be killed before the middleware has removed its shared memory.
-    # The C library first: a signal that came while Python replaces its handler would be printed as an error.
-    ctypes.CDLL(None).signal(signal.SIGINT, ctypes.c_void_p(signal.SIG_IGN))
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
 def own_prefix(node: Node) -> bytes:
-    """The prefix of the GUIDs of this process, read from the endpoints of one of its nodes.
-
-    Empty if it is not known, since another node has the same name.
-    """
+    """The prefix of the GUIDs of this process; empty: not known, since another node has the same name."""
     own = (node.get_name(), node.get_namespace())
     endpoints = [p for topic in node.publishers for p in node.get_publishers_info_by_topic(topic.topic_name)]
     prefixes = {bytes(p.endpoint_gid[:PREFIX_SIZE]) for p in endpoints if (p.node_name, p.node_namespace) == own}
@@ -220,10 +196,7 @@ def store_participant(takeovers: Sequence[Takeover], node: Node) -> None:
 
 
 def leave(nodes: Sequence[Node], executor: Executor | None, *, complete: bool) -> None:
-    """Remove the nodes from the network, so that no other node waits for them, and make sure that the process ends.
-
-    As long as an executor has a node, the middleware keeps it, and the others are not informed.
-    """
+    """Remove the nodes from the network, so that no other node waits for them, and make sure that the process ends."""
     # When many participants leave at once, Fast DDS 2.14 can deadlock in DomainParticipant::set_listener, with the
     # interpreter's lock held or after the interpreter has gone. Then only C code helps. Nothing is lost, because a
     # complete process has delivered everything by now.
@@ -231,7 +204,7 @@ def leave(nodes: Sequence[Node], executor: Executor | None, *, complete: bool) -
         exit_after(LEAVE_GRACE)
     else:
         faulthandler.dump_traceback_later(INTERRUPTED_GRACE, exit=True)
-    if executor is not None:
+    if executor is not None:  # as long as it has a node, the middleware keeps that, and the others are not informed
         executor.shutdown()
     for node in nodes:
         node.destroy_node()
@@ -239,23 +212,17 @@ def leave(nodes: Sequence[Node], executor: Executor | None, *, complete: bool) -
 
 
 def leave_at_once(nodes: Sequence[Node], executor: Executor | None, prefix: bytes) -> None:
-    """Let the end of this process be its removal from the network, in one message to each of the others.
-
-    For processes that the relay knows, which have no shared memory. Otherwise each endpoint's end would be announced to
-    each of them: in a large network more messages than all the rest.
-    """
+    """Let the end of this process be its removal from the network, in one message to each of the others."""
+    # For processes that the relay knows, which have no shared memory. Otherwise each endpoint's end would be announced
+    # to each of them: in a large network more messages than all the rest.
     _LEFT.extend([executor, *nodes])
     atexit.register(remove_participant, prefix, int(os.environ.get("ROS_DOMAIN_ID") or 0), repeats=1)
     rclpy.try_shutdown()
 
 
 def _gate(nodes: Sequence[NetworkNode], timeout: float, signals: Sequence[int]) -> None:
-    """Wait until the publishers of all nodes have found their readers, and every name belongs to one node only.
-
-    ``signals``: end the wait.
-
-    Readers are identified by name: with duplicates, a run might start without the node that belongs to it.
-    """
+    """Wait until the publishers of all nodes have found their readers, and every name belongs to one node only."""
+    # Readers are identified by name: with duplicates, a run might start without the node that belongs to it.
     deadline = time.monotonic() + timeout
     waiting = list(nodes)
     warned = False
@@ -278,6 +245,6 @@ def _gate(nodes: Sequence[NetworkNode], timeout: float, signals: Sequence[int]) 
                 f"after {timeout:g} s {', '.join(node.get_name() for node in waiting)} did not discover: "
                 f"{', '.join(missing)}. Are they running {discovery_scope()}?"
             )
-        if signals or not rclpy.ok():
+        if signals or not rclpy.ok():  # the wait is interrupted
             raise ExternalShutdownException
         time.sleep(min(max(FIRST_POLL, PAUSE_PER_LOOK * (time.monotonic() - begun)), GATE_POLL))

@@ -25,26 +25,21 @@ from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.topics import Topic, agent_node_name, network_topics
 from msg_analysis.model.run_record import RunRecord
 
+# Bytes of states after which they are written: 16 kB for each agent, within these bounds. Many at once cost a fraction
+# of one by one, but in longer turns the recorder delays agents on the same core.
 LEAST_WRITE, MOST_WRITE = 2**15, 2**20
-"""Bytes of states after which they are written: 16 kB for each agent, within these bounds. Many at once cost a fraction
-of one by one, but in longer turns the recorder delays agents on the same core."""
 WRITE_PERIOD = 0.1  # s of wall time after which fewer are written, in slow runs and at the end
-UNNAMED = "_NODE_NAME_UNKNOWN_"
-"""What ROS 2 says of a writer as long as it does not know its node: of our agents, too, in the first moments."""
-
+UNNAMED = "_NODE_NAME_UNKNOWN_"  # node of a writer that ROS 2 does not know yet: of our agents, too, at first
 UNNAMED_TIME = 5.0  # s after which such a writer is taken for one of another node
 LOOK_PERIOD = 0.5  # s of wall time between two looks for other nodes that publish states
 KEPT_MEMORY, LARGEST_KEPT = 2**26, 2**25  # bytes: of all that is free, and of one array (the most that glibc takes)
-FLUSH_PERIOD = 1.0
-"""s of wall time: a killed recorder loses at most so much, even if a chunk takes longer to fill."""
+FLUSH_PERIOD = 1.0  # s of wall time: a killed recorder loses at most so much, even if a chunk takes longer to fill
 
 
 class Recorder(NetworkNode):
-    """Records a run into ``directory`` (new or empty), and detects when the run is complete.
+    """Records a run into ``directory`` (new or empty), and detects when the run is complete."""
 
-    Messages are stamped with simulated time, so that equal runs give equal bags whatever the load of the machine.
-    """
-
+    # Messages are stamped with simulated time, so that equal runs give equal bags whatever the load of the machine.
     def __init__(self, *, record: RunRecord, directory: Path, storage: Storage = DEFAULT_STORAGE) -> None:
         super().__init__("recorder", record=record)
         experiment = record.experiment
@@ -83,15 +78,16 @@ class Recorder(NetworkNode):
         values = {"messages": str(self.bag.messages), "topics without their last message": str(len(self._awaiting))}
         return Health(f"{self.bag.messages} messages recorded", values=values)
 
-    def finish(self, *, complete: bool, deadline: float) -> None:  # noqa: ARG002  an interrupted bag is closed just as well
+    def finish(self, *, complete: bool, deadline: float) -> None:  # noqa: ARG002
         """Close the bag; it is complete only if the recorder saw the end of the run."""
         self._guarded(self._write_states)()
         self.bag.close(complete=not self._awaiting)
 
     def _look_for_others(self) -> None:
         """Read the agents' own topics, too, as soon as another node publishes there: a player has no batches."""
-        first = agent_node_name(0)
-        for kind in () if self._reads_single else self._kinds:
+        if self._reads_single:
+            return
+        for kind in self._kinds:
             name = kind.of.of(0)
             if self.count_publishers(name):
                 names = {w.node_name for w in self.get_publishers_info_by_topic(self.resolve_topic_name(name))}
@@ -100,13 +96,8 @@ class Recorder(NetworkNode):
                 elif self._unnamed_since is None:
                     self._unnamed_since = time.monotonic()
                 nameless = self._unnamed_since is not None and time.monotonic() > self._unnamed_since + UNNAMED_TIME
-                if nameless or names - {first, UNNAMED}:
-                    self._read_single()
-                    return
-
-    def _read_single(self) -> None:
-        self._reads_single = True
-        for kind in self._kinds:
+                self._reads_single |= nameless or bool(names - {agent_node_name(0), UNNAMED})
+        for kind in self._kinds if self._reads_single else ():
             for agent in range(self.record.experiment.agents):
                 self.subscribe(kind.of, self._collector(partial(kind.add_single, agent)), agent=agent)
 
@@ -132,7 +123,7 @@ class Recorder(NetworkNode):
                 self._received_last(kind.names[agent])
 
     def _record_graph(self, data: bytes) -> None:
-        graph = self.decode_graph(data)
+        graph = self.accepted(self.rules.graph(data), topics.GRAPH)
         if graph is None:
             return
         if graph.sequence in self._sojourns:
@@ -197,10 +188,8 @@ class Recorder(NetworkNode):
 
 
 def keep_freed_memory() -> None:
-    """Let this process keep the memory that it frees, in which the next states are written (glibc; else no effect).
-
-    The C library would give it back after every write and ask for it again: a fifth of the recorder's CPU time.
-    """
+    """Let this process keep the memory that it frees, in which the next states are written (glibc; else no effect)."""
+    # The C library would give it back after every write and ask for it again: a fifth of the recorder's CPU time.
     trim_threshold, mmap_threshold = -1, -3  # of <malloc.h>
     with contextlib.suppress(AttributeError):
         ctypes.CDLL(None).mallopt(trim_threshold, KEPT_MEMORY)

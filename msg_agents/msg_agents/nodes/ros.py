@@ -49,13 +49,10 @@ __all__ = ["RCLError", "until_shutdown"]
 
 @contextmanager
 def until_shutdown(node: Node) -> Iterator[None]:
-    """Drop what cannot be published any more: a signal has shut rclpy down in the middle of a callback.
-
-    The executor would print the error as FATAL, with a stack.
-    """
+    """Drop what cannot be published any more: a signal has shut rclpy down in the middle of a callback."""
     try:
         yield
-    except RCLError:
+    except RCLError:  # the executor would print it as FATAL, with a stack
         if node.context.ok():
             raise
 
@@ -74,12 +71,10 @@ FAR_OFF = 3600.0  # s
 
 
 class DueTimer:
-    """Calls back once, when the node's clock (a wall clock, or ``/clock`` under use_sim_time) has reached a given time.
+    """Calls back once, when the node's clock (a wall clock, or ``/clock`` under use_sim_time) has reached a time."""
 
-    ROS 2's own timers are periodic and count from when they were made. This one is set anew for every time, so it does
-    not drift and has the phase that was asked for. The callback may come a little late.
-    """
-
+    # ROS 2's own timers are periodic and count from when they were made. This one is set anew for every time, so it
+    # does not drift and has the phase that was asked for. The callback may come a little late.
     def __init__(self, node: Node, callback: Callable[[], None]) -> None:
         self._clock = cast(ROSClock, node.get_clock())
         self._callback = callback
@@ -118,10 +113,6 @@ def after(node: Node, seconds: float, callback: Callable[[], None]) -> None:
     timer = node.create_timer(seconds, fire, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
-LOSSLESS = ("history", "reliability", "durability", "lifespan")
-"""Policies that must not change where nothing may be lost, except that a publisher may become latched."""
-
-
 def message_class(type_name: str) -> Any:
     """Class of a type such as std_msgs/msg/String; ImportError, AttributeError or ValueError without one."""
     package, kind, name = type_name.split("/")
@@ -135,12 +126,9 @@ def load_type_support(topics: Iterable[Topic]) -> None:
 
 
 class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy can follow
-    """A node without parameter services, type descriptions and /rosout.
+    """A node without parameter services, type descriptions and /rosout; its parameters are declared all the same."""
 
-    Each node would have seven services and /rosout, which cost more than the network if there are many nodes.
-    Parameters are declared all the same; the option ``parameter_services`` adds their services.
-    """
-
+    # Seven services and /rosout cost more than the network if there are many nodes.
     def __init__(self, name: str) -> None:
         self._takes_overrides = False  # rclpy cannot handle overrides yet when it makes the node's own topics
         super().__init__(
@@ -157,7 +145,7 @@ class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy
         return self.create_publisher(message_class(topic.type.full_name), topic.of(agent), ros_profile(topic.qos))
 
     def subscribe(
-        self, topic: Topic, callback: Callable[[bytes], None], *, agent: int = 0, qos: Qos | None = None
+        self, topic: Topic, callback: Callable[[bytes], object], *, agent: int = 0, qos: Qos | None = None
     ) -> Subscription:
         """Pass the messages of a topic on as CDR bytes; ``qos``: if not that of the topic."""
         kind, profile = message_class(topic.type.full_name), ros_profile(qos or topic.qos)
@@ -165,23 +153,23 @@ class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy
 
     def create_publisher(self, msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Publisher:
         """As in rclpy; with the user's overrides of the quality of service, as far as no message would be lost."""
-        kinds = [
-            QoSPolicyKind.DEADLINE,
-            QoSPolicyKind.LIFESPAN,
-            QoSPolicyKind.LIVELINESS,
-            QoSPolicyKind.LIVELINESS_LEASE_DURATION,
-        ]
+        names = ("DEADLINE", "LIFESPAN", "LIVELINESS", "LIVELINESS_LEASE_DURATION")
+        kinds = [QoSPolicyKind[name] for name in names]
         return self._create(super().create_publisher, kinds, msg_type, topic, qos_profile, **options)
 
     def create_subscription(
-        self, msg_type: Any, topic: str, callback: Callable[[Any], None], qos_profile: Any, **options: Any
+        self, msg_type: Any, topic: str, callback: Callable[[Any], object], qos_profile: Any, **options: Any
     ) -> Subscription:
         """As in rclpy; overrides as in ``create_publisher``."""
-
-        def create(msg_type: Any, topic: str, qos_profile: Any, **options: Any) -> Subscription:
-            return super(LeanNode, self).create_subscription(msg_type, topic, callback, qos_profile, **options)
-
-        return self._create(create, [], msg_type, topic, qos_profile, **options)
+        create = super().create_subscription
+        return self._create(
+            lambda kind, name, qos, **more: create(kind, name, callback, qos, **more),
+            [],
+            msg_type,
+            topic,
+            qos_profile,
+            **options,
+        )
 
     def _create(
         self,
@@ -206,10 +194,9 @@ class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy
             reason = objection(before, profile, publishes=publishes)
             return SetParametersResult(successful=not reason, reason=reason)
 
+        overriding = QoSOverridingOptions(kinds, callback=check)
         try:
-            return create(
-                msg_type, topic, qos, qos_overriding_options=QoSOverridingOptions(kinds, callback=check), **options
-            )
+            return create(msg_type, topic, qos, qos_overriding_options=overriding, **options)
         except (InvalidQosOverridesError, RuntimeError) as error:
             if not isinstance(error, InvalidQosOverridesError) and "QoS override" not in str(error):
                 raise
@@ -218,16 +205,13 @@ class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy
             raise InputError(f"parameter qos_overrides.{final}.{side}: {reason}") from error
 
     def publish(self, publisher: Publisher, data: bytes) -> None:
-        """Publish CDR bytes on a reliable, keep-all publisher, again until they go through, or this process has to end.
-
-        A slow reader blocks such a writer; after 100 ms the middleware raises, and the message has not been written.
-        """
+        """Publish CDR bytes on a reliable, keep-all publisher, again until they go through or this process ends."""
         while True:
             try:
                 # What Publisher.publish does with bytes, without entering the handle's context each time.
                 publisher.handle.publish_raw(data)
                 return
-            except RCLError:
+            except RCLError:  # a slow reader blocks such a writer: after 100 ms, the message has not been written
                 if not self.context.ok():  # see ``until_shutdown``
                     return
 
@@ -236,7 +220,7 @@ def objection(before: QoSProfile, after: QoSProfile, *, publishes: bool) -> str:
     """Why a quality of service may not be overridden so, or empty text; publishers may become latched."""
     if before.history != HistoryPolicy.KEEP_ALL:  # messages may be lost there anyway
         return ""
-    for policy in LOSSLESS:
+    for policy in ("history", "reliability", "durability", "lifespan"):
         ours, theirs = getattr(before, policy), getattr(after, policy)
         latched_as_well = policy == "durability" and publishes and theirs.name == "TRANSIENT_LOCAL"
         if theirs != ours and not latched_as_well:

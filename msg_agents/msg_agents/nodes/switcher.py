@@ -1,10 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The switcher node: publishes the experiment and the path of the active graph.
-
-In lockstep it keeps ahead of the agents; in real time it publishes the epoch, and each sojourn when it begins.
-"""
+"""The switcher node: publishes the experiment and the path of the active graph."""
 
 from __future__ import annotations
 
@@ -26,6 +23,7 @@ from msg_agents.stepping.monitoring import MILLISECOND, ClockOffsets
 from msg_agents.stepping.newest_values import Schedule
 from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW
 from msg_analysis.arithmetic.reproducible import SECOND
+from msg_analysis.common.files import write_whole
 from msg_analysis.messages import topics
 from msg_analysis.messages.acceptance import Refusal, sojourn_message
 from msg_analysis.messages.messages import encode_string
@@ -34,22 +32,15 @@ from msg_analysis.model.graph_path import Sojourn, sojourns
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import Wiring
 
+# Sojourns that are published before the slowest agent reaches them: enough that no agent waits for one; bounded, so
+# that a long run takes little memory, and below the 5,000 messages that a late reader gets.
 MOST_AHEAD = 1000
-"""Sojourns that are published before the slowest agent reaches them: enough that no agent waits for one; bounded, so
-that a long run takes little memory, and below the 5,000 messages that a late reader gets."""
-
+# Graphs of many agents are large messages, and their agents are slow: only as many as fit BYTES_AHEAD.
 LEAST_AHEAD, BYTES_AHEAD = 50, 1 << 22
-"""Graphs of many agents are large messages, and their agents are slow: only as many sojourns ahead as fit
-BYTES_AHEAD, but at least LEAST_AHEAD."""
-
-MOST_BEHIND = 5000
-"""Sojourns that a reader may be behind: the number of messages that the middleware keeps of a writer."""
-
+MOST_BEHIND = 5000  # sojourns that a reader may be behind: the messages that the middleware keeps of a writer
 REPORT_PERIOD = 0.1  # s
 STOP_NOTICE = 1.0  # s in real time between the news of an early end and that end: time for all nodes to receive it
-
-EPOCH_DELAY = SECOND // 2
-"""ns of the clock from the publication of the epoch to the epoch: time for all nodes to receive it."""
+EPOCH_DELAY = SECOND // 2  # ns of the clock from its publication to the epoch: time for all nodes to receive it
 
 
 class Switcher(NetworkNode):
@@ -92,10 +83,6 @@ class Switcher(NetworkNode):
         self.subscribe(topics.PROGRESS, self._receive)
         every(self, REPORT_PERIOD, self._report)
 
-    def discovered_all(self) -> bool:
-        """Whether all expected nodes have been discovered."""
-        return not self.missing_nodes()
-
     def missing_nodes(self) -> list[str]:
         """Names of nodes that have not been discovered yet; all topics are latched, so readers need not be matched."""
         return self.undiscovered(self._expected)
@@ -106,7 +93,12 @@ class Switcher(NetworkNode):
 
     def health(self) -> Health:
         """Progress of the slowest agent, or which agents have not started."""
-        self._check_names()
+        duplicates = set(self.duplicate_names())
+        for name in duplicates & self._duplicates:  # twice in a row: a killed one may not be gone yet
+            if not self.refused[name, Refusal.DUPLICATE_NAME]:
+                self.refused[name, Refusal.DUPLICATE_NAME] = 1
+                self.get_logger().warning(f"two nodes are called {name}: of different messages, the first is used")
+        self._duplicates = duplicates
         values = {"step of the slowest agent": str(self._slowest)}
         if self._slowest < 0:
             silent = [agent_node_name(i) for i, step in enumerate(self._reached) if step < 0]
@@ -116,15 +108,6 @@ class Switcher(NetworkNode):
     def _health(self, values: dict[str, str]) -> Health:
         """Health once all agents have started; ``values``: facts to include."""
         raise NotImplementedError
-
-    def _check_names(self) -> None:
-        """Warn of a duplicate node when it is seen twice in a row: a killed one may not be gone yet."""
-        there = set(self.duplicate_names())
-        for name in there & self._duplicates:
-            if not self.refused[name, Refusal.DUPLICATE_NAME]:
-                self.refused[name, Refusal.DUPLICATE_NAME] = 1
-                self.get_logger().warning(f"two nodes are called {name}: of different messages, the first is used")
-        self._duplicates = there
 
     def begin(self) -> None:
         """Publish the experiment."""
@@ -166,23 +149,17 @@ class Switcher(NetworkNode):
         """The first step at which the run can end early; None: not known yet. Agents may be there before they know."""
         return max(self._reached) + LOCKSTEP_WINDOW if self._slowest >= 0 else None
 
-    def _look_for_stop(self) -> None:
-        """End the run early, if somebody has asked for it and that is before its planned end."""
-        if self._stops is None or not self._stops.asked() or (step := self._first_end()) is None:
-            return
-        if step >= self._steps:
-            self._stops = None
-            return
-        self._stops.decide(step)
-        self._announce_stop(step)
-
     def _announce_stop(self, step: int) -> None:
         self._stops, self._steps = None, step
         self.publish(self._stop, self.progress(topics.STOP, NOT_AN_AGENT, step))
         self._end_if_complete()
 
     def _report(self) -> None:
-        self._look_for_stop()
+        if self._stops and self._stops.asked() and (step := self._first_end()) is not None:
+            if step < self._steps:
+                self._stops.decide(step)
+                self._announce_stop(step)
+            self._stops = None  # too late to end earlier, or announced
         if self._new_progress:
             self._new_progress = False
             self._on_progress(self._reached)
@@ -262,7 +239,7 @@ class RealtimeSwitcher(Switcher):
     def _receive_health(self, data: bytes) -> None:
         """Compare the clocks of agents with ours: their health has the time at which it was sent."""
         assert self._on_clocks
-        now = self._timer.now()
+        experiment, now = self.record.experiment, self._timer.now()
         array = deserialize_message(data, DiagnosticArray)
         sent = array.header.stamp.sec * SECOND + array.header.stamp.nanosec
         agents = {f"{self.get_namespace()}/{name}".lstrip("/"): name for name in self._own_names()}
@@ -271,8 +248,7 @@ class RealtimeSwitcher(Switcher):
             bounds = [float(value.value) for value in status.values if value.key == CLOCK_BOUND]
             if name not in (None, SWITCHER, RECORDER) and bounds:
                 self._clocks.add(name, sent, now, bounds[0] * MILLISECOND)
-        run = self.record.experiment.run
-        apart = self._clocks.warning(self.record.experiment.step_length / run.speed * SECOND)
+        apart = self._clocks.warning(experiment.step_length / experiment.run.speed * SECOND)
         if apart and not self._apart:
             self.get_logger().warning(apart)
         self._apart = apart
@@ -290,9 +266,8 @@ class RealtimeSwitcher(Switcher):
     def begin(self) -> None:
         """Publish the experiment and, after a takeover, the epoch and the path so far."""
         super().begin()
-        text = self._state_file.read_text(encoding="ascii") if self._state_file and self._state_file.exists() else ""
-        if text:
-            self._start(int(text))
+        if self._state_file and self._state_file.exists():
+            self._start(int(self._state_file.read_text(encoding="ascii")))
 
     def _first_end(self) -> int | None:
         """See Switcher. Agents step by the clock, whatever has been reported."""
@@ -308,17 +283,14 @@ class RealtimeSwitcher(Switcher):
         if self._schedule is None and self._slowest >= 0 and now:
             epoch = now + EPOCH_DELAY
             if self._state_file:  # whole or not at all: a process that takes over must go on with this epoch
-                draft = self._state_file.with_suffix(".draft")
-                draft.write_text(str(epoch), encoding="ascii")
-                draft.replace(self._state_file)
+                write_whole(self._state_file, str(epoch).encode())
             self._start(epoch)
 
     def _start(self, epoch: int) -> None:
         """Publish the epoch, and the path so far."""
         experiment = self.record.experiment
         self._schedule = Schedule(epoch=epoch, speed=experiment.run.speed, step_length=experiment.step_length)
-        publisher = self.publisher_of(topics.EPOCH)
-        self.publish(publisher, self.progress(topics.EPOCH, NOT_AN_AGENT, 0, epoch))
+        self.publish(self.publisher_of(topics.EPOCH), self.progress(topics.EPOCH, NOT_AN_AGENT, 0, epoch))
         self._keep_up()
 
     def _keep_up(self) -> None:

@@ -39,16 +39,13 @@ NOTE_DELAY = 1.0  # s after which a note says that there is no network
 
 
 class Watcher(LeanNode):
-    """Follows the run whose record is given, or the first one that it discovers.
-
-    ``known`` is set when the run is there, and ``done`` (by subclasses) at its end.
-    """
+    """Follows a run: that of the record, if given, else the first. ``known``: it is there; ``done``: it is over."""
 
     ack_timeout = 5.0  # s for readers to acknowledge the last message of this node
 
     def __init__(
         self, name: str, output: Topic, *, on_note: Callable[[str], None], record: RunRecord | None = None
-    ) -> None:
+    ) -> None:  # output: the topic that it publishes
         super().__init__(name)
         self._on_note = on_note
         self._writer: Publisher = self.publisher_of(output)
@@ -61,7 +58,7 @@ class Watcher(LeanNode):
         self._topics: list[str] = []  # topics of states: the run is there while they have publishers
         self.subscribe(topics.EXPERIMENT, self._receive_experiment)
         self.subscribe(topics.END, self._receive_end)
-        self.subscribe(topics.STOP, self._receive_stop)
+        self.subscribe(topics.STOP, self._take_last_step)
 
     def follow(self) -> None:
         """Read the states of the run that has been found; InputError: not possible with this run."""
@@ -121,9 +118,6 @@ class Watcher(LeanNode):
     def _receive_end(self, data: bytes) -> None:
         self._ended = self._take_last_step(data) or self._ended
 
-    def _receive_stop(self, data: bytes) -> None:
-        self._take_last_step(data)
-
     def _take_last_step(self, data: bytes) -> bool:
         """Take the last step of the run; False: of another one."""
         if self.record is None:
@@ -144,6 +138,12 @@ class Watcher(LeanNode):
         if self._topics and not self.known.done() and self._has_publishers():
             self.known.set_result(None)
 
+    def _finish_if_over(self, *, all_there: bool, quiet: bool) -> None:
+        """Finish if all states have arrived, or no more will: the run has ended, or its publishers have gone."""
+        over = all_there or (quiet and (self._ended or not self._has_publishers()))
+        if over and not self.done.done():
+            self.done.set_result(None)
+
     def _has_publishers(self) -> bool:
         return any(self.count_publishers(topic) for topic in self._topics)
 
@@ -158,11 +158,8 @@ def run_watcher(
     on_note: Callable[[str], None] = lambda _: None,
     on_look: Callable[[], None] = lambda: None,  # called about every ``SPIN_SLICE`` s, between two callbacks
 ) -> Kind | None:
-    """Watch a network in this process until it is over or a signal comes; None: interrupted before there was a node.
-
-    If the run was seen to be over, the node is still on the network: end the process at once. InputError: no network
-    within ``timeout`` s (None: no limit), or it cannot be followed.
-    """
+    """Watch a network in this process until it is over or a signal comes; None: interrupted before there was a node."""
+    # If the run was seen to be over, the node is still on the network: the caller has to end the process at once.
     no_network = f"no network {discovery_scope()}"
     os.environ.update(without_shared_memory())
     with ros_arguments():
@@ -191,7 +188,11 @@ def run_watcher(
                 on_note(f"{no_network} yet: waiting for one. {_other_domain()}")
         if not followed:
             node.follow()
-        _spin(executor, node.done, on_look)
+        with Interruption() as interruption:  # raised within a callback, the executor would report it as an error
+            while not node.done.done():
+                interruption.check()
+                on_look()
+                executor.spin_until_future_complete(node.done, timeout_sec=SPIN_SLICE)
         node.wait_for_readers()
     except (KeyboardInterrupt, SystemExit):
         pass
@@ -206,17 +207,14 @@ def run_watcher(
 
 
 def _other_domain() -> str:
-    """How to look elsewhere."""
     mine = os.environ.get("ROS_DOMAIN_ID", "0")
     found = [str(domain) for domain in held_domains() if str(domain) != mine]
     return "Another domain: --domain D" + (f"; runs on this machine are in {', '.join(found)}" if found else "")
 
 
 def _stop_reading(nodes: Sequence[Watcher], executor: Executor | None) -> None:
-    """Remove the readers from the network: who publishes to them would wait until the middleware gives them up, 20 s.
-
-    The participant stays until the end of the process: to remove it while others leave can deadlock, see ``leave``.
-    """
+    """Remove the readers from the network: who publishes to them would wait until the middleware drops them, 20 s."""
+    # The participant stays until the end of the process: to remove it while others leave can deadlock, see ``leave``.
     faulthandler.dump_traceback_later(INTERRUPTED_GRACE, exit=True)  # should that happen here, too
     if executor is not None:
         executor.shutdown()
@@ -224,15 +222,3 @@ def _stop_reading(nodes: Sequence[Watcher], executor: Executor | None) -> None:
         for subscription in list(node.subscriptions):
             node.destroy_subscription(subscription)
     faulthandler.cancel_dump_traceback_later()
-
-
-def _spin(executor: Executor, done: Future, on_look: Callable[[], None]) -> None:
-    """Spin until ``done``; a signal raises KeyboardInterrupt or SystemExit between two callbacks.
-
-    Raised within a callback, the executor would report it as an error.
-    """
-    with Interruption() as interruption:
-        while not done.done():
-            interruption.check()
-            on_look()
-            executor.spin_until_future_complete(done, timeout_sec=SPIN_SLICE)

@@ -30,15 +30,11 @@ YOUTH = 60.0  # s; younger folders may belong to a run that has not locked its o
 
 @contextmanager
 def temporary_directory(room: int | None = None, memory: Path = MEMORY) -> Iterator[Path]:
-    """A folder that is removed at the end; those that killed runs left behind are removed first.
-
-    A lock, which ends with its process, marks folders in use. ``room``: bytes that will be mapped into memory; the
-    folder is then in memory, if there is plenty.
-    """
+    """A folder, in memory if there is ``room`` [bytes], that is removed at the end; first, those of killed runs are."""
     _clear_abandoned(memory)
     parent = memory if room is not None and free_space(memory) > SPARE * room else None
     path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
-    lock = os.open(path, os.O_RDONLY)
+    lock = os.open(path, os.O_RDONLY)  # marks folders in use; ends with its process
     try:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield path
@@ -61,10 +57,7 @@ def _clear_abandoned(memory: Path) -> None:
 
 
 def make_bag_directory(experiment: Experiment, out: Path, *, option: str = "--out: ") -> Path:
-    """Make an empty directory <out>/<name>_<time> for a new bag; no other run can then take that name.
-
-    InputError: it cannot be made; ``option`` is how the user gave ``out``.
-    """
+    """Make an empty directory <out>/<name>_<time> for a new bag; ``option``: how the user gave ``out``."""
     require_utf8(out)
     stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
     candidate, number = out / stem, 2
@@ -72,7 +65,7 @@ def make_bag_directory(experiment: Experiment, out: Path, *, option: str = "--ou
         out.mkdir(parents=True, exist_ok=True)
         while True:
             try:
-                candidate.mkdir()
+                candidate.mkdir()  # no other run can then take that name
                 return candidate
             except FileExistsError:
                 candidate, number = out / f"{stem}_{number}", number + 1
@@ -85,17 +78,13 @@ def load_with_overrides(
     path: Path,
     run: Mapping[str, Any],
     *,
-    name: Callable[[str], str] = "--{}".format,
-    change: Callable[[Any], Any] = lambda document: document,
-    source: str = "",
+    name: Callable[[str], str] = "--{}".format,  # of the new value of a key, in errors
+    change: Callable[[Any], Any] = lambda document: document,  # of other keys of the file, made first
+    source: str = "",  # name of the file then, in errors
 ) -> Experiment:
-    """The experiment, checked once, after values of ``run`` were replaced; None replaces nothing.
-
-    ``processes`` may be a number as text. ``name``: how errors call the new value of a key. ``change``: of other keys
-    of the file, made first; ``source``: how errors call the file then.
-    """
+    """The experiment, checked once, after values of ``run`` were replaced; None replaces nothing."""
     changes = {key: value for key, value in run.items() if value is not None}
-    if str(changes.get("processes", "")).isdigit():
+    if str(changes.get("processes", "")).isdigit():  # it may be a number as text
         changes["processes"] = int(changes["processes"])
     document, source = change(read_yaml(path)), source or str(path)
     if not changes or not isinstance(document, dict) or not isinstance(section := document.get("run", {}), dict):

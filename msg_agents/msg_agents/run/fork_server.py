@@ -1,11 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Processes of nodes: forked from a fork server, which has imported everything, and ended with their parent.
-
-Every forked process is a child of the process that asked for it, which waits for it as for any other: the fork server
-may end, or be killed, at any time.
-"""
+"""Processes of nodes: forked from a fork server, which has imported everything, and ended with their parent."""
 
 from __future__ import annotations
 
@@ -127,12 +123,10 @@ class NodeStart:
 
 
 class ForkServer:
-    """The fork server of a network, as seen by the process that runs it: a context, at whose end the server is gone.
+    """The fork server of a network, as seen by the process that runs it: a context, at whose end the server is gone."""
 
-    It imports while its user goes on; the first fork waits for that. It leaves no process behind but those that it has
-    forked. Where the system cannot do it, or the server cannot start, nothing is forked.
-    """
-
+    # It imports while its user goes on; the first fork waits for that. Every forked process is a child of the process
+    # that asked for it: the server may end, or be killed, at any time. Other systems than Linux cannot do it.
     def __init__(self, environment: Mapping[str, str], log: Path) -> None:
         self._environment = environment
         self._log = log  # of what the server itself prints
@@ -163,10 +157,7 @@ class ForkServer:
         return None if self._process is None else self._process.pid
 
     def fork_nodes(self, nodes: Sequence[NodeStart]) -> list[ForkedProcess]:
-        """Fork processes, each in a session of its own.
-
-        Fewer come back if the server ends, or cannot do it: it is then gone.
-        """
+        """Fork processes, each in a session of its own; fewer if the server ends, or cannot do it: it is then gone."""
         forked: list[ForkedProcess] = []
         for message, descriptors in _messages(nodes):
             if self._control is None or len(message) > LONGEST:
@@ -229,30 +220,19 @@ def _messages(nodes: Sequence[NodeStart]) -> Iterator[tuple[bytes, list[int]]]:
 
 
 def _adopt_orphans(*, adopt: bool) -> bool | None:
-    """Whether this process becomes the parent of processes below it whose own parent has ended: set it.
-
-    Returns what was set before; None where the system has no such setting.
-    """
-    if sys.platform != "linux":
-        return None
-    try:
-        prctl = ctypes.CDLL(None).prctl
-    except (OSError, AttributeError):
-        return None
+    """Set whether this process adopts processes below it whose parent has ended; what was set before, None: cannot."""
     before = ctypes.c_int()
-    if prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(before), 0, 0, 0) or prctl(PR_SET_CHILD_SUBREAPER, adopt, 0, 0, 0):
-        return None
-    return bool(before.value)
+    with contextlib.suppress(OSError, AttributeError):
+        prctl = ctypes.CDLL(None).prctl  # Linux only
+        if not prctl(PR_GET_CHILD_SUBREAPER, ctypes.byref(before), 0, 0, 0):
+            return None if prctl(PR_SET_CHILD_SUBREAPER, adopt, 0, 0, 0) else bool(before.value)
+    return None
 
 
 def serve(
     control: socket.socket, run: Callable[[list[str]], object], read_ahead: Callable[[list[str]], object]
 ) -> NoReturn:
-    """Fork processes as the other side requests it, and end when that does.
-
-    A forked process does ``run`` with the arguments of its command. Before, this process does ``read_ahead`` with the
-    arguments of every command: what that leaves, the forked ones have.
-    """
+    """Fork processes that ``run`` the arguments of their commands, as the other side asks for them; end with that."""
     gc.freeze()  # the collector writes to the objects that it looks at, and their memory would be copied
     gc.enable()
     # Python 3.12 warns of threads, whose locks might be held. Here, only the library of a tracer (LTTng) has any.
@@ -263,7 +243,7 @@ def serve(
             os._exit(0)
         requests = json.loads(message)
         for request, _ in requests:
-            read_ahead(request["arguments"])
+            read_ahead(request["arguments"])  # what that leaves, the forked ones have
         try:
             between = os.fork()  # the parent of those that it forks, until it ends
         except OSError:

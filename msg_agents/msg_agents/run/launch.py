@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Runs under `ros2 launch`, without ``launch``: arguments, which processes, what the end of each means, what follows.
+"""Runs under ``ros2 launch``, without ``launch``: arguments, processes, what the end of each means, what follows.
 
-The processes are those of ``msg-agents run``. ``launch`` itself starts them and handles signals and output
-(``nodes/launch_actions.py``). Killed processes are not started again here.
+``launch`` itself starts the processes and handles signals and output (``nodes/launch_actions.py``).
 """
 
 from __future__ import annotations
@@ -64,15 +63,18 @@ REPLAY_ARGUMENTS = {
     "shutdown": SHUTDOWN,
 }
 """The same for replay.launch.py."""
+# Arguments that launch itself reads, for any launch file.
 OF_LAUNCH = {"sigterm_timeout", "sigkill_timeout", "emulate_tty", "launch-prefix", "launch-prefix-filter"}
-"""Arguments that launch itself reads, for any launch file."""
+ANALYSIS = "msg-analysis"
+VERDICTS: dict[int, str] = {  # of the exit codes of ``msg-analysis compare``
+    ExitCode.DISAGREES: "the run disagrees with the prediction",
+    ExitCode.INCOMPLETE: "data are incomplete: no verdict",
+}
 
 
 def check_names(context: Any, known: Collection[str]) -> None:
-    """InputError: ``ros2 launch`` was given an argument that its launch file does not have; launch ignores these.
-
-    ``context`` is launch's. A launch file that another one includes may be given the arguments of that one, too.
-    """
+    """InputError: ``ros2 launch`` was given an argument that its launch file does not have; launch ignores these."""
+    # A launch file that another one includes may be given the arguments of that one, too.
     values = context.get_locals_as_dict()
     description = getattr(values.get("event"), "launch_description", None)
     sources = [getattr(each, "launch_description_source", None) for each in getattr(description, "entities", ())]
@@ -159,24 +161,15 @@ def player_options(arguments: Mapping[str, str]) -> list[str]:
     return options
 
 
-ANALYSIS = "msg-analysis"
-VERDICTS: dict[int, str] = {
-    ExitCode.DISAGREES: "the run disagrees with the prediction",
-    ExitCode.INCOMPLETE: "data are incomplete: no verdict",
-}
-"""Exit codes of ``msg-analysis compare``."""
-
-
 class LaunchFailedError(Exception):
     """A process has failed: the launch is to end with a failure as exit code."""
 
 
 class LaunchedProcesses:
-    """Processes that ``launch`` starts together: when one fails, the others are stopped; then ``reason`` says why.
+    """Processes that ``launch`` starts together: when one fails, the others are stopped; then ``reason`` says why."""
 
-    The actions of ``launch`` pass on the end of each process, and ask ``to_stop`` and ``analysis`` then.
-    """
-
+    # The actions of ``launch`` pass on the end of each process, and ask ``to_stop`` and ``analysis`` then. Killed
+    # processes are not started again here.
     def __init__(self, namespace: str) -> None:
         self.namespace = namespace.strip()
         self._stack = ExitStack()
@@ -234,11 +227,7 @@ class LaunchedProcesses:
 
 
 class LaunchedNetwork(LaunchedProcesses):
-    """A run whose processes ``launch`` starts.
-
-    Takes the arguments of the launch by the names of NETWORK_ARGUMENTS. InputError: the arguments or the experiment are
-    wrong; no bag has been made.
-    """
+    """A run whose processes ``launch`` starts; InputError: the arguments are wrong, and no bag has been made."""
 
     def __init__(self, arguments: Mapping[str, str]) -> None:
         experiment = load_experiment(arguments)
@@ -256,15 +245,8 @@ class LaunchedNetwork(LaunchedProcesses):
                 out = Path(arguments["out"]).expanduser().absolute()
                 self.bag = make_bag_directory(experiment, out, option="out:=")
             # Of each, ``arguments[0]`` is the executable.
-            processes = lay_out_network(
-                experiment,
-                self._run_file,
-                self.bag,
-                use_sim_time=use_sim_time,
-                parameter_services=services,
-                storage=storage,
-            )
-            self._set(processes)
+            options: dict[str, Any] = {"use_sim_time": use_sim_time, "parameter_services": services}
+            self._set(lay_out_network(experiment, self._run_file, self.bag, storage=storage, **options))
         except BaseException:
             self.close()
             raise
@@ -312,23 +294,16 @@ class LaunchedNetwork(LaunchedProcesses):
 
 
 class LaunchedReplay(LaunchedProcesses):
-    """A player and, if requested, ``live``, which ``launch`` starts; the arguments are those of REPLAY_ARGUMENTS.
-
-    InputError: they are wrong.
-    """
+    """A player and, if requested, ``live``, which ``launch`` starts; InputError: the arguments are wrong."""
 
     def __init__(self, arguments: Mapping[str, str]) -> None:
         player = ("player", *player_options(arguments))
         live = flag(arguments, "live")
         super().__init__(arguments["namespace"])
         if live:
-            processes = [
-                ProcessSpec("live", ("live", "--reliable")),
-                ProcessSpec("player", (*player, "--await", "live")),
-            ]
-        else:
-            processes = [ProcessSpec("player", player)]
-        self._set(processes)
+            player = (*player, "--await", "live")
+        watcher = [ProcessSpec("live", ("live", "--reliable"))] if live else []
+        self._set([*watcher, ProcessSpec("player", player)])
 
 
 def environment() -> dict[str, str]:

@@ -1,11 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Files in which the processes of a run report to the runner: neither side ever waits for the other.
-
-Status files have refused messages and what the nodes wait for; the file of steps, how far every agent is; that of
-clocks, how far those of several hosts are apart.
-"""
+"""Files in which the processes of a run report to the runner, so that neither side waits for the other; the result."""
 
 from __future__ import annotations
 
@@ -14,7 +10,7 @@ import json
 import signal
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -26,9 +22,6 @@ from msg_analysis.model.run import Run
 
 if TYPE_CHECKING:
     from msg_analysis.inference.comparison import Comparison
-
-
-Refused = tuple[str, str, str, int]  # node, topic, reason, count
 
 
 @dataclass(slots=True)
@@ -46,55 +39,32 @@ class StatusSummary:
         ]
 
 
-def write_status(path: Path, refused: Sequence[Refused], waiting: Mapping[str, str]) -> None:
-    """Replace the status file of one process atomically; an error such as a full disk is ignored."""
-    _replace(path, {"refused": refused, "waiting": waiting})
+def write_report(path: Path, document: Any) -> None:
+    """Replace a file as a whole; an error such as a full disk is ignored."""
+    with contextlib.suppress(OSError):
+        write_whole(path, json.dumps(document).encode())
 
 
-def write_steps(path: Path, steps: Sequence[int]) -> None:
-    """Replace the newest step of every agent; an error such as a full disk is ignored."""
-    _replace(path, list(steps))
+def read_report(path: Path) -> Any:
+    """What is in such a file; None: it is not there, or damaged."""
+    with contextlib.suppress(OSError, ValueError):
+        return json.loads(path.read_bytes())
+    return None
 
 
 def read_steps(path: Path) -> list[int]:
     """The newest step of every agent; empty as long as there is no such file."""
-    with contextlib.suppress(OSError, ValueError):
-        steps: list[int] = json.loads(path.read_text(encoding="utf-8"))
-        return steps
-    return []
-
-
-def write_clocks(path: Path, offsets: Sequence[Mapping[str, Any]], warning: str | None) -> None:
-    """Replace what the switcher knows of the clocks of several hosts; an error such as a full disk is ignored."""
-    _replace(path, {"offsets": list(offsets), "warning": warning})
-
-
-def read_clocks(path: Path) -> tuple[list[dict[str, Any]] | None, str | None]:
-    """Offsets of the clocks (None: not compared), and which are too far apart."""
-    with contextlib.suppress(OSError, ValueError):
-        document = json.loads(path.read_text(encoding="utf-8"))
-        return document["offsets"], document["warning"]
-    return None, None
-
-
-def _replace(path: Path, document: Any) -> None:
-    """Whole or not at all, whatever ends this process."""
-    with contextlib.suppress(OSError):
-        temporary = path.with_suffix(".part")
-        temporary.write_text(json.dumps(document), encoding="utf-8")
-        temporary.replace(path)
+    return read_report(path) or []
 
 
 def read_status_files(paths: Iterable[Path]) -> StatusSummary:
-    """Add up status files, given in the order of the starts; missing or damaged files are left out."""
+    """Add up the status files of processes, given in the order of their starts."""
     status = StatusSummary()
     waiting: dict[str, str] = {}
-    for path in paths:
-        with contextlib.suppress(OSError, ValueError):
-            document = json.loads(path.read_text(encoding="utf-8"))
-            for *what, count in document["refused"]:
-                status.refused[tuple(what)] += count
-            waiting |= document["waiting"]  # later processes are more recent; "": does not wait
+    for document in filter(None, map(read_report, paths)):
+        for *what, count in document["refused"]:
+            status.refused[tuple(what)] += count
+        waiting |= document["waiting"]  # later processes are more recent; "": does not wait
     status.waiting = {node: message for node, message in waiting.items() if message}
     return status
 
@@ -103,10 +73,7 @@ _STATUS_PERIOD = 1.0  # s between two readings of the status files
 
 
 class EventLog:
-    """Appends dictionaries with "kind", "step", "node" and "words" to a list.
-
-    The kind is "killed", "back" or "refused". The step is that of the node that was killed, else the newest of all.
-    """
+    """Appends dictionaries with "kind" (killed, back, refused), "step", "node" and "words" to a list."""
 
     def __init__(self, events: list[dict[str, Any]], clock: Callable[[], float] = time.monotonic) -> None:
         self._events, self._clock = events, clock
@@ -116,11 +83,8 @@ class EventLog:
         self._newest = 0
 
     def killed(self, node: str, agents: Sequence[int], step: int, words: str) -> None:
-        """Note that a process, with these agents (from 0), has ended after this step.
-
-        One without agents, such as the switcher, is not known to be back: it makes no steps.
-        """
-        if agents:
+        """Note that a process, with these agents (from 0), has ended after this step."""
+        if agents:  # one without any, such as the switcher, makes no steps: it is not known to be back
             self._absent[node] = agents, step
         self._add("killed", step if agents else self._newest, node, words)
 
@@ -134,9 +98,8 @@ class EventLog:
         if self._clock() < self._next_status and not last:
             return
         self._next_status = self._clock() + _STATUS_PERIOD
-        for key in sorted(set(status().refused) - self._refused):
-            self._refused.add(key)
-            node, topic, reason = key
+        for node, topic, reason in sorted(set(status().refused) - self._refused):
+            self._refused.add((node, topic, reason))
             self._add("refused", newest, node, f"{node}: refused on {topic}: {reason} (first noticed)")
 
     def _add(self, kind: str, step: int, node: str, words: str) -> None:
@@ -264,7 +227,7 @@ class RunResult:
 
 
 def _without_comparison(experiment: Experiment) -> dict[str, Any]:
-    """What `msg-analysis tabulate` reads of a result, without numbers."""
+    """What ``msg-analysis tabulate`` reads of a result, without numbers."""
     from msg_analysis.inference.estimates import Estimate
 
     return {
@@ -277,10 +240,7 @@ def _without_comparison(experiment: Experiment) -> dict[str, Any]:
 
 
 def conclude(result: RunResult, report: ReportWhen = "always") -> None:
-    """Set the ``comparison`` of a run whose bag was read, and write report.html and result.json into the bag.
-
-    InputError: there is no prediction, the bag lacks what is needed, or the report cannot be written.
-    """
+    """Set the ``comparison`` of a run whose bag was read, and write report.html and result.json into the bag."""
     if result.trajectory is None or result.bag is None:
         return
     from msg_analysis.inference.pool import compare

@@ -7,20 +7,18 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from msg_agents.channel.channel_file import BASE, Channel
-from msg_agents.channel.links import read_counts
-from msg_agents.channel.process import ActiveGraphFile, Host, hand_over, open_hosts
+from msg_agents.channel.process import ActiveGraphFile, Host, hand_over
 from msg_agents.discovery.rtps import LEASE, PEERS_VARIABLE, profile_for_hosts
 from msg_agents.environment import channel_environment
 from msg_agents.process_layout import SWITCHER, ProcessSpec
+from msg_agents.run.result import read_report
 from msg_agents.run.supervisor import Supervisor
 from msg_analysis.common.text import counted, percent
 from msg_analysis.errors import InputError
@@ -38,21 +36,16 @@ MOST_Z = 5.0  # of the packets that a pair lost; by chance, any of 1000 pairs is
 SHOWN_PAIRS = 3
 
 
-@dataclass(slots=True)
 class RunChannel:
     """The channel of one run. The hosts are open."""
 
-    channel: Channel
-    hosts: dict[str, Host]
-    _active: ActiveGraphFile | None = field(default=None, init=False)  # if packets follow the graph
-    _lockstep: bool = field(default=False, init=False)
-    _steps: list[int] = field(default_factory=list, init=False)  # of the agents, and since when [s]
-    _since: float = field(default=0.0, init=False)
-
-    @property
-    def agents(self) -> list[tuple[int, ...]]:
-        """The agents (from 0) of each host that has any."""
-        return [agents for agents in self.channel.hosts.values() if agents]
+    def __init__(self, channel: Channel, hosts: dict[str, Host]) -> None:
+        self.channel, self.hosts = channel, hosts
+        self.agents = [agents for agents in channel.hosts.values() if agents]  # (from 0) of each host that has any
+        self._active: ActiveGraphFile | None = None  # if packets follow the graph
+        self._lockstep = False
+        self._steps: list[int] = []  # of the agents, and since when [s]
+        self._since = 0.0
 
     def environment(self, folder: Path) -> dict[str, str]:
         """Changes of the environment of all processes, with a profile in ``folder``."""
@@ -79,11 +72,9 @@ class RunChannel:
         hand_over(control, self.channel, self.hosts, counts, active_graph, joined)
 
     def look(self, supervisor: Supervisor) -> None:
-        """Let processes that were started again find all others, as at the start of the run; in lockstep, let it go on.
-
-        There an agent also waits for those to which the graph cuts its link for longer than the window of the lockstep,
-        and the graph changes only when all go on.
-        """
+        """Let processes that were started again find all others, as at the start, and a run in lockstep go on."""
+        # There an agent also waits for those to which the graph cuts its link for longer than the window of the
+        # lockstep, and the graph changes only when all go on.
         if self._active is None:
             return
         if supervisor.steps != self._steps or not self._lockstep:
@@ -99,7 +90,7 @@ class RunChannel:
             name: {"address": host.address, "agents": [agent + 1 for agent in self.channel.hosts[name]]}
             for name, host in self.hosts.items()
         }
-        counts = read_counts(supervisor.channel_status) or {"pairs": [], "overflowed": 0, "late_ms": None}
+        counts = read_report(supervisor.channel_status) or {"pairs": [], "overflowed": 0, "late_ms": None}
         for pair in counts["pairs"]:
             model = self.channel.links[pair["sender"], pair["receiver"]].loss
             pair |= {"loss": model.mean, "inflation": model.inflation}
@@ -110,11 +101,8 @@ class RunChannel:
 
 
 def predicted_errors(channel: Channel, experiment: Experiment) -> dict[str, Any] | None:
-    """Errors predicted before the run: in place of what the channel loses, the last value received; nothing is late.
-
-    None where that is not what happens (lockstep, reliable delivery, losses in the experiment itself, packets that the
-    graph cuts, bursts, which are of packets and not of the messages of a link), or where it has no prediction.
-    """
+    """Errors predicted before the run: in place of what the channel loses, the last value received; nothing is late."""
+    # None where that is not what happens: bursts are of packets and not of the messages of a link, for example.
     run, noise = experiment.run, experiment.noise
     if run.pace == "lockstep" or run.delivery == "reliable" or noise.loss.any or channel.graph:
         return None
@@ -130,16 +118,6 @@ def predicted_errors(channel: Channel, experiment: Experiment) -> dict[str, Any]
     except InputError:
         return None
     return {"system_error": predicted.system_error, "node_errors": predicted.node_errors.tolist()}
-
-
-@contextmanager
-def run_channel(channel: Channel | None) -> Iterator[RunChannel | None]:
-    """Open the hosts of a channel; None: without one. NotAvailableError: this machine or user cannot have them."""
-    if channel is None:
-        yield None
-        return
-    with open_hosts(list(channel.hosts), channel.mtu) as hosts:
-        yield RunChannel(channel, hosts)
 
 
 def channel_findings(

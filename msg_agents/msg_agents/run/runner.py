@@ -9,11 +9,12 @@ import shutil
 import signal
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 
 from msg_agents.channel.channel_file import Channel
+from msg_agents.channel.process import open_hosts
 from msg_agents.environment import RESTARTS, ROS_LOGS, require_middleware, run_environment, uses_relay
 from msg_agents.process_layout import (
     MOST_PROCESSES,
@@ -29,7 +30,7 @@ from msg_agents.recovery import entry_size, room_for
 from msg_agents.run.folder import make_bag_directory, temporary_directory
 from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.result import EventLog, RunResult
-from msg_agents.run.run_channel import RunChannel, run_channel
+from msg_agents.run.run_channel import RunChannel
 from msg_agents.run.supervisor import CLOCKS, CRASHED, HUNG, LATE, STATUS_FOLDER, STEPS, Supervisor
 from msg_agents.stepping.monitoring import ClockDetector, LagDetector, StallDetector
 from msg_agents.terminal import Interruption
@@ -142,17 +143,17 @@ def run_network(
     signals = interruption or Interruption()
     try:
         with (
-            run_channel(channel) as linked,
+            open_hosts(list(channel.hosts), channel.mtu) if channel else nullcontext() as opened,
             temporary_directory() as folder,
-            run_environment(
-                folder, domain, {**(environment or {}), **(linked.environment(folder) if linked else {})}, count + 2
-            ) as around,
+            ExitStack() as stack,
         ):
-            variables = around.environment
+            linked = RunChannel(channel, opened) if channel and opened else None
+            changes = {**(environment or {}), **(linked.environment(folder) if linked else {})}
+            domain, variables, relay = stack.enter_context(run_environment(folder, domain, changes, count + 2))
             with ForkServer(variables, folder / "fork_server.log") if fork else nullcontext() as fork_server:
                 require_middleware(variables, *([fork_server.has_middleware] if fork_server else []))
                 if assignment is None and linked is None:  # tools of the user do not reach a channel
-                    view.joined(around.domain)
+                    view.joined(domain)
                 record = replace(record or new_record(experiment), until=until)
                 run_file = folder / "run.json"
                 run_file.write_text(record.to_json(with_key=True), encoding="utf-8")
@@ -166,7 +167,7 @@ def run_network(
                         variables,
                         last_step=experiment.steps,
                         fork_server=fork_server,
-                        relay=around.relay,
+                        relay=relay,
                         hung_timeout=hung_timeout,
                         ends_hung=assignment is None,  # with several hosts, the switcher waits for others at its end
                     ) as supervisor,
@@ -180,33 +181,24 @@ def run_network(
                         storage=storage,
                         assignment=assignment,
                         readers=readers,
-                        most=MOST_PROCESSES if around.relay else MOST_UNAIDED,
+                        most=MOST_PROCESSES if relay else MOST_UNAIDED,
                         hosts=linked.agents if linked else (),
                     )
+                    lockstep = experiment.run.pace == "lockstep"
                     if linked:
-                        linked.start(supervisor, processes, record.model, lockstep=experiment.run.pace == "lockstep")
-                    if around.relay:
-                        around.relay.connect(partners(processes, record.model.listens()))
-                    if pin and experiment.run.pace == "lockstep":
-                        supervisor.cores = assign_cores(processes, available_cores(), first=around.domain)
+                        linked.start(supervisor, processes, record.model, lockstep=lockstep)
+                    if relay:
+                        relay.connect(partners(processes, record.model.listens()))
+                    if pin and lockstep:
+                        supervisor.cores = assign_cores(processes, available_cores(), first=domain)
                     supervisor.start(processes)
                     ending = EarlyEnd(record, checkpoints) if until and checkpoints else None
                     with ending or nullcontext():
-                        view.begin(
-                            record, checkpoints if assignment is None else None, ending.observer if ending else None
-                        )
+                        kept_here = checkpoints if assignment is None else None
+                        view.begin(record, kept_here, ending.observer if ending else None)
                         view.started(supervisor.by_node)
-                        _watch(
-                            supervisor,
-                            experiment,
-                            result,
-                            restarts,
-                            signals,
-                            view,
-                            ending,
-                            linked,
-                            follow_clock=not use_sim_time,
-                        )
+                        parts = supervisor, result, restarts, signals, view, ending, linked
+                        _watch(*parts, follow_clock=not use_sim_time)
                         view.end()
                     result.until = ending.to_json() if ending else None
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
@@ -236,10 +228,9 @@ def run_network(
 
 def _watch(
     supervisor: Supervisor,
-    experiment: Experiment,
     result: RunResult,
     restarts: int,
-    interruption: Interruption,
+    signals: Interruption,
     view: View,
     ending: EarlyEnd | None,
     linked: RunChannel | None,
@@ -248,12 +239,12 @@ def _watch(
 ) -> None:
     """Watch until all have done their part, one has failed for good, or a signal has ended the run."""
     began: float | None = None
-    stall, steps, run = StallDetector(), experiment.steps, experiment.run
-    due = run.speed / experiment.step_length  # steps per second in real time
+    stall, steps, run = StallDetector(), result.experiment.steps, result.experiment.run
+    due = run.speed / result.experiment.step_length  # steps per second in real time
     lag, clock = (LagDetector(due), ClockDetector()) if run.pace == "realtime" and follow_clock else (None, None)
     events, warned = EventLog(result.events), None
     will_begin = SWITCHER in supervisor.by_node  # with several hosts, one has it; the others do not know
-    while interruption.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
+    while signals.caught is None and _revive(supervisor, result, restarts, view, events) and supervisor.awaited:
         if linked:
             linked.look(supervisor)
         time.sleep(FIRST_POLL if will_begin and began is None else POLL)
@@ -340,7 +331,8 @@ def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: I
 
 def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
     try:
-        shutil.copytree(folder, directory, ignore=shutil.ignore_patterns(STATUS_FOLDER, STEPS, CLOCKS, ROS_LOGS))
+        unwanted = shutil.ignore_patterns(STATUS_FOLDER, STEPS, CLOCKS, ROS_LOGS, ".*")  # hidden: drafts
+        shutil.copytree(folder, directory, ignore=unwanted)
     except OSError as error:
         # The argument of shutil.Error is a list of (from, to, reason).
         reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)

@@ -1,11 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Starts the processes of a network, watches them and ends them: none outlives its parent, none that has hung stays.
-
-A process has hung when its main thread waits, and has not run for a minute, though nobody has stopped it. The main
-thread of a node that waits for others, for its clock, or for a slow reader still runs several times a second.
-"""
+"""Starts the processes of a network, watches them and ends them: none outlives its parent, none that has hung stays."""
 
 from __future__ import annotations
 
@@ -25,15 +21,12 @@ from typing import Any, Self
 from msg_agents.discovery.relay import DiscoveryRelay
 from msg_agents.process_layout import CHANNEL, RECORDER, SWITCHER, Process, ProcessSpec, pin_to_core
 from msg_agents.run.fork_server import SHOW_STACKS, ForkServer, NodeStart
-from msg_agents.run.result import StatusSummary, read_clocks, read_status_files, read_steps
+from msg_agents.run.result import StatusSummary, read_report, read_status_files, read_steps
 from msg_analysis.errors import ExitCode
 
+# Signals and the seconds that a process has to obey each; the second ones for one that has hung.
 ESCALATION = ((signal.SIGINT, 5.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 5.0))
-"""Signals and the seconds that a process has to obey each."""
-
 AFTER_HANG = ((SHOW_STACKS, 0.5), (signal.SIGKILL, 5.0))
-"""The same for a process that has hung."""
-
 AT_ONCE = 50  # processes that are started together: so many log files are then open
 POLL = 0.02  # s
 CHECK_PERIOD = 1.0  # s between two checks whether processes have hung
@@ -52,6 +45,8 @@ WAITS = "S"  # of the states of proc(5): neither running, nor waiting for a disk
 class HungDetector:
     """Watches one process; where the system does not say when threads run, no process has ever hung."""
 
+    # It has hung when its main thread waits, and has not run for a minute, though nobody has stopped it. That of a node
+    # that waits for others, for its clock, or for a slow reader still runs several times a second.
     def __init__(
         self, pid: int, *, clock: Callable[[], float] = time.monotonic, wall: Callable[[], float] = time.time
     ) -> None:
@@ -138,15 +133,11 @@ class Child:
 
     @property
     def resumes(self) -> bool:
-        """Whether it can take over from itself, and starting it again makes sense.
-
-        It does for a process that was killed, for whatever reason. A crash of its own will probably repeat: one more
-        try. It does not after bad input, failed discovery or an order to stop.
-        """
+        """Whether it can take over from itself, and starting it again makes sense: not after bad input, for example."""
         code = self.process.poll()
         if not self.spec.resumes or code is None:
             return False
-        return code < 0 or (code == CRASHED and self.number == 1)
+        return code < 0 or (code == CRASHED and self.number == 1)  # a crash of its own will probably repeat: one try
 
     def last_line(self) -> str:
         """The last line that it printed; none of one that was ended, since it did not say why."""
@@ -160,11 +151,9 @@ class Child:
 
 @dataclass(slots=True)
 class Supervisor:
-    """The processes of one run; at the end of the context they are ended.
+    """The processes of one run; at the end of the context they are ended."""
 
-    They have sessions of their own, so that Ctrl-C reaches only the parent; they end when its pipe to them closes.
-    """
-
+    # They have sessions of their own, so that Ctrl-C reaches only the parent; they end when its pipe to them closes.
     logs: Path  # directory for what the children print
     environment: Mapping[str, str]  # of the children
     children: list[Child] = field(default_factory=list)  # as started; a restarted one keeps its place
@@ -234,7 +223,7 @@ class Supervisor:
             return NodeStart(command, {option: int(control)}, output, None)
         status_file = self.logs / STATUS_FOLDER / f"{spec.name}.{number}.json"
         self._status_files.append(status_file)
-        arguments = [*spec.arguments, "--account", str(status_file), *self.options.get(spec.name, ())]
+        arguments = [*spec.arguments, "--status-file", str(status_file), *self.options.get(spec.name, ())]
         if spec.name == SWITCHER:
             arguments += ["--steps", str(self.logs / STEPS), "--clocks", str(self.logs / CLOCKS)]
         descriptors = {"--lifeline": self._lifeline[0]}
@@ -268,7 +257,10 @@ class Supervisor:
             self.channel.process.send_signal(signal.SIGKILL)
         if self.ends_hung and time.monotonic() >= self._checked + CHECK_PERIOD:
             self._checked = time.monotonic()
-            self._end_hung()
+            for child in self.running:
+                if words := child.detector.update(self.hung_timeout):  # the others would wait for it for ever
+                    child.end_reason = f"{words} (stacks in log/{child.log.name})"
+                    self._end([child], AFTER_HANG)
         switching = any(child.running for child in self.children if child.spec.name == SWITCHER)
         for child in self.children:
             if not self.steps or not switching or not child.spec.agents or child.process.poll() != 0:
@@ -277,18 +269,9 @@ class Supervisor:
             behind = min(self.steps[agent] for agent in child.spec.agents) < self.last_step
             child.early = behind and time.monotonic() > child.ended + EARLY
 
-    def _end_hung(self) -> None:
-        """End processes that have hung: the others would wait for them for ever."""
-        for child in self.running:
-            if words := child.detector.update(self.hung_timeout):
-                child.end_reason = f"{words} (stacks in log/{child.log.name})"
-                self._end([child], AFTER_HANG)
-
     def dismiss_late(self) -> list[str]:
-        """Interrupt processes that have not left long after the switcher; the names of those that are now interrupted.
-
-        The middleware may not have given them the end of the run; one that was stopped then is not given it any more.
-        """
+        """Interrupt processes that have not left long after the switcher; the names of those interrupted now."""
+        # The middleware may not have given them the end of the run; one that was stopped is not given it any more.
         if not any(child.spec.name == SWITCHER and child.ended_well for child in self.children):
             return []
         self._over_since = self._over_since or time.monotonic()
@@ -316,8 +299,9 @@ class Supervisor:
         return read_status_files(self._status_files)
 
     def clocks(self) -> tuple[list[dict[str, Any]] | None, str | None]:
-        """How far the clocks of several hosts are apart, and a warning."""
-        return read_clocks(self.logs / CLOCKS)
+        """How far the clocks of several hosts are apart (None: not compared), and a warning."""
+        report = read_report(self.logs / CLOCKS) or {}
+        return report.get("offsets"), report.get("warning")
 
     @property
     def silent(self) -> list[Child]:
@@ -333,11 +317,11 @@ class Supervisor:
     @property
     def over(self) -> bool:
         """Whether all have done their part: no process leaves before, and the switcher only after it has said so."""
+        names = {child.spec.name for child in self.children}
         ended = {child.spec.name for child in self.children if child.ended_well}
-        rest = {child.spec.name for child in self.children} - ended
-        if all(child.spec.name != SWITCHER for child in self.children):  # it is on another host
+        if SWITCHER not in names:  # it is on another host
             return bool(ended)
-        return SWITCHER in ended or (bool(ended) and rest == {SWITCHER})
+        return SWITCHER in ended or (bool(ended) and names - ended == {SWITCHER})
 
     @property
     def awaited(self) -> list[Child]:
@@ -366,12 +350,8 @@ class Supervisor:
                 if child.running:
                     child.process.send_signal(number)
             deadline = time.monotonic() + timeout
-            while any(child.running for child in children):
-                if time.monotonic() > deadline:
-                    break
+            while any(child.running for child in children) and time.monotonic() < deadline:
                 time.sleep(POLL)
-            else:
-                return
 
     def __enter__(self) -> Self:
         return self

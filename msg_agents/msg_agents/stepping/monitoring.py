@@ -1,12 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Stalls, lags and clocks: when to warn that no steps are made, or fewer than in real time, or that clocks differ.
-
-Steps in real time follow the clock of the system, which can be set while they do; on several hosts there are several.
-A message sent at s of its sender's clock and received at r of ours has taken r - s plus how far the sender's clock is
-ahead, which is not negative: r - s bounds the offset from one side, and the other direction from the other.
-"""
+"""Stalls, lags and clocks: when to warn that no steps are made, or fewer than in real time, or that clocks differ."""
 
 from __future__ import annotations
 
@@ -17,8 +12,7 @@ from math import inf
 from typing import Any
 
 STALL_TIME = 5.0  # s without a step, after which an agent counts as stalled
-LAG_TIME = 2.0
-"""s by which a run in real time is behind its clock after which it counts as too slow; agents report every 0.2 s."""
+LAG_TIME = 2.0  # s behind its clock after which a run in real time counts as too slow; agents report every 0.2 s
 CLOCK_STEP = 0.5  # s by which the clock must have been set to be noted
 
 
@@ -83,14 +77,10 @@ class ClockDetector:
         if abs(forward) < CLOCK_STEP:
             return None
         if forward > 0.0:
-            return (
-                f"the clock of this machine was set forward by {forward:.1f} s, or the machine slept: the steps of "
-                "that time are made at once, too late"
-            )
-        return (
-            f"the clock of this machine was set back by {-forward:.1f} s: no step is due until it is there again, "
-            "since steps in real time follow it; a new run begins at once"
-        )
+            what = f"forward by {forward:.1f} s, or the machine slept: the steps of that time are made at once, too"
+            return f"the clock of this machine was set {what} late"
+        what = f"back by {-forward:.1f} s: no step is due until it is there again, since steps in real time follow it"
+        return f"the clock of this machine was set {what}; a new run begins at once"
 
 
 MILLISECOND = 1e6  # ns
@@ -112,14 +102,13 @@ class Offset:
 class ClockOffsets:
     """Of the clocks of some nodes, by name."""
 
+    # A message sent at s of its sender's clock and received at r of ours has taken r - s plus how far that clock is
+    # ahead, which is not negative: s - r bounds the offset from below, and the other direction from above.
     def __init__(self) -> None:
         self._offsets: dict[str, Offset] = {}
 
     def add(self, node: str, sent: int, received: int, at_most: float = inf) -> None:
-        """Take a message that a node sent at ``sent`` of its clock, and that came at ``received`` of ours.
-
-        ``at_most``: how far its clock is ahead at most, by what it has received from here; all in ns.
-        """
+        """Take a message: times of its clock and ours, and how far its own is ahead ``at_most``, by ours to it [ns]."""
         offset = self._offsets.setdefault(node, Offset())
         offset.low = max(offset.low, float(sent - received))
         offset.high = min(offset.high, at_most)

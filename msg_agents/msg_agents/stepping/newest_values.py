@@ -1,11 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What an agent uses in real time: the newest values it has. No ROS, no arithmetic, no clock.
-
-The agent makes each step when it is due: with the newest graph that it knows and the newest value that it has of every
-neighbour under that graph. Nothing waits, so nothing is buffered.
-"""
+"""What an agent uses in real time: the newest values it has. No ROS, no arithmetic, no clock."""
 
 from __future__ import annotations
 
@@ -18,15 +14,11 @@ from msg_agents.stepping.synchronizer import NOTHING, AgentInputs, Value
 from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.messages.acceptance import Refusal
 
-CLOCK_MARGIN = 1.0
-"""s of the clock by which the clock of another host, or a message from there, may be ahead of ours."""
+CLOCK_MARGIN = 1.0  # s of the clock by which that of another host, or a message from there, may be ahead of ours
 
 
 class Schedule:
-    """Simulated time on a clock, and the steps of one agent in it.
-
-    Step k, from x(k) to x(k+1), is due at simulated time (k + phase) dt, 0 <= phase < 1: see ``StepClock``.
-    """
+    """Simulated time on a clock: step k, from x(k) to x(k+1), is due at the time (k + phase) dt, 0 <= phase < 1."""
 
     def __init__(self, *, epoch: int, speed: float, step_length: float, phase: float = 0.0) -> None:
         self.epoch = epoch  # time of the clock [ns] at which simulated time is 0
@@ -62,11 +54,10 @@ class Schedule:
 
 
 class NewestValues(AgentInputs[Value]):
-    """The newest values of one agent; ``reach`` gives the newest step that any agent can have reached by now.
+    """The newest values of one agent; ``reach``: the newest step that any agent can have by now, newer are refused."""
 
-    Newer states are refused. Other options as in AgentInputs.
-    """
-
+    # The agent makes each step when it is due: with the newest graph that it knows and the newest value that it has of
+    # every neighbour under that graph. Nothing waits, so nothing is buffered.
     def __init__(self, *, reach: Callable[[], int], **options: Any) -> None:
         super().__init__(**options)
         self._reach = reach
@@ -76,11 +67,8 @@ class NewestValues(AgentInputs[Value]):
         self._first_step = NOTHING  # of the newest sojourn
 
     def learn(self, mode: int, first_step: int) -> str | None:
-        """Take a sojourn of the run's path as the newest; None if taken, else a ``Refusal``.
-
-        One may be missing before it: it was over before it arrived here.
-        """
-        if first_step <= self._first_step:
+        """Take a sojourn of the run's path as the newest; None if taken, else a ``Refusal``."""
+        if first_step <= self._first_step:  # one that is missing before it was over before it arrived here
             return Refusal.REPEATED
         if not self._within_reach(first_step):
             return Refusal.TOO_EARLY
@@ -125,10 +113,7 @@ class NewestValues(AgentInputs[Value]):
         return self._mode is not None and self.step < self.steps
 
     def inputs(self) -> tuple[int, list[tuple[int, Value | None]]]:
-        """Mode of the due step; step and value of the state to use of each agent that its row uses, ascending.
-
-        ``(NOTHING, None)`` where the agent's own value is to be used.
-        """
+        """Mode of the due step; step and value to use of each agent in its row, NOTHING and None: the own value."""
         assert self._mode is not None, "not ready"
         return self._mode, [self._used(j) for j in self._inputs[self._mode]]
 
@@ -152,12 +137,10 @@ class NewestValues(AgentInputs[Value]):
 
 
 class NewestReceived(NewestValues[Value]):
-    """The same with messages that are lost, or ``delay`` steps old.
+    """The same with messages that are lost, or ``delay`` steps old."""
 
-    Of an agent with a newest state x(n), a step uses the newest of those up to x(n - delay), and the own value where
-    that one is ``lost`` (of agent and step) or nothing came; with ``holds``, the newest of these that is not lost.
-    """
-
+    # Of an agent with a newest state x(n), a step uses the newest of those up to x(n - delay), and the own value where
+    # that one is ``lost`` (of agent and step) or nothing came; with ``holds``, the newest of these that is not lost.
     def __init__(self, *, delay: int, lost: Callable[[int, int], bool], holds: bool, **options: Any) -> None:
         super().__init__(**options)
         self._delay, self._lost, self._holds = delay, lost, holds

@@ -20,8 +20,9 @@ from msg_analysis.messages.topics import TRUTHS, Topic
 from msg_analysis.model.run_record import RunRecord
 
 _MASK = 0x3FFFFFFF  # of the bits of a content that are in its hash
-CONSECUTIVE = 64
-"""Steps in a row after which those before them are taken for lost: the reader came late, for example."""
+CONSECUTIVE = 64  # steps in a row after which those before them are taken for lost: the reader came late, for example
+_WORD = 4  # bytes; every message in the agents' layout is a multiple of it
+_HASH_SHIFT = np.uint64(34)  # the 30 highest bits of a sum are the hash of a message
 
 
 def hashes_of(contents: IntArray) -> array[int]:
@@ -30,24 +31,18 @@ def hashes_of(contents: IntArray) -> array[int]:
 
 
 class ReceivedSteps:
-    """The steps 0 to ``last`` of one agent, in any order: after a restart some come again.
+    """The steps 0 to ``last`` of one agent, in any order: after a restart some come again."""
 
-    A hash of 4 bytes per step shows whether a repeated one is the same, up to RESEND_LIMIT steps before and after
-    ``row``, the newest step up to which none is to come any more.
-    """
-
+    # A hash of 4 bytes per step shows whether a repeated one is the same, up to RESEND_LIMIT steps around ``row``.
     def __init__(self, last: int) -> None:
-        self.row = -1
+        self.row = -1  # the newest step up to which none is to come any more
         self._last = last
         self._chain = (0, 0)  # the step that would continue the newest ones beyond ``row``, and how many these are
         # 0: not received. Negative: two different ones were.
         self._hashes = array("i", bytes(4 * min(2 * RESEND_LIMIT, last + 1)))
 
     def take(self, step: int, content: int) -> str | None:
-        """Take a step with a hash of its content; None if it is new, else a ``Refusal``.
-
-        Of two different ones of one step, the second is a contradiction; further ones count as repeated.
-        """
+        """Take a step with a hash of its content; None if it is new, else a ``Refusal``."""
         if step > self._last:
             return Refusal.OUT_OF_RANGE
         if step <= self.row - RESEND_LIMIT:
@@ -66,7 +61,7 @@ class ReceivedSteps:
             while self.row < self._last and self._hashes[(self.row + 1) % len(self._hashes)]:
                 self._move(self.row + 1)
             return None
-        if known == value or known < 0:
+        if known == value or known < 0:  # of different ones of one step, the second is a contradiction, no further ones
             return Refusal.REPEATED
         self._hashes[slot] = -known
         return Refusal.CONTRADICTION
@@ -100,10 +95,6 @@ class ReceivedSteps:
         self.row = row
 
 
-_WORD = 4  # bytes; every message in the agents' layout is a multiple of it
-_HASH_SHIFT = np.uint64(34)  # the 30 highest bits of a sum are the hash of a message
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Received:
     """States to be written, in the order in which they came, and what was refused."""
@@ -118,12 +109,9 @@ class Received:
 
 
 class StateReceiver:
-    """Takes the batches of a topic (STATES or TRUTHS); ``of``: the topic of the same states, one for each agent.
+    """Takes the batches of a topic (STATES or TRUTHS); ``of``: the topic of the same states, one for each agent."""
 
-    ``root``: namespace of the network, with a slash at its end.
-    """
-
-    def __init__(self, record: RunRecord, topic: Topic, of: Topic, root: str) -> None:
+    def __init__(self, record: RunRecord, topic: Topic, of: Topic, root: str) -> None:  # root: namespace and slash
         experiment = record.experiment
         self.topic, self.of = topic, of
         self.names = [root + of.of(agent) for agent in range(experiment.agents)]  # by agent
@@ -171,8 +159,7 @@ class StateReceiver:
         new = self._take(agent, step, self._contents(data, states.start, size[states.position]), refused)
         if not new.all():
             states, agent, step = states[new], agent[new], step[new]
-        time = np.maximum(states.stamp, 0)
-        return Received(data, states.start, size[states.position], agent, step, time, refused)
+        return Received(data, states.start, size[states.position], agent, step, np.maximum(states.stamp, 0), refused)
 
     def _take(self, agent: IntArray, step: IntArray, contents: IntArray, refused: list[tuple[str, str]]) -> BoolArray:
         """(states,) which of them to write: those that have not come before, and of contradicting ones two."""
@@ -208,11 +195,11 @@ class StateReceiver:
             except CdrError:
                 refused.append((self.topic.name, Refusal.UNDECODABLE))
                 continue
-            if run != self._record.run.bytes:
+            if run == self._record.run.bytes:
+                parts.append(messages)
+                sizes.append(size)
+            else:
                 refused.append((self.topic.name, Refusal.OTHER_RUN))
-                continue
-            parts.append(messages)
-            sizes.append(size)
         parts += self._single
         sizes.append(np.array([len(message) for message in self._single], dtype=np.int64))
         self._batches.clear()

@@ -14,9 +14,8 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
 from operator import itemgetter
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar
 
 from msg_analysis.messages.acceptance import Refusal
 
@@ -53,8 +52,7 @@ class AgentInputs(Generic[Value]):
         return self.step >= self.steps
 
 
-TURN_SLICE = 0.02
-"""s of steps without a break, after which the executor gets its turn: messages, timers, signals."""
+TURN_SLICE = 0.02  # s of steps without a break, after which the executor gets its turn: messages, timers, signals
 
 
 class Member(Protocol):
@@ -65,23 +63,18 @@ class Member(Protocol):
 
 
 class TurnQueue:
-    """Gives turns in the order of the requests, once all ``members`` (a number) have joined.
+    """Gives turns in the order of the requests, once all ``members`` (a number) have joined."""
 
-    A step of one agent lets others step, and theirs others again: the queue replaces nested calls, which would go as
-    deep as the run is long.
-    """
-
+    # A step of one agent lets others step, and theirs others again: the queue replaces nested calls, which would go as
+    # deep as the run is long.
     def __init__(
         self,
         members: int,
         defer: Callable[[Callable[[], None]], object],  # runs a callback after what is already waiting in the executor
-        after: Callable[[], None] = lambda: None,  # is called when turns have been given
+        after: Callable[[], None],  # is called when turns have been given
         turn: float = TURN_SLICE,  # s
     ) -> None:
-        self._absent = members
-        self._defer = defer
-        self._after = after
-        self._turn = turn
+        self._absent, self._defer, self._after, self._turn = members, defer, after, turn
         self._queue: deque[Member] = deque()
         self._given = True  # turns are being given, or will be: ``ask`` need not start that
 
@@ -111,31 +104,18 @@ class TurnQueue:
         self._given = False
 
 
-LOCKSTEP_WINDOW = 64
-"""Steps that an agent may be ahead of a peer; small enough for a burst to fit a socket's receive buffer."""
-
-RESEND_LIMIT = 6000
-"""Most steps that an agent keeps, and sends again when another one was killed; older ones are never sent again."""
-
+LOCKSTEP_WINDOW = 64  # steps that an agent may be ahead of a peer; a burst of so many fits a socket's receive buffer
+RESEND_LIMIT = 6000  # most steps that an agent keeps, and sends again when another one was killed
+# Steps for which a used value is stored, to notice a different one for the same step: one of the two is forged. The
+# true one may come second, when its sender, up to a window behind, makes that step.
 HISTORY_STEPS = LOCKSTEP_WINDOW
-"""Steps for which a used value is stored, to notice a different one for the same step: one of the two is forged.
-The true one may come second, when its sender, up to a window behind, makes that step."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Known:
-    """Mode of the steps up to ``last``."""
-
-    mode: int
-    last: int
-
-
-@dataclass(frozen=True, slots=True)
-class _Uses:
+class _Uses(NamedTuple):
     """The places in a row of the values that a step uses."""
 
     flags: tuple[bool, ...]  # by place, whether it is one of them
-    pick: Callable[[list[Any]], Sequence[Any]] = field(compare=False)  # the values of a row that are used
+    pick: Callable[[list[Any]], Sequence[Any]]  # the values of a row that are used
 
     @classmethod
     def of(cls, places: Sequence[int], peers: int) -> Self:
@@ -143,43 +123,49 @@ class _Uses:
         flags = tuple(place in set(places) for place in range(peers))
         if len(places) > 1:
             return cls(flags, itemgetter(*places))
-        first = places[0] if places else 0
-        return cls(flags, itemgetter(slice(first, first + len(places))))  # a list, too, of none or one
+        return cls(flags, itemgetter(slice(places[0], places[0] + 1) if places else slice(0)))  # a list, too
 
 
 class Synchronizer(AgentInputs[Value]):
-    """The lockstep of one agent; it may be ``window`` steps (>= 0) ahead of a peer. Other options as in AgentInputs.
+    """The lockstep of one agent; it may be ``window`` steps (>= 0) ahead of a peer. Other options as in AgentInputs."""
 
-    ``history``: steps for which values are kept after they became the newest.
-    """
-
-    def __init__(self, *, window: int = LOCKSTEP_WINDOW, history: int = HISTORY_STEPS, **options: Any) -> None:
+    # With ``needed``, step k uses x_j(needed(j, k)) instead of x_j(k): an earlier one, which does not decrease with k,
+    # and is at least ``delay`` steps old. Values may come in any order: those that are sent again after a restart come
+    # behind newer ones.
+    def __init__(
+        self,
+        *,
+        window: int = LOCKSTEP_WINDOW,
+        needed: Callable[[int, int], int] | None = None,
+        delay: int = 0,
+        **options: Any,
+    ) -> None:
         super().__init__(**options)
-        self._window, self._history = window, history
+        self._window, self._needed_step = window, needed
+        self._history = max(HISTORY_STEPS, delay)
         self._places = {j: place for place, j in enumerate(self._newest)}  # of the peers in a row
         # The values of a step are in the row (step modulo the number of rows): None where there is none. The rows are
         # those of the last steps, for which values are kept, and of those to come.
-        self._number_of_rows = history + window + 2
+        self._number_of_rows = self._history + window + 2
         self._rows: list[list[Value | None]] = [[None] * len(self._places) for _ in range(self._number_of_rows)]
+        self._held: dict[int, tuple[int, Value]] = {}  # by place: step and value, older than the rows and still needed
         self._uses = [_Uses.of([self._places[j] for j in row], len(self._places)) for row in self._inputs]
-        self._limit = window - 1 if self._newest else self.steps
-        self._known: deque[_Known] = deque()
+        self._limit = NOTHING if self._newest else self.steps  # no step up to this one is too far ahead of a peer
+        self._known: deque[tuple[int, int]] = deque()  # mode, and the last step with it
         # Number of the next sojourn; None: any, since a process that takes over starts in the middle.
         self._sequence: int | None = 0 if self.step == 0 else None
         self._unplanned = self.step  # first step whose graph is not known
-        self._mode = 0  # of the next step, if its graph is known
-        self._needed: _Uses | None = None  # by the next step
-        self._missing = 1  # of them; never 0 while the graph is not known
+        self._needed: _Uses | None  # by the next step, if its graph is known
+        self._missing: int  # of them; never 0 while the graph is not known
+        self._oldest: list[int]  # by place, the step of the value that the next step uses
+        self._prepare()
 
     def learn(self, sequence: int, mode: int, first_step: int, last_step: int) -> str | None:
-        """Take a sojourn (steps ``first_step`` to ``last_step``); None if taken, else a ``Refusal``.
-
-        Sojourns must come in sequence, each where the last one ended.
-        """
+        """Take the next sojourn (steps ``first_step`` to ``last_step``); None if taken, else a ``Refusal``."""
         if self._sequence is None:
             if last_step < self.step:
                 return Refusal.REPEATED
-            if not first_step <= self.step:
+            if first_step > self.step:
                 return Refusal.OUT_OF_SEQUENCE
         elif sequence < self._sequence:
             return Refusal.REPEATED
@@ -187,7 +173,7 @@ class Synchronizer(AgentInputs[Value]):
             return Refusal.OUT_OF_SEQUENCE
         self._sequence = sequence + 1
         self._unplanned = last_step + 1
-        self._known.append(_Known(mode, last_step))
+        self._known.append((mode, last_step))
         if len(self._known) == 1:
             self._prepare()
         return None
@@ -197,37 +183,38 @@ class Synchronizer(AgentInputs[Value]):
         place = self._places.get(agent)
         if place is None:
             return Refusal.NOT_A_PEER
-        ahead = step - self.step
-        if ahead > self._window + 1:
+        if step > self.step + self._window + 1:
             return Refusal.TOO_NEW
-        row = self._rows[step % self._number_of_rows]
-        known = row[place] if ahead >= -self._history else None
-        if ahead < 0 or known is not None:
-            # Also of a peer that is behind: its value is of no use, but it shows the progress of the peer.
-            if known is not None and known != value:
-                return Refusal.CONTRADICTION
-            if ahead < -self._window - RESEND_LIMIT:
+        known, oldest = self._value(place, step), self._oldest[place]
+        if known is not None:
+            return Refusal.REPEATED if known == value else Refusal.CONTRADICTION
+        if step < oldest:  # of no use, but it shows the progress of a peer that is behind
+            if step < self.step - self._window - RESEND_LIMIT:
                 return Refusal.TOO_OLD
             if step <= self._newest[agent]:
                 return Refusal.REPEATED
-            self._newest[agent] = step
-            return None
-        row[place] = value
-        if step > self._newest[agent]:
-            self._newest[agent] = step
-        if not ahead and self._needed and self._needed.flags[place]:
+        elif step >= self.step - self._history:
+            self._row(step)[place] = value
+        elif step == oldest:  # those between it and the rows are never used
+            self._held[place] = step, value
+        self._newest[agent] = max(self._newest[agent], step)
+        if step == oldest and self._needed and self._needed.flags[place]:
             self._missing -= 1
         return None
 
     def known(self, agent: int, step: int) -> Value:
         """x_agent(step), which was taken not long ago."""
-        value = self._row(step)[self._places[agent]]
+        value = self._value(self._places[agent], step)
         assert value is not None
         return value
 
     def ready(self) -> bool:
         """Whether the next step can be made now."""
-        return not self._missing and (self.step <= self._limit or self._within_window())
+        if self._missing:
+            return False
+        if self.step > self._limit:  # the peers may have moved on
+            self._limit = min(self._newest.values()) + self._window
+        return self.step <= self._limit
 
     @property
     def awaits_graph(self) -> bool:
@@ -235,148 +222,44 @@ class Synchronizer(AgentInputs[Value]):
         return self._needed is None and not self.finished
 
     def inputs(self) -> tuple[int, list[Value]]:
-        """Mode of the step that is ready, and the states x_j(step) of the agents that its row uses, j ascending."""
+        """Mode of the step that is ready, and the values of the agents that its row uses, ascending."""
         assert self._needed is not None
-        return self._mode, list(self._needed.pick(self._rows[self.step % self._number_of_rows]))
+        return self._known[0][0], list(self._needed.pick(self._next_values()))
 
     def advance(self) -> None:
         """Move on to x(step + 1): the step that was ready has been made."""
-        step = self.step
-        self._rows[(step - self._history) % self._number_of_rows] = [None] * len(self._places)
-        self.step = step + 1
-        if self._known[0].last <= step:
+        leaving, needed = self.step - self._history, self._needed_step
+        row = self._row(leaving)
+        if needed is not None:
+            for j, place in self._places.items():
+                value = row[place]
+                if value is not None and needed(j, self.step + 1) == leaving:
+                    self._held[place] = leaving, value
+        row[:] = [None] * len(row)
+        if self._known[0][1] <= self.step:
             self._known.popleft()
+        self.step += 1
         self._prepare()
-
-    def _prepare(self) -> None:
-        """Find out which agents the next step needs, and count those whose state is missing."""
-        if not self._known or self.step >= self.steps:
-            self._needed, self._missing = None, 1
-            return
-        self._mode = self._known[0].mode
-        self._needed = self._uses[self._mode]
-        self._missing = self._needed.pick(self._rows[self.step % self._number_of_rows]).count(None)
-
-    def _row(self, step: int) -> list[Value | None]:
-        return self._rows[step % self._number_of_rows]
-
-    def _next(self, place: int) -> tuple[int, Value | None]:
-        """Step and value, if it is there, of what the next step would use of the agent in a place."""
-        return self.step, self._row(self.step)[place]
-
-    def _within_window(self) -> bool:
-        self._limit = min(self._newest.values()) + self._window
-        return self.step <= self._limit
 
     def end_at(self, steps: int) -> None:
         """See AgentInputs."""
         super().end_at(steps)
         self._prepare()
 
-    def waiting_for(self) -> str:
-        """What keeps the agent from its next step, as text (agents from 1)."""
-        if self.finished:
-            return "nothing, it has finished"
-        if not self._known:
-            return f"the graph of step {self.step}"
-        inputs = self._inputs[self._known[0].mode]
-        missing = [(j, step) for j in inputs for step, value in [self._next(self._places[j])] if value is None]
-        if missing:
-            steps = {step for _, step in missing}
-            if len(steps) > 1:
-                return ", ".join(f"step {step} of agent {j + 1}" for j, step in missing)
-            return f"step {min(steps)} of " + ", ".join(f"agent {j + 1}" for j, _ in missing)
-        if behind := self._behind():
-            return "too far behind: " + ", ".join(f"agent {j + 1}" for j in behind)
-        return "nothing"
-
-    def lacking(self) -> list[int]:
-        """Peers of which it lacks a state, as far as it knows what the next step needs."""
-        needed = self._needed.flags if self._needed else ()
-        places = [place for place, flag in enumerate(needed) if flag and self._next(place)[1] is None]
-        missing = [j for j, place in self._places.items() if place in places]
-        return sorted({*missing, *self._behind()})
-
-    def _behind(self) -> list[int]:
-        return [j for j, newest in self._newest.items() if newest + self._window < self.step]
-
-    @property
-    def buffered(self) -> int:
-        """Most values held of any one peer for steps to come; never more than window + 2."""
-        to_come = [self._row(self.step + ahead) for ahead in range(self._window + 2)]
-        return max((sum(value is not None for value in values) for values in zip(*to_come, strict=True)), default=0)
-
-
-class DelayedSynchronizer(Synchronizer[Value]):
-    """As Synchronizer, but step k uses x_j(``needed``(j, k)): an earlier step, which does not decrease with k.
-
-    Values may come in any order: those that are sent again after a restart come behind newer ones. A value that is
-    older than what is kept anyway, and is still needed, is held.
-    """
-
-    def __init__(self, *, needed: Callable[[int, int], int], delay: int, **options: Any) -> None:
-        self._needed_step = needed
-        self._held: dict[int, tuple[int, Value]] = {}  # by place
-        self._oldest: list[int] = []  # by place, the step of the value that the next step would use
-        super().__init__(history=max(HISTORY_STEPS, delay + 1), **options)
-        self._find_oldest()
-
-    def _find_oldest(self) -> None:
-        self._oldest = [self._needed_step(j, self.step) for j in self._places]
-
-    def offer(self, agent: int, step: int, value: Value) -> str | None:
-        """See Synchronizer."""
-        place = self._places.get(agent)
-        if place is None:
-            return Refusal.NOT_A_PEER
-        ahead = step - self.step
-        if ahead > self._window + 1:
-            return Refusal.TOO_NEW
-        known = self._value(place, step)
-        if known is not None:
-            return Refusal.REPEATED if known == value else Refusal.CONTRADICTION
-        if step < self._oldest[place]:  # of no use, but it shows the progress of the peer
-            if ahead < -self._window - RESEND_LIMIT:
-                return Refusal.TOO_OLD
-            if step <= self._newest[agent]:
-                return Refusal.REPEATED
-        elif ahead >= -self._history:
-            self._row(step)[place] = value
-        elif step == self._oldest[place]:  # those between it and the kept ones are never used
-            self._held[place] = step, value
-        self._newest[agent] = max(self._newest[agent], step)
-        if self._needed and self._needed.flags[place] and step == self._oldest[place]:
-            self._missing -= 1
-        return None
-
-    def known(self, agent: int, step: int) -> Value:
-        """See Synchronizer."""
-        value = self._value(self._places[agent], step)
-        assert value is not None
-        return value
-
-    def inputs(self) -> tuple[int, list[Value]]:
-        """See Synchronizer: the states x_j(needed(j, step))."""
-        assert self._needed is not None
-        found = [self._value(place, step) for place, step in enumerate(self._oldest)]
-        return self._mode, list(self._needed.pick(found))
-
-    def advance(self) -> None:
-        """See Synchronizer."""
-        leaving, row = self.step - self._history, self._row(self.step - self._history)
-        for j, place in self._places.items():
-            value = row[place]
-            if value is not None and self._needed_step(j, self.step + 1) == leaving:
-                self._held[place] = leaving, value
-        super().advance()
-
     def _prepare(self) -> None:
-        """See Synchronizer."""
-        self._find_oldest()
-        super()._prepare()
-        if self._needed is not None:
-            found = [self._value(place, step) for place, step in enumerate(self._oldest)]
-            self._missing = self._needed.pick(found).count(None)
+        """Find out what the next step needs, and count what is missing."""
+        if self._needed_step is None:
+            self._oldest = [self.step] * len(self._places)
+        else:
+            self._oldest = [self._needed_step(j, self.step) for j in self._places]
+        if not self._known or self.finished:
+            self._needed, self._missing = None, 1
+            return
+        self._needed = self._uses[self._known[0][0]]
+        self._missing = self._needed.pick(self._next_values()).count(None)
+
+    def _row(self, step: int) -> list[Value | None]:
+        return self._rows[step % self._number_of_rows]
 
     def _value(self, place: int, step: int) -> Value | None:
         held = self._held.get(place)
@@ -384,6 +267,35 @@ class DelayedSynchronizer(Synchronizer[Value]):
             return held[1]
         return self._row(step)[place] if step >= self.step - self._history else None
 
-    def _next(self, place: int) -> tuple[int, Value | None]:
-        """See Synchronizer."""
-        return self._oldest[place], self._value(place, self._oldest[place])
+    def _next_values(self) -> list[Value | None]:
+        """By place, what the next step would use of an agent, if it is there."""
+        if self._needed_step is None:
+            return self._row(self.step)
+        return [self._value(place, step) for place, step in enumerate(self._oldest)]
+
+    def waiting_for(self) -> str:
+        """What keeps the agent from its next step, as text (agents from 1)."""
+        if self.finished:
+            return "nothing, it has finished"
+        if not self._known:
+            return f"the graph of step {self.step}"
+        if missing := self._without_value():
+            if len(set(missing.values())) > 1:
+                return ", ".join(f"step {step} of agent {j + 1}" for j, step in missing.items())
+            return f"step {min(missing.values())} of " + ", ".join(f"agent {j + 1}" for j in missing)
+        if behind := self._behind():
+            return "too far behind: " + ", ".join(f"agent {j + 1}" for j in behind)
+        return "nothing"
+
+    def lacking(self) -> list[int]:
+        """Peers of which it lacks a state, as far as it knows what the next step needs."""
+        return sorted({*self._without_value(), *self._behind()})
+
+    def _without_value(self) -> dict[int, int]:
+        """The agents whose value the next step needs and does not have, and the step of that value."""
+        needed, values = self._needed.flags if self._needed else (), self._next_values()
+        rows = zip(self._places, self._oldest, needed, values, strict=False)
+        return {j: step for j, step, flag, value in rows if flag and value is None}
+
+    def _behind(self) -> list[int]:
+        return [j for j, newest in self._newest.items() if newest + self._window < self.step]

@@ -1,10 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reads the states of a running network from the checkpoint files of its agents.
-
-Nothing is sent and nothing waits: the network pays only for the CPU time of the reader.
-"""
+"""Reads the states of a running network from the checkpoint files of its agents: nothing is sent, nothing waits."""
 
 from __future__ import annotations
 
@@ -36,8 +33,11 @@ if TYPE_CHECKING:
     from msg_analysis.inference.online_steps import LoggedStates, StateLog
 
 
-BLOCK = 2000
-"""Steps that are taken at once: limits the memory that a large network needs."""
+BLOCK = 2000  # steps that are taken at once: limits the memory that a large network needs
+PERIOD = 0.5  # s between two updates
+SHUTDOWN_TIMEOUT = 2.0  # s for the states that are left when the run ends
+NICE = 10  # of the thread: on a busy machine the network goes first
+MOST_NODES = 20  # agents up to which each gets a standard error: more would cost the network too much CPU time
 
 
 class CheckpointReader:
@@ -52,7 +52,7 @@ class CheckpointReader:
         self._rings: list[AnyArray] = []  # (capacity, slot) bytes of each agent
         self._next = 0
         self._log: StateLog | None = None
-        self._logged: LoggedStates | None = None
+        self.logged: LoggedStates | None = None  # the steps of the last ``take`` and the one after them, if kept
         self.missed = 0  # steps that were overwritten before or while they were read
 
     def ready(self) -> bool:
@@ -61,38 +61,29 @@ class CheckpointReader:
             paths = [self._directory / f"{agent_node_name(agent)}.states" for agent in range(self._agents)]
             if not all(path.exists() and path.stat().st_size == self._total for path in paths):
                 return False
-            self._rings = [self._open(path) for path in paths]
+            for path in paths:
+                with path.open("rb") as file:
+                    ring = np.frombuffer(mmap.mmap(file.fileno(), self._total, access=mmap.ACCESS_READ), np.uint8)
+                self._rings.append(ring.reshape(self._capacity, self._slot))
         return True
 
     def keep(self, log: StateLog) -> None:
         """From now on, ``logged`` has the steps that are taken."""
         self._log = log
 
-    def logged(self) -> LoggedStates | None:
-        """The steps of the last ``take``, from the first one to the one after the last; None: there were none."""
-        return self._logged
-
-    def _open(self, path: Path) -> AnyArray:
-        with path.open("rb") as file:
-            ring = np.frombuffer(mmap.mmap(file.fileno(), self._total, access=mmap.ACCESS_READ), np.uint8)
-        return ring.reshape(self._capacity, self._slot)
-
     def take(self, reached: int) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-        """The next steps that all agents have made, at most ``BLOCK``; ``reached``: newest state of all agents.
-
-        Returns steps k (b,), modes from 0 of k -> k+1 (b,), x(k) (b, m, width), x(k+1) (b, m, width). Modes are those
-        of the first agent; in real time others may have used another graph.
-        """
+        """The next steps k that all agents have made, up to ``reached``: k, modes (b,), x(k), x(k+1) (b, m, width)."""
+        # Modes, from 0, are those of the first agent; in real time others may have used another graph.
         oldest = max(reached - self._capacity // 2, 0)  # older ones may be overwritten while they are read
         if self._next < oldest:
             self.missed += oldest - self._next
             self._next = oldest
         last = min(reached, self._next + BLOCK)
         count = max(last - self._next, 0)
-        self._logged = None
+        self.logged = None
         if not count:
-            none = np.empty(0, np.int64)
-            return none, none, np.empty((0, self._agents, self._width)), np.empty((0, self._agents, self._width))
+            none, nothing = np.empty(0, np.int64), np.empty((0, self._agents, self._width))
+            return none, none, nothing, nothing
         steps = np.arange(self._next, last + 1)
         states, modes = np.empty((count + 1, self._agents, self._width)), np.empty(0, np.int64)
         there: BoolArray = np.ones(count + 1, dtype=bool)
@@ -108,7 +99,7 @@ class CheckpointReader:
             there &= whole
         self._next = last
         if self._log is not None:
-            self._logged = self._read_log(steps, entries, lengths, there)
+            self.logged = self._read_log(steps, entries, lengths, there)
         good = there[:-1] & there[1:] & (modes[1:] >= 1)
         self.missed += int((~good).sum())
         return steps[:-1][good], modes[1:][good] - 1, states[:-1][good], states[1:][good]
@@ -153,24 +144,13 @@ class CheckpointReader:
         return self._log.read(steps[there], data.tobytes(), start, length.reshape(-1) - self._beside, published)
 
 
-PERIOD = 0.5  # s between two updates
-SHUTDOWN_TIMEOUT = 2.0  # s for the states that are left when the run ends
-NICE = 10  # of the thread: on a busy machine the network goes first
-MOST_NODES = 20
-"""Up to this many agents, each gets a standard error; for more it would cost the network too much CPU time."""
-
-
 class RunObserver:
-    """Estimates the errors of a run; ``checkpoints``: directory in which its agents keep their states.
-
-    Its thread sets ``report`` (the newest numbers; None before the first), ``note`` (why there are none any more) and,
-    of a run that may end early, ``reached`` (why it may end now). Whatever happens to it, the run goes on.
-    """
+    """Estimates the errors of a run, in a thread; ``checkpoints``: directory in which its agents keep their states."""
 
     def __init__(self, record: RunRecord, checkpoints: Path) -> None:
-        self.report: LiveReport | None = None
-        self.note: str | None = None
-        self.reached: str | None = None
+        self.report: LiveReport | None = None  # the newest numbers
+        self.note: str | None = None  # why there are none any more; the run goes on
+        self.reached: str | None = None  # why the run may end now, if it may end early
         self._record, self._reader = record, CheckpointReader(record, checkpoints)
         self._newest = -1
         self._last: int | None = None  # last step, where the run ends early
@@ -218,14 +198,13 @@ class RunObserver:
             return
         while time.monotonic() < deadline and not (deadline == math.inf and self._over.is_set()):
             found = self._reader.take(self._newest if self._last is None else min(self._newest, self._last))
-            logged = self._reader.logged()
-            if logged is not None:
+            if (logged := self._reader.logged) is not None:
                 self._add_sojourns(estimate, int(logged.steps.max(initial=0)))
                 estimate.add_logged(logged)
             if not len(found[0]):
                 break
             estimate.add_whole(*found)
-            if self._record.experiment.run.pace == "realtime":
+            if self._path is not None:
                 self._add_stamps(estimate, found[0])
         if self._last is not None:
             estimate.end_at(self._last)
@@ -255,12 +234,10 @@ class RunObserver:
 
 
 class EarlyEnd:
-    """Follows a run, and asks the switcher to end it when that is enough; a context.
+    """Follows a run, and asks the switcher to end it when that is enough; a context."""
 
-    The request is a file, so a killed switcher that is restarted finds it again. Without an answer, the run goes on to
-    its planned end: the observer has failed, or the answer comes too late to end earlier.
-    """
-
+    # The request is a file, so a killed switcher that is restarted finds it again. Without an answer, the run goes on
+    # to its planned end: the observer has failed, or the answer comes too late to end earlier.
     def __init__(self, record: RunRecord, checkpoints: Path) -> None:
         assert record.until is not None
         self._record, self._until = record, record.until
@@ -287,26 +264,22 @@ class EarlyEnd:
 
     def to_json(self) -> dict[str, Any]:
         """Key ``until`` of result.json."""
+        from msg_analysis.inference.online_errors import precision_words
+
+        observer, reason = self.observer, "not reached"
+        if observer.reached is not None:
+            reason = observer.reached + ("" if self._decided else ", too late to end earlier")
+        elif observer.note is not None:
+            reason = f"not known: {observer.note}"
+        elif observer.report is not None:
+            reason += f": {precision_words(observer.report)}"
         return {
             "rule": str(self._until),
             "planned_steps": self._record.experiment.steps,
             "ended_early": self._decided,
             "step": self.last_step,
-            "reason": self._reason(),
+            "reason": reason,
         }
-
-    def _reason(self) -> str:
-        observer = self.observer
-        if observer.reached is not None:
-            late = "" if self._decided else ", too late to end earlier"
-            return f"{observer.reached}{late}"
-        if observer.note is not None:
-            return f"not known: {observer.note}"
-        if observer.report is None:
-            return "not reached"
-        from msg_analysis.inference.online_errors import precision_words
-
-        return f"not reached: {precision_words(observer.report)}"
 
     def __enter__(self) -> Self:
         return self

@@ -46,10 +46,7 @@ class View:
         """The run is in this ROS_DOMAIN_ID, and nothing has been started yet."""
 
     def begin(self, record: RunRecord, checkpoints: Path | None, observer: RunObserver | None = None) -> None:
-        """The processes have been started; ``checkpoints``: directory of the agents' states, if they are kept here.
-
-        ``observer``: follows the run already, and is ended by who has made it.
-        """
+        """The processes have been started; ``checkpoints``: of the agents; ``observer``: follows the run already."""
 
     def ends_at(self, step: int) -> None:
         """The run ends at this step, before its planned end."""
@@ -70,16 +67,7 @@ class View:
         """The run is over; its processes may still be there."""
 
 
-COLOURS = (
-    "blue",
-    "yellow",
-    "green",
-    "magenta",
-    "cyan",
-    "red",
-    "bright_yellow",
-    "white",
-)  # of graphs; names say the same
+COLOURS = ("blue", "yellow", "green", "magenta", "cyan", "red", "bright_yellow", "white")  # of graphs, beside names
 FIXED_LINES = 10  # of the panel besides the agents
 FAR = 2.0  # standard errors
 _LEGEND = "  ● measured ◆ predicted"
@@ -93,8 +81,7 @@ def panel_of(snapshot: Snapshot, experiment: Experiment, *, width: int, height: 
         waiting = "starting" if not snapshot.steps else "waiting for the first states"
         return Panel(Text(waiting), title=title, title_align="left")
     inside = max(width - 4, 20)
-    lines: list[RenderableType] = [_progress(snapshot, experiment, inside), _graph(snapshot, experiment)]
-    lines.append(_coverage(snapshot, experiment))
+    lines = [_progress(snapshot, experiment, inside), _graph(snapshot, experiment), _coverage(snapshot, experiment)]
     lines += _system(snapshot, inside)
     room = height - FIXED_LINES
     if room >= 3:
@@ -104,36 +91,30 @@ def panel_of(snapshot: Snapshot, experiment: Experiment, *, width: int, height: 
 
 def plain_line(snapshot: Snapshot, experiment: Experiment) -> str:
     """The same as one line of text."""
-    parts = [f"step {snapshot.reached} of {snapshot.last or experiment.steps}", *_speed(snapshot)]
-    if snapshot.sojourn is not None:
-        parts.append(f"graph {experiment.graph_list[snapshot.sojourn.mode].name}")
-    if snapshot.left is not None:
-        parts.append(f"{_duration(snapshot.left)} left")
-    return ", ".join(parts)
+    graph = "" if snapshot.sojourn is None else f"graph {experiment.graph_list[snapshot.sojourn.mode].name}"
+    return ", ".join(_parts(snapshot, experiment, graph))
 
 
-def _speed(snapshot: Snapshot) -> list[str]:
-    """The speed, where it is known."""
-    return [] if snapshot.rate is None else [f"{snapshot.rate:.0f} steps/s"]
+def _parts(snapshot: Snapshot, experiment: Experiment, more: str) -> list[str]:
+    """How far the run is, as far as it is known."""
+    left = "" if snapshot.left is None else f"{_duration(snapshot.left)} left"
+    speed = "" if snapshot.rate is None else f"{snapshot.rate:.0f} steps/s"
+    step = f"step {snapshot.reached} of {snapshot.last or experiment.steps}"
+    return [part for part in (step, speed, more, left) if part]
 
 
 def _progress(snapshot: Snapshot, experiment: Experiment, width: int) -> RenderableType:
-    last = snapshot.last or experiment.steps
-    fraction = snapshot.reached / last
-    parts = [f"step {snapshot.reached} of {last}", f"{100 * fraction:.0f} %", *_speed(snapshot)]
-    if snapshot.left is not None:
-        parts.append(f"{_duration(snapshot.left)} left")
-    text = "  ".join(parts)
-    bar = ProgressBar(
-        total=1.0,
-        completed=fraction,
-        width=max(width - len(text) - 2, 4),
-        complete_style="cyan",
-        finished_style="green",
-    )
-    line = Table.grid(padding=(0, 2, 0, 0))
-    line.add_row(Text(text, no_wrap=True, overflow="ellipsis"), bar)
-    return line if width > len(text) + 6 else Text(text, no_wrap=True, overflow="ellipsis")
+    fraction = snapshot.reached / (snapshot.last or experiment.steps)
+    step, *rest = _parts(snapshot, experiment, "")
+    text = "  ".join([step, f"{100 * fraction:.0f} %", *rest])
+    line = Text(text, no_wrap=True, overflow="ellipsis")
+    if width <= len(text) + 6:
+        return line
+    room = max(width - len(text) - 2, 4)
+    bar = ProgressBar(1.0, fraction, room, complete_style="cyan", finished_style="green")
+    row = Table.grid(padding=(0, 2, 0, 0))
+    row.add_row(line, bar)
+    return row
 
 
 def _graph(snapshot: Snapshot, experiment: Experiment) -> Text:
@@ -152,7 +133,6 @@ def _graph(snapshot: Snapshot, experiment: Experiment) -> Text:
 
 
 def _coverage(snapshot: Snapshot, experiment: Experiment) -> Text:
-    """What the errors below are computed from."""
     report = snapshot.report
     if report is None or not report.steps:
         return Text()
@@ -273,15 +253,11 @@ class Display:
             self._jobs.__exit__(*_)
             self._live.stop()
 
-    @property
-    def wanted(self) -> bool:
-        """Whether anything is drawn."""
-        return self.panel or self._web is not None
-
-    def begin(self, experiment: Experiment) -> None:
-        """Give the page what does not change in a run."""
+    def begin(self, experiment: Experiment) -> bool:
+        """Give the page what does not change in a run; whether anything is drawn."""
         if self._web is not None:
             self._web.begin(run_description(experiment))
+        return self.panel or self._web is not None
 
     def check(self) -> None:
         """Stop if Ctrl-Z was typed; to be called often."""
@@ -350,8 +326,7 @@ class RunView(View):
     def begin(self, record: RunRecord, checkpoints: Path | None, observer: RunObserver | None = None) -> None:
         """Follow the run: its processes have been started. Without ``checkpoints`` its errors are not followed."""
         self._begun = True
-        self.display.begin(record.experiment)
-        if not self.display.wanted:
+        if not self.display.begin(record.experiment):
             return  # lines do not show errors
         if observer is not None:
             self._observer, self._made_observer = observer, False

@@ -45,22 +45,14 @@ class StepRates:
         while len(self._seen) > 2 and now - self._seen[1][0] > WINDOW:
             self._seen.popleft()
 
-    def rates(self) -> list[float]:
-        """Steps per second of every agent; empty before the second measurement."""
+    def rates(self) -> tuple[list[float], float | None]:
+        """Steps per second of every agent, and of the step that all have reached; empty, None: not known yet."""
         if len(self._seen) < 2:
-            return []
+            return [], None
         (then, before), (now, after) = self._seen[0], self._seen[-1]
-        return [(b - a) / (now - then) for a, b in zip(before, after, strict=True)]
-
-    def rate(self) -> float | None:
-        """By how many steps per second the step that all agents have reached has moved; None where not known.
-
-        Not the least of ``rates``: in an overloaded network agents step in bursts, and one is always between two.
-        """
-        if len(self._seen) < 2:
-            return None
-        (then, before), (now, after) = self._seen[0], self._seen[-1]
-        return (min(after) - min(before)) / (now - then)
+        rates = [(b - a) / (now - then) for a, b in zip(before, after, strict=True)]
+        # Not the least of these: in an overloaded network agents step in bursts, and one is always between two.
+        return rates, (min(after) - min(before)) / (now - then)
 
 
 class Presence:
@@ -115,14 +107,6 @@ class SojournFinder:
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
-    """Something that happened in a run."""
-
-    step: int  # which all agents had reached
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
 class Snapshot:
     """The state of a run at one time."""
 
@@ -137,7 +121,7 @@ class Snapshot:
     ages: list[float] = field(default_factory=list)  # s since each agent has made its newest step
     gone: frozenset[int] = frozenset()  # agents (from 0) without a process, or with one that has made no step yet
     path: list[Sojourn] = field(default_factory=list)  # sojourns from the oldest of ``report.recent`` on
-    events: tuple[Event, ...] = ()  # the newest ``MOST_EVENTS``
+    events: tuple[tuple[int, str], ...] = ()  # the newest ``MOST_EVENTS``: step that all had reached, text
     last: int | None = None  # last step of a run that ends before its planned end; None: not known to do so
 
     @property
@@ -155,7 +139,7 @@ class SnapshotSource:
         self._last: int | None = None  # where the run ends early
         self._sojourns, self._rates = SojournFinder(experiment), StepRates(clock)
         self._presence = Presence(experiment.names, clock)
-        self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
+        self._events: deque[tuple[int, str]] = deque(maxlen=MOST_EVENTS)
         self._refused: dict[str, int] = {}
         self._reached = -1
 
@@ -165,15 +149,12 @@ class SnapshotSource:
 
     def happened(self, text: str) -> None:
         """Something happened, now."""
-        self._events.append(Event(self._reached, text))
+        self._events.append((self._reached, text))
 
     def snapshot(
         self, steps: Sequence[int], report: LiveReport | None = None, note: str | None = None, ended: Iterable[int] = ()
     ) -> Snapshot:
-        """The snapshot now, from the newest step of every agent (-1: none; empty before the start).
-
-        ``ended``: agents (from 0) whose process has ended before its last step.
-        """
+        """The snapshot now, from the newest step of every agent; ``ended``: those (from 0) without a process."""
         now = Snapshot(list(steps), report=report, note=note or (report.note if report else None), last=self._last)
         self._reached = max(self._reached, now.reached)
         for text in self._presence.add(steps, ended):
@@ -186,9 +167,10 @@ class SnapshotSource:
         if now.reached < 0:
             return now
         self._rates.add(steps)
-        now = replace(now, rates=self._rates.rates(), rate=self._rates.rate())
-        left = (self._steps - now.reached) / now.rate if now.rate else None
-        now = replace(now, left=left, sojourn=self._sojourns.at(min(now.reached, self._steps - 1)))
+        rates, rate = self._rates.rates()
+        left = (self._steps - now.reached) / rate if rate else None
+        sojourn = self._sojourns.at(min(now.reached, self._steps - 1))
+        now = replace(now, rates=rates, rate=rate, left=left, sojourn=sojourn)
         recent = report.recent if report else None
         return now if recent is None else replace(now, path=self._sojourns.since(int(recent.steps[0])))
 
@@ -197,7 +179,7 @@ def run_description(experiment: Experiment) -> dict[str, Any]:
     """What does not change in a run, for a page that draws it: agents, graphs, positions."""
     from msg_analysis.report.look import places
 
-    where = places(experiment.graph_list)
+    where, realtime = places(experiment.graph_list), experiment.run.pace == "realtime"
     return {
         "name": experiment.name,
         "problem": experiment.problem,
@@ -206,9 +188,7 @@ def run_description(experiment: Experiment) -> dict[str, Any]:
         "steps": experiment.steps,
         "dt": experiment.step_length,
         "pace": experiment.run.pace,
-        "silent": max(SILENT, 5 * experiment.step_length / experiment.run.speed)
-        if experiment.run.pace == "realtime"
-        else SILENT,
+        "silent": max(SILENT, 5 * experiment.step_length / experiment.run.speed if realtime else 0.0),
         "leaders": list(experiment.spec.leaders.agents) if experiment.spec.leaders else [],
         "reference": experiment.reference if experiment.spec.leaders else None,
         "graphs": [
@@ -224,10 +204,7 @@ def run_description(experiment: Experiment) -> dict[str, Any]:
 
 
 def snapshot_document(snapshot: Snapshot, before: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """A snapshot for a page; unknown numbers are None, the graph counts from 0 and the sojourn from 1.
-
-    While there are no new states, the "trace" is that of the document ``before``.
-    """
+    """A snapshot for a page; unknown numbers are None, the graph counts from 0 and the sojourn from 1."""
     report, sojourn = snapshot.report, snapshot.sojourn
     recent = report.recent if report else None
     return {
@@ -247,13 +224,13 @@ def snapshot_document(snapshot: Snapshot, before: Mapping[str, Any] | None = Non
         "lateness": report.lateness if report else None,
         "ages": [round(age, 2) for age in snapshot.ages] if len(snapshot.ages) > 1 else [],
         "gone": sorted(snapshot.gone),
-        "events": [[event.step, event.text] for event in snapshot.events],
+        "events": [list(event) for event in snapshot.events],
         "note": snapshot.note,
     }
 
 
 def _trace(snapshot: Snapshot, recent: Recent, before: Mapping[str, Any] | None) -> Mapping[str, Any]:
-    """The newest states of the first agents, in four digits, with the graphs; ``before`` if the steps are the same."""
+    """The newest states of the first agents, in four digits, with the graphs; ``before`` while there are none new."""
     steps = recent.steps.tolist()
     if before is not None and before["steps"] == steps:
         return before

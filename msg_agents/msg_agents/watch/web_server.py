@@ -3,9 +3,8 @@
 
 """A small page on which browsers follow a run: one HTML file, and server-sent events.
 
-Each browser has a thread of its own, which sends what is newest whenever the browser is ready. A slow or lost browser
-delays nothing; it misses what it is too slow for. Connections are few, and a request must arrive soon: nothing that a
-browser does may take the file descriptors of the run.
+A slow or lost browser delays nothing; it misses what it is too slow for. Connections are few, and a request must arrive
+soon: nothing that a browser does may take the file descriptors of the run.
 """
 
 from __future__ import annotations
@@ -31,8 +30,7 @@ from msg_analysis.errors import InputError
 MOST_BROWSERS = 32  # that follow the run; one more takes the place of the one that has followed longest
 MOST_CONNECTIONS = 64
 REQUEST_TIME = 5.0  # s for a request to arrive
-HISTORY = 600
-"""Points of the running error that a browser gets when it connects."""
+HISTORY = 600  # points of the running error that a browser gets when it connects
 SEND_TIMEOUT = 10.0  # s for a browser to take what it is sent
 ALIVE = 5.0  # s after which a comment is sent if there is nothing new, to detect lost browsers
 HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^:@/\[\]]+)(?::\d+)?")  # of a Host header: name, port
@@ -49,10 +47,7 @@ HEADERS = {
 
 
 class WebServer:
-    """Serves the page at ``address`` from when it is made until ``close``; port 0: any free one.
-
-    Its methods may be called from any thread. InputError: the port is taken, or the address is not one of this machine.
-    """
+    """Serves the page at ``address`` until ``close``; its methods may be called from any thread."""
 
     def __init__(self, host: str, port: int, *, request_timeout: float = REQUEST_TIME) -> None:
         self._changed = threading.Condition()
@@ -64,7 +59,7 @@ class WebServer:
         self._ending: dict[str, Any] | None = None
         self._history: deque[list[float | None]] = deque(maxlen=HISTORY)
         self._browsers: dict[_Handler, None] = {}  # in the order in which they came
-        self._report: bytes | None = None
+        self.report: bytes | None = None  # browsers keep it, so that it can be opened when nothing is served any more
         self._fetching = 0  # browsers that have been sent the end and have not fetched it
         try:
             family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
@@ -108,22 +103,15 @@ class WebServer:
             self._notify()
 
     def end(self, words: dict[str, Any], report: Path | None = None) -> None:
-        """Show that the run is over (first call only): ``words`` are "text", and "verdict" or None.
-
-        Browsers keep the report, so that it can be opened there when nothing is served any more.
-        """
+        """Show that the run is over (first call only): ``words`` are "text", and "verdict" or None."""
         content = None
         with contextlib.suppress(OSError):
             content = report.read_bytes() if report is not None else None
         with self._changed:
             if self._ending is None:
-                self._report = content
+                self.report = content
                 self._ending = finite({**words, "report": str(report) if content is not None else None})
             self._notify()
-
-    def report(self) -> bytes | None:
-        """The report for a browser; None: there is none."""
-        return self._report
 
     def report_fetched(self) -> None:
         """A browser has fetched the report, or will not."""
@@ -156,7 +144,7 @@ class WebServer:
                 # It may be one that never reads; a browser comes back by itself.
                 longest = next(iter(self._browsers))
                 del self._browsers[longest]
-                longest.hang_up()
+                _hang_up(longest.connection)
             self._browsers[handler] = None
         try:
             handler.start_events()
@@ -167,7 +155,7 @@ class WebServer:
                     number = self._number
                     events = self._events(sent_events)
                 sent = handler.send_events(events)
-                if sent and "end" in sent_events and self._report is not None:
+                if sent and "end" in sent_events and self.report is not None:
                     with self._changed:
                         self._fetching += 1
                 if not sent or "end" in sent_events:
@@ -290,7 +278,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(HTTPStatus.OK, self.server.page, "text/html; charset=utf-8")
         elif path == "/events":
             self.server.web.follow(self)
-        elif path == "/report" and (report := self.server.web.report()) is not None:
+        elif path == "/report" and (report := self.server.web.report) is not None:
             try:
                 self._send(HTTPStatus.OK, report, "text/html; charset=utf-8")
             finally:
@@ -304,10 +292,6 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer a request that is none, or of another method."""
         self.request_version = "HTTP/1.0"  # what cannot be read counts as 0.9, whose answers have no headers
         self.refuse(HTTPStatus(code), message or HTTPStatus(code).phrase)
-
-    def hang_up(self) -> None:
-        """End the connection; from any thread."""
-        _hang_up(self.connection)
 
     def refuse(self, status: HTTPStatus, words: str) -> None:
         """Answer with an error and its reason."""

@@ -115,11 +115,8 @@ def test_rate_and_queue_by_hand() -> None:
     """125 bytes take 1 ms at 1 Mbit/s: one is sent, two wait, the fourth is dropped; at 1.5 ms one more can wait."""
     link = Link(LinkSettings(delay=0.01, rate=1.0, queue=2), 1, 2, 3)
     found = [link.carry(125, 0.0) for _ in range(4)] + [link.carry(125, 0.0015) for _ in range(2)]
-    assert [outcome for outcome, _ in found] == [Outcome.PASSED] * 3 + [
-        Outcome.DROPPED,
-        Outcome.PASSED,
-        Outcome.DROPPED,
-    ]
+    last = [Outcome.DROPPED, Outcome.PASSED, Outcome.DROPPED]
+    assert [outcome for outcome, _ in found] == [Outcome.PASSED] * 3 + last
     times = [time for outcome, time in found if outcome is Outcome.PASSED]
     assert times == pytest.approx([0.011, 0.012, 0.013, 0.014])
     assert link.waited == 3
@@ -128,18 +125,14 @@ def test_rate_and_queue_by_hand() -> None:
 
 def test_without_a_queue_only_one_packet_is_on_its_way() -> None:
     link = Link(LinkSettings(rate=1.0, queue=0), 1, 2, 3)
-    assert [link.carry(125, time)[0] for time in (0.0, 0.0005, 0.0011)] == [
-        Outcome.PASSED,
-        Outcome.DROPPED,
-        Outcome.PASSED,
-    ]
+    outcomes = [Outcome.PASSED, Outcome.DROPPED, Outcome.PASSED]
+    assert [link.carry(125, time)[0] for time in (0.0, 0.0005, 0.0011)] == outcomes
 
 
 def test_lost_packets_take_their_time_on_the_air() -> None:
     certain = LossModel(1.0, 1.0, 0.0, 1.0)
     link = Link(LinkSettings(certain, rate=1.0, queue=0), 1, 2, 3)
     assert [link.carry(125, time)[0] for time in (0.0, 0.0005)] == [Outcome.LOST, Outcome.DROPPED]
-    assert math.isinf(LinkSettings().rate)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 
 from msg_agents.channel.channel_file import Channel
-from msg_agents.channel.links import LinkSettings, LossModel, destinations, read_counts
+from msg_agents.channel.links import LinkSettings, LossModel, destinations
 from msg_agents.channel.process import ActiveGraphFile, Host, enter, hand_over, host_address, open_hosts, serve
 from msg_analysis.errors import NotAvailableError
 
@@ -99,8 +100,7 @@ class Running:
         self._control.close()
         self._thread.join(10)
         assert not self._thread.is_alive()
-        counts = read_counts(self.counts_file)
-        assert counts is not None
+        counts = json.loads(self.counts_file.read_bytes())
         return {(pair["sender"], pair["receiver"]): pair for pair in counts["pairs"]}
 
 

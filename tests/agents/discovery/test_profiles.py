@@ -36,6 +36,12 @@ FOLDER = Path(rtps.__file__).parent
 RENAMED = {"heartbeatPeriod": "heartbeat_period", "initialAcknackDelay": "initial_acknack_delay"}
 
 
+@pytest.fixture(autouse=True)
+def plain_shell(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in (*PROFILE_VARIABLES, "ROS_AUTOMATIC_DISCOVERY_RANGE", "RMW_IMPLEMENTATION"):
+        monkeypatch.delenv(name, raising=False)
+
+
 @pytest.mark.parametrize("name", ["loopback.xml", "relayed.xml"])
 def test_profiles_for_fast_dds_3_differ_in_what_it_has_renamed(name: str) -> None:
     old = (FOLDER / name).read_text()
@@ -53,24 +59,19 @@ def test_profiles_of_topics_have_the_times_of_the_others(path: Path) -> None:
         assert {(each[0].text, len(each)) for each in times} == {(times[0][0].text, 1)}
 
 
-@pytest.mark.parametrize("distribution", ["", "humble", "jazzy"])
-def test_up_to_jazzy_the_old_variable_is_read(distribution: str) -> None:
-    assert not has_fast_dds_3(distribution)
-    assert profile_variables(Path("/p.xml"), distribution) == {OLD: "/p.xml", NEW: "/p.xml"}
-
-
-@pytest.mark.parametrize("distribution", ["kilted", "lyrical", "rolling"])
-def test_from_kilted_on_the_old_variable_gives_a_warning(distribution: str) -> None:
-    assert has_fast_dds_3(distribution)
-    assert profile_variables(Path("/p.xml"), distribution) == {NEW: "/p.xml"}
+@pytest.mark.parametrize(
+    ("distributions", "names"), [(["", "humble", "jazzy"], [OLD, NEW]), (["kilted", "lyrical", "rolling"], [NEW])]
+)
+def test_from_kilted_on_the_old_variable_is_not_read(distributions: list[str], names: list[str]) -> None:
+    for distribution in distributions:
+        assert has_fast_dds_3(distribution) == (OLD not in names)
+        assert profile_variables(Path("/p.xml"), distribution) == dict.fromkeys(names, "/p.xml")
 
 
 @pytest.mark.parametrize("profile", [LOOPBACK_PROFILE, RELAYED_PROFILE, UDP_PROFILE], ids=lambda path: path.stem)
 def test_the_middleware_here_takes_it(profile: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It prints what it does not understand and goes on without the profile."""
     pytest.importorskip("rclpy")
-    for name in (*PROFILE_VARIABLES, "ROS_AUTOMATIC_DISCOVERY_RANGE", "RMW_IMPLEMENTATION"):
-        monkeypatch.delenv(name, raising=False)
     code = "import rclpy; rclpy.init(); rclpy.create_node('reads_a_profile'); rclpy.shutdown()"
     with free_domain() as domain:
         node = subprocess.run(
@@ -88,8 +89,6 @@ def test_our_profiles_for_one_machine_bound_the_batches_of_states(
     variable: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """So batches are large with these profiles only."""
-    for name in PROFILE_VARIABLES:
-        monkeypatch.delenv(name, raising=False)
     hosts, damaged = tmp_path / "hosts.xml", tmp_path / "damaged.xml"
     hosts.write_text(profile_for_hosts(["10.0.0.1"]))
     damaged.write_text("<dds>")
@@ -137,8 +136,6 @@ else:
 def test_so_many_batches_wait_for_a_reader_that_takes_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """At the writer, and as many at the reader: both are bounded by the profile (40 MB of batches each)."""
     pytest.importorskip("rclpy")
-    for name in (*PROFILE_VARIABLES, "ROS_AUTOMATIC_DISCOVERY_RANGE", "RMW_IMPLEMENTATION"):
-        monkeypatch.delenv(name, raising=False)
     command = [sys.executable, "-P", "-W", "ignore", "-c", KEPT]
     with free_domain() as domain:
         environment = os.environ | node_environment(domain, LOOPBACK_PROFILE)
@@ -162,8 +159,6 @@ def test_the_older_variable_for_this_machine_does_not_reach_the_nodes(
     value: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With 1 they would have shared memory in spite of the profile."""
-    for name in (*PROFILE_VARIABLES, "ROS_AUTOMATIC_DISCOVERY_RANGE"):
-        monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("ROS_LOCALHOST_ONLY", value)
     environment = node_environment(0)
     assert "ROS_LOCALHOST_ONLY" not in environment

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
+from waiting import wait_for
 
 from msg_agents.discovery.relay import DiscoveryRelay, report_ready
 from msg_agents.discovery.rtps import FIRST_RELAYED, discovery_port, disposal_message, free_domain, read_announcement
@@ -80,6 +81,15 @@ def settle() -> None:
     time.sleep(QUIET)
 
 
+def ready(relay: DiscoveryRelay, participants: list[Participant]) -> None:
+    """Agents 1, 2, ... announce themselves, and are ready a little later."""
+    for number, each in enumerate(participants, start=1):
+        each.announce()
+        settle()
+        report(relay, f"agent_{number}", each)
+    settle()
+
+
 def test_those_who_have_to_do_with_each_other_meet(relay: DiscoveryRelay, processes: list[Participant]) -> None:
     """As soon as both are ready: the later one is announced to the earlier one, which answers by itself."""
     for each in processes:
@@ -92,9 +102,8 @@ def test_those_who_have_to_do_with_each_other_meet(relay: DiscoveryRelay, proces
     report(relay, "agent_2", two)
     one.hears(two)
     report(relay, "switcher", switcher)
-    one.hears(switcher)
-    two.hears(switcher)
-    three.hears(switcher)
+    for each in (one, two, three):
+        each.hears(switcher)
     switcher.hears()
 
 
@@ -110,11 +119,7 @@ def test_a_report_may_be_faster_than_the_announcement(relay: DiscoveryRelay, pro
 
 def test_who_comes_back_is_connected_again(relay: DiscoveryRelay, processes: list[Participant], domain: int) -> None:
     one, two, *_ = processes
-    for name, each in (("agent_1", one), ("agent_2", two)):
-        each.announce()
-        settle()
-        report(relay, name, each)
-        settle()
+    ready(relay, [one, two])
     one.hears(two)
     again = Participant(domain, FIRST_RELAYED + 7)
     again.announce()
@@ -128,11 +133,7 @@ def test_who_comes_back_is_connected_again(relay: DiscoveryRelay, processes: lis
 def test_joining_participants_are_connected_to_all(
     relay: DiscoveryRelay, processes: list[Participant], domain: int
 ) -> None:
-    for name, each in zip(["agent_1", "agent_2", "agent_3"], processes, strict=False):
-        each.announce()
-        settle()
-        report(relay, name, each)
-    settle()
+    ready(relay, processes[:3])
     processes[0].hears(processes[1])
     joining = Participant(domain, 5)
     joining.announce()
@@ -204,10 +205,7 @@ def test_foreign_nodes_among_the_numbers_of_the_run(
 def test_announcements_are_repeated(relay: DiscoveryRelay, processes: list[Participant], again: bool) -> None:
     """Now and then only: most of them, the participants hear directly."""
     one, two, *_ = processes
-    for name, each in (("agent_1", one), ("agent_2", two)):
-        each.announce()
-        settle()
-        report(relay, name, each)
+    ready(relay, [one, two])
     one.hears(two)
     two.announce()
     one.hears(*([two] if again else []))
@@ -230,12 +228,8 @@ def test_who_has_left_is_not_connected(relay: DiscoveryRelay, processes: list[Pa
 
 @pytest.mark.parametrize("relay", [{"fresh": 0.0}], indirect=True)
 def test_who_has_not_been_heard_for_long_is_not_connected(relay: DiscoveryRelay, processes: list[Participant]) -> None:
-    one, two, *_ = processes
-    for name, each in (("agent_1", one), ("agent_2", two)):
-        each.announce()
-        settle()
-        report(relay, name, each)
-    one.hears()
+    ready(relay, processes[:2])
+    processes[0].hears()
 
 
 @pytest.mark.parametrize("noise", [b"", b"RTPS", bytes(3000), b"RTPS" + bytes(100)])
@@ -243,10 +237,7 @@ def test_noise_does_no_harm(relay: DiscoveryRelay, processes: list[Participant],
     one, two, *_ = processes
     one.announce(noise)
     os.write(relay.descriptor, b"nonsense\nzz agent_1\n")
-    for name, each in (("agent_1", one), ("agent_2", two)):
-        each.announce()
-        settle()
-        report(relay, name, each)
+    ready(relay, [one, two])
     one.hears(two)
 
 
@@ -254,10 +245,7 @@ def test_noise_does_no_harm(relay: DiscoveryRelay, processes: list[Participant],
 def test_not_more_is_remembered_than_needed(relay: DiscoveryRelay, processes: list[Participant]) -> None:
     for each in processes:
         each.announce()
-    wanted, end = {each.prefix for each in processes[2:]}, time.monotonic() + 10
-    while set(relay._known) != wanted and time.monotonic() < end:
-        time.sleep(0.01)
-    assert set(relay._known) == wanted
+    wait_for(lambda: set(relay._known) == {each.prefix for each in processes[2:]}, 10)
 
 
 def test_without_a_port_it_does_not_start(domain: int) -> None:

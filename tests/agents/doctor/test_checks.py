@@ -36,14 +36,9 @@ def plain_shell(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def by_variables() -> dict[str, Check]:
     """The checks of variables, by name."""
-    checks = (
-        network_checks.check_profiles(),
-        network_checks.check_range(),
-        network_checks.check_server(),
-        network_checks.check_peers(),
-        network_checks.check_own_domain(),
-    )
-    return {check.name: check for check in checks}
+    names = ("profiles", "range", "server", "peers", "own_domain")
+    found = [getattr(network_checks, f"check_{name}")() for name in names]
+    return {check.name: check for check in found}
 
 
 def test_a_plain_shell() -> None:

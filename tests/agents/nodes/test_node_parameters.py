@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,6 @@ from msg_agents.nodes.parameters import describe, name_of, options_of
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import new_record
 
-BIN = Path(sys.executable).parent
 NODES = {name: command for name, command in main.commands.items() if isinstance(command, RosCommand)}
 RUN = {"name": "pair", "graphs": {"a": {"path": [1, 2]}}, "run": {"dt": 0.1, "duration": 5}}
 
@@ -37,32 +35,14 @@ def run_file(tmp_path: Path) -> Path:
     return file
 
 
-@dataclass
-class Ended:
-    """A process."""
-
-    returncode: int
-    stdout: str
-    stderr: str
-
-
-def start(executable: str, *arguments: Any) -> Ended:
+def start(executable: str, *arguments: Any) -> subprocess.CompletedProcess[str]:
     words = [executable, *(str(argument) for argument in arguments)]
     with free_domain() as domain:
         environment = {"NO_COLOR": "1", "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
         ((code, stdout, stderr),) = many_commands.outcomes(
             [["msg-agents", words, "pipe"]], Path.cwd(), NODE_MODULES, **environment
         )
-    return Ended(code, stdout, stderr)
-
-
-def execute(executable: str, *arguments: Any) -> subprocess.CompletedProcess[str]:
-    """From its start to its end."""
-    with free_domain() as domain:
-        environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1", "ROS_DOMAIN_ID": str(domain)}
-        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        command = [str(BIN / "msg-agents"), executable, *(str(argument) for argument in arguments)]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    return subprocess.CompletedProcess(words, code, stdout, stderr)
 
 
 def test_split_arguments() -> None:
@@ -150,9 +130,8 @@ def test_the_command_line_wins_over_a_file_for_all_nodes(run_file: Path, tmp_pat
     assert (by_file.returncode, by_command.returncode) == (2, 2)
 
 
-@pytest.mark.parametrize("rule", ["__node:=other"])
-def test_nodes_keep_their_names(run_file: Path, tmp_path: Path, rule: str) -> None:
-    process = execute("recorder", run_file, "--out", tmp_path / "bag", "--ros-args", "-r", rule)
+def test_nodes_keep_their_names(run_file: Path, tmp_path: Path) -> None:
+    process = start("recorder", run_file, "--out", tmp_path / "bag", "--ros-args", "-r", "__node:=other")
     assert process.returncode == 2
     assert "the nodes of a run find each other by name" in process.stderr
     assert not (tmp_path / "bag").exists()

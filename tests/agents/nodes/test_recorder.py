@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from networks import experiment
 
 pytest.importorskip("rclpy")
 
@@ -23,7 +24,6 @@ from msg_agents.environment import node_environment
 from msg_agents.nodes.recorder import Recorder, write_size
 from msg_agents.stepping.state_receiver import ReceivedSteps, StateReceiver
 from msg_agents.stepping.synchronizer import RESEND_LIMIT
-from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.acceptance import Refusal, sojourn_message
 from msg_analysis.messages.cdr import encode_batch
 from msg_analysis.messages.messages import StateCodec
@@ -38,18 +38,13 @@ STEPS = 3 * RESEND_LIMIT
 @pytest.fixture
 def recorder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Recorder]:
     """A recorder that hears no other node."""
-    experiment = Experiment.parse(
-        {
-            "name": "pair",
-            "graphs": {"line": {"path": [1, 2]}},
-            "run": {"dt": DT, "duration": STEPS * DT, "start": "zero", "replicas": 1},
-        }
-    )
+    one_graph = {"graphs": {"line": {"path": [1, 2]}}, "switching": {"generator": [[0]]}}
+    what = experiment(2, **one_graph, run={"dt": DT, "duration": STEPS * DT, "start": "zero", "replicas": 1})
     with free_domain() as domain:
         for name, value in node_environment(domain).items():
             monkeypatch.setenv(name, value)
         rclpy.init()
-        node = Recorder(record=new_record(experiment), directory=tmp_path / "bag")
+        node = Recorder(record=new_record(what), directory=tmp_path / "bag")
         yield node
         node.finish(complete=False, deadline=time.monotonic())
         node.destroy_node()
@@ -82,9 +77,8 @@ def test_memory_is_bounded_and_repeats_are_recorded_once(recorder: Recorder) -> 
         if step % 500 == 499:
             most = max(most, held(vars(recorder)))
     marks = 2 * AGENTS * RESEND_LIMIT
-    waiting = write_size(AGENTS) // len(
-        encode_batch(recorder.run, [bytes(76)])
-    )  # batches that are not yet written, at most
+    # Batches that are not yet written, at most.
+    waiting = write_size(AGENTS) // len(encode_batch(recorder.run, [bytes(76)]))
     assert marks <= most <= marks + waiting + 1000
     newest = STEPS - 1
     for step in range(newest - RESEND_LIMIT + 1, newest + 1):

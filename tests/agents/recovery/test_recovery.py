@@ -56,10 +56,11 @@ def test_in_memory() -> None:
     ring = Checkpoint(None, 24)
     ring.write(0, message(0, 24))
     assert ring.read() == [(0, message(0, 24))]
+    assert not ring.found
 
 
 def test_another_size_is_another_run(tmp_path: Path) -> None:
-    Checkpoint(tmp_path / "states", 200)
+    assert [Checkpoint(tmp_path / "states", 200).found for _ in range(2)] == [False, True]
     with pytest.raises(InputError, match=r"expected .* another run"):
         Checkpoint(tmp_path / "states", 208)
 
@@ -136,11 +137,6 @@ def test_no_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         Checkpoint(tmp_path / "states", LARGE)
 
 
-def test_whether_somebody_was_there_before(tmp_path: Path) -> None:
-    assert not Checkpoint(None, 100).found
-    assert [Checkpoint(tmp_path / "states", 100).found for _ in range(2)] == [False, True]
-
-
 def test_a_request_and_its_answer_outlive_processes(tmp_path: Path) -> None:
     run, other = uuid.UUID(int=1), uuid.UUID(int=2)
     asking = StopFiles(tmp_path, run)
@@ -152,7 +148,6 @@ def test_a_request_and_its_answer_outlive_processes(tmp_path: Path) -> None:
     for files in (asking, StopFiles(tmp_path, run)):
         assert (files.asked(), files.decided()) == (True, 1234)
     assert (StopFiles(tmp_path, other).asked(), StopFiles(tmp_path, other).decided()) == (False, None)
-    assert not list(tmp_path.glob("*.draft"))
 
 
 PREFIX = bytes(range(1, 13))
@@ -176,7 +171,4 @@ def test_a_takeover_removes_the_process_before_it(tmp_path: Path, monkeypatch: p
     with pytest.raises(InputError, match="another process is running agent_2"):
         take_over(tmp_path, ["agent_2"])
     assert [t.predecessor for t in takeovers] == [PREFIX, b""]
-
-
-def test_without_a_directory_there_is_no_takeover() -> None:
     assert take_over(None, ["agent_1"]) == []

@@ -56,8 +56,7 @@ def server(tmp_path: Path, domain: int) -> Iterator[ForkServer]:
 @pytest.fixture
 def waiting(tmp_path: Path) -> list[str]:
     """Arguments of an agent that waits for the other one until it is told to end."""
-    file = record_of_two(tmp_path)
-    return ["agent", str(file), "--agent", "1"]
+    return ["agent", str(record_of_two(tmp_path)), "--agent", "1"]
 
 
 def start(server: ForkServer, log: Path, *arguments: str, core: int | None = None, **descriptors: int) -> ForkedProcess:
@@ -263,10 +262,6 @@ def test_every_node_is_in_one_message_with_its_descriptors(sizes: list[tuple[int
 
 def test_few_messages() -> None:
     """A network of forty processes is one, and what they share is sent once."""
-    (message,) = _messages(
-        [
-            NodeStart(["agent", "run.json", "--agent", str(i)], {"--lifeline": 6, "--status": 10 + i}, 5, None)
-            for i in range(40)
-        ]
-    )
-    assert len(message[1]) == 42
+    nodes = [NodeStart(["agent", "run.json"], {"--lifeline": 6, "--status": 10 + i}, 5, None) for i in range(40)]
+    ((_, descriptors),) = _messages(nodes)
+    assert len(descriptors) == 42

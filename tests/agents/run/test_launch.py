@@ -119,6 +119,12 @@ def launched(out: Path, **changes: str) -> LaunchedNetwork:
     return LaunchedNetwork(NETWORK | {"out": str(out)} | changes)
 
 
+def end(network: LaunchedNetwork, *names: str, code: int = 0) -> None:
+    """These processes, or all, end."""
+    for name in names or [spec.name for spec in network.processes]:
+        network.ended(name, code)
+
+
 def temporary_folder(network: LaunchedNetwork) -> Path:
     (folder,) = {
         Path(word).parent for spec in network.processes for word in spec.arguments if word.endswith("run.json")
@@ -147,9 +153,8 @@ def test_complete(tmp_path: Path) -> None:
     """The last process to end completes the run."""
     network = launched(tmp_path, processes="1")
     folder = temporary_folder(network)
-    for name in ("agents_1_to_5", "switcher"):
-        network.ended(name, 0)
-        assert network.analysis() is None
+    end(network, "agents_1_to_5", "switcher")
+    assert network.analysis() is None
     network.ended("recorder", 0)
     assert network.analysis() == ["compare", str(network.bag), "--report", f"{network.bag}/report.html"]
     assert (network.over, network.analysis()) == (False, None)
@@ -164,6 +169,10 @@ def test_complete(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("code", "words"), [(2, "exit code 2"), (-signal.SIGKILL, "killed by SIGKILL")])
 def test_failed(tmp_path: Path, code: int, words: str) -> None:
     """Said once: the others end because of it, the recorder last. Until then they may read the run record."""
+    network = launched(tmp_path, processes="1")
+    network.ended("recorder", code)
+    assert network.to_stop() == ["agents_1_to_5", "switcher"]
+    network.close()
     network = launched(tmp_path, processes="2")
     assert network.to_stop() == []
     network.ended("agents_1_to_2", code)
@@ -179,21 +188,13 @@ def test_failed(tmp_path: Path, code: int, words: str) -> None:
     network.close()
 
 
-def test_a_recorder_that_failed(tmp_path: Path) -> None:
-    network = launched(tmp_path, processes="1")
-    network.ended("recorder", 2)
-    assert network.to_stop() == ["agents_1_to_5", "switcher"]
-    network.close()
-
-
 def test_interrupted(tmp_path: Path) -> None:
     """What launch was told is the reason, not that its processes obeyed; data so far are kept with the run record."""
     network = launched(tmp_path, processes="1")
     assert network.bag is not None
     (network.bag / f"{network.bag.name}_0.mcap").touch()
     network.interrupted("stopped by Ctrl-C")
-    for name in ("agents_1_to_5", "switcher", "recorder"):
-        network.ended(name, 3)
+    end(network, code=3)
     assert network.reason == f"stopped by Ctrl-C: the run is not complete; its data so far are in {network.bag}"
     network.close()
     assert (network.bag / "log/run.json").exists()
@@ -201,17 +202,16 @@ def test_interrupted(tmp_path: Path) -> None:
 
 def test_interrupted_after_the_run(tmp_path: Path) -> None:
     """Before the comparison, which launch does not start any more, or during it."""
-    for started in (False, True):
-        network = launched(tmp_path, processes="1")
-        for interrupted, name in ((False, "agents_1_to_5"), (not started, "switcher"), (False, "recorder")):
-            if interrupted:
-                network.interrupted("stopped by Ctrl-C")
-            network.ended(name, 0)
-        assert (network.analysis() is not None) == started
-        if started:
-            network.interrupted("stopped by Ctrl-C")
-            network.ended(ANALYSIS, 130)
-        when = "during" if started else "before"
+    before, during = launched(tmp_path, processes="1"), launched(tmp_path, processes="1")
+    before.ended("agents_1_to_5", 0)
+    before.interrupted("stopped by Ctrl-C")
+    end(before, "switcher", "recorder")
+    assert before.analysis() is None
+    end(during)
+    assert during.analysis() is not None
+    during.interrupted("stopped by Ctrl-C")
+    during.ended(ANALYSIS, 130)
+    for when, network in (("before", before), ("during", during)):
         assert network.reason == f"stopped by Ctrl-C {when} the comparison: no verdict of {network.bag}"
         network.close()
 
@@ -219,8 +219,7 @@ def test_interrupted_after_the_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("code", "words"), [(1, "disagrees"), (3, "incomplete"), (2, "exit code 2")])
 def test_verdict(tmp_path: Path, code: int, words: str) -> None:
     network = launched(tmp_path, processes="1")
-    for spec in network.processes:
-        network.ended(spec.name, 0)
+    end(network)
     assert network.analysis()
     network.ended(ANALYSIS, code)
     network.close()
@@ -231,8 +230,7 @@ def test_verdict(tmp_path: Path, code: int, words: str) -> None:
 def test_nothing_to_analyse(tmp_path: Path) -> None:
     for changes in ({"analyse": "false"}, {"record": "false"}):
         network = launched(tmp_path, **changes)
-        for spec in network.processes:
-            network.ended(spec.name, 0)
+        end(network)
         network.close()
         assert (network.over, network.analysis(), network.reason) == (True, None, None)
         assert ("recorder" in {spec.name for spec in network.processes}) == ("record" not in changes)

@@ -9,7 +9,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from msg_agents.run.result import EventLog, StatusSummary, read_status_files, write_status
+from msg_agents.run.result import EventLog, StatusSummary, read_status_files, write_report
 
 
 def test_events() -> None:
@@ -62,8 +62,10 @@ def test_killed_before_the_first_step() -> None:
 def test_counts_add_up_and_the_latest_word_on_waiting_counts(tmp_path: Path) -> None:
     """A process that was killed, the one that took over from it, and others that have said nothing or nonsense."""
     paths = [tmp_path / f"{i}.json" for i in range(4)]
-    write_status(paths[0], [("agent_1", "graph", "other run", 2)], {"agent_1": "at step 3, waiting", "agent_2": "so"})
-    write_status(paths[1], [("agent_1", "graph", "other run", 3), ("agent_1", "end", "other run", 1)], {"agent_1": ""})
+    once, waiting = [("agent_1", "graph", "other run", 2)], {"agent_1": "at step 3, waiting", "agent_2": "so"}
+    again = [("agent_1", "graph", "other run", 3), ("agent_1", "end", "other run", 1)]
+    write_report(paths[0], {"refused": once, "waiting": waiting})
+    write_report(paths[1], {"refused": again, "waiting": {"agent_1": ""}})
     paths[2].write_text("{")
     found = read_status_files(paths)
     assert found.waiting == {"agent_2": "so"}
@@ -74,4 +76,4 @@ def test_counts_add_up_and_the_latest_word_on_waiting_counts(tmp_path: Path) -> 
 
 
 def test_a_full_disk_is_no_failure(tmp_path: Path) -> None:
-    write_status(tmp_path / "no such folder" / "x.json", [], {})
+    write_report(tmp_path / "no such folder" / "x.json", {})

@@ -18,7 +18,6 @@ from types import SimpleNamespace
 
 import pytest
 from networks import record_of_two
-from started_processes import started_processes
 from waiting import gone, participants, state_of, wait_for
 
 pytest.importorskip("rclpy")
@@ -49,9 +48,9 @@ REPORTER = """
 import json, os, sys
 from pathlib import Path
 sys.path.remove(os.environ["PYTHONPATH"])
-from msg_agents.run.result import write_steps
+from msg_agents.run.result import write_report
 for line in open(sys.argv[2]):
-    write_steps(Path(sys.argv[sys.argv.index("--steps") + 1]), json.loads(line))
+    write_report(Path(sys.argv[sys.argv.index("--steps") + 1]), json.loads(line))
     print("written", flush=True)
 """
 INCOMPLETE = OBEDIENT.replace("exit(0)", f"exit({ExitCode.INCOMPLETE:d})")
@@ -131,44 +130,28 @@ def test_a_stopped_process_is_ended_too(tmp_path: Path, start: Callable[..., Chi
 
 
 @pytest.mark.parametrize(
-    ("code", "failure", "words"),
+    ("code", "failure", "words", "number", "resumes"),
     [
-        ("print('ready')", None, "ready"),
-        ("import sys; print('ready'); sys.exit('error: no disk')", "exit code 1", "error: no disk"),
-        ("import os; os.kill(os.getpid(), 9)", "killed by SIGKILL", ""),
-        ("import os; os.kill(os.getpid(), 15)", "killed by SIGTERM", ""),
+        ("print('ready')", None, "ready", 1, False),
+        ("import sys; print('ready'); sys.exit('error: no disk')", "exit code 1", "error: no disk", 1, True),
+        ("import os; os.kill(os.getpid(), 9)", "killed by SIGKILL", "", 1, True),
+        ("import os; os.kill(os.getpid(), 11)", "killed by SIGSEGV", "", 3, True),
+        ("raise MemoryError", "exit code 1", "MemoryError", 2, False),  # its own fault, again
+        ("import sys; sys.exit(2)", "exit code 2", "", 1, False),  # bad input
+        ("import sys; sys.exit(3)", "exit code 3", "", 1, False),  # told to stop
     ],
 )
-def test_failures_in_words(
-    tmp_path: Path, start: Callable[..., Child], code: str, failure: str | None, words: str
+def test_failures_and_which_are_worth_a_restart(
+    tmp_path: Path, start: Callable[..., Child], code: str, failure: str | None, words: str, number: int, resumes: bool
 ) -> None:
-    child = start(code)
-    child.process.wait()
+    child, without = (start(code, name, number=number, resumes=name == "agent_1") for name in NAMES[:2])
+    for each in (child, without):
+        each.process.wait()
     supervisor = supervised(tmp_path, child)
-    assert child.failure == failure
+    assert (child.failure, child.last_line()) == (failure, words)
     assert supervisor.failures == ([child] if failure else [])
     assert supervisor.running == []
-    assert child.last_line() == words
-
-
-@pytest.mark.parametrize(
-    ("code", "number", "resumes"),
-    [
-        ("import os; os.kill(os.getpid(), 9)", 1, True),
-        ("import os; os.kill(os.getpid(), 11)", 3, True),
-        ("raise MemoryError", 1, True),
-        ("raise MemoryError", 2, False),  # its own fault, again
-        ("import sys; sys.exit(2)", 1, False),  # bad input
-        ("import sys; sys.exit(3)", 1, False),  # told to stop
-        ("print('done')", 1, False),
-    ],
-)
-def test_which_deaths_are_worth_a_restart(start: Callable[..., Child], code: str, number: int, resumes: bool) -> None:
-    with_checkpoint, without = (start(code, name, number=number, resumes=name == "agent_1") for name in NAMES[:2])
-    for child in (with_checkpoint, without):
-        child.process.wait()
-    assert with_checkpoint.resumes == resumes
-    assert not without.resumes
+    assert (child.resumes, without.resumes) == (resumes, False)
 
 
 @pytest.mark.parametrize(
@@ -235,11 +218,6 @@ def test_steps_that_the_switcher_reports(tmp_path: Path) -> None:
         assert supervisor.steps == reports[-1]
 
 
-@pytest.fixture
-def run_file(tmp_path: Path) -> Path:
-    return record_of_two(tmp_path)
-
-
 PARENT = """
 import sys, time
 from pathlib import Path
@@ -261,7 +239,8 @@ with Supervisor(directory, node_environment(int(sys.argv[2]))) as supervisor:
 
 
 @pytest.mark.parametrize("early", [True, False], ids=["while they start", "while they wait"])
-def test_children_do_not_outlive_a_killed_parent(tmp_path: Path, run_file: Path, early: bool) -> None:
+def test_children_do_not_outlive_a_killed_parent(tmp_path: Path, early: bool) -> None:
+    record_of_two(tmp_path)
     with free_domain() as domain:
         command = [sys.executable, "-P", "-c", PARENT, str(tmp_path), str(domain)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
@@ -279,10 +258,11 @@ def test_children_do_not_outlive_a_killed_parent(tmp_path: Path, run_file: Path,
                     os.kill(pid, signal.SIGKILL)
 
 
-def test_real_nodes_end_in_order_when_told(tmp_path: Path, run_file: Path) -> None:
+def test_real_nodes_end_in_order_when_told(tmp_path: Path) -> None:
+    run_file = str(record_of_two(tmp_path))
     plans = [
-        ProcessSpec("recorder", ("recorder", str(run_file), "--out", str(tmp_path / "bag"))),
-        ProcessSpec("agent_1", ("agent", str(run_file), "--agent", "1")),
+        ProcessSpec("recorder", ("recorder", run_file, "--out", str(tmp_path / "bag"))),
+        ProcessSpec("agent_1", ("agent", run_file, "--agent", "1")),
     ]
     with free_domain() as domain, Supervisor(tmp_path, node_environment(domain)) as supervisor:
         supervisor.start(plans)
@@ -294,28 +274,15 @@ def test_real_nodes_end_in_order_when_told(tmp_path: Path, run_file: Path) -> No
     assert not any(re.search("Traceback", log) for log in logs.values()), logs
 
 
-BLOCKED = "import threading; lock = threading.Lock(); lock.acquire(); print(flush=True); lock.acquire()"
+BLOCKED = "import threading; lock = threading.Lock(); lock.acquire(); print('ready'); lock.acquire()"
 HELPED = (
     "import threading, time; lock = threading.Lock(); lock.acquire()\n"
     "def help():\n    while True: time.sleep(0.01)\n"
-    "threading.Thread(target=help, daemon=True).start(); print(flush=True); lock.acquire()"
+    "threading.Thread(target=help, daemon=True).start(); print('ready'); lock.acquire()"
 )
-SLEEPING = "import time; print(flush=True)\nwhile True: time.sleep(0.02)"
-RUNNING = "print(flush=True)\nwhile True: pass"
+SLEEPING = "import time; print('ready')\nwhile True: time.sleep(0.02)"
+RUNNING = "print('ready')\nwhile True: pass"
 HUNG = 0.5  # s
-
-
-@pytest.fixture
-def begin() -> Iterator[Callable[[str], subprocess.Popen[str]]]:
-    def start(code: str) -> subprocess.Popen[str]:
-        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-        processes.append(process)
-        assert process.stdout is not None
-        assert process.stdout.readline() == "\n"
-        return process
-
-    with started_processes() as processes:
-        yield start
 
 
 def looks(detector: HungDetector, seconds: float) -> bool:
@@ -328,31 +295,28 @@ def looks(detector: HungDetector, seconds: float) -> bool:
     return False
 
 
-@pytest.mark.parametrize("code", [BLOCKED, HELPED], ids=["alone", "another thread runs"])
-def test_a_main_thread_that_waits_for_ever(begin: Callable[[str], subprocess.Popen[str]], code: str) -> None:
-    assert looks(HungDetector(begin(code).pid), 30.0)
+@pytest.mark.parametrize(
+    ("code", "hung"),
+    [(BLOCKED, True), (HELPED, True), (SLEEPING, False), (RUNNING, False)],
+    ids=["waits for ever", "and another thread runs", "sleeps", "runs"],
+)
+def test_main_threads(start: Callable[..., Child], code: str, hung: bool) -> None:
+    assert looks(start(code).detector, 30.0 if hung else 2.5 * HUNG) == hung
 
 
-@pytest.mark.parametrize("code", [SLEEPING, RUNNING], ids=["sleeping", "running"])
-def test_a_main_thread_that_runs(begin: Callable[[str], subprocess.Popen[str]], code: str) -> None:
-    assert not looks(HungDetector(begin(code).pid), 2.5 * HUNG)
-
-
-def test_stopped_and_gone(begin: Callable[[str], subprocess.Popen[str]]) -> None:
-    process = begin(BLOCKED)
+def test_stopped_and_gone(start: Callable[..., Child]) -> None:
+    process = start(BLOCKED).process
     process.send_signal(signal.SIGSTOP)
     detector = HungDetector(process.pid)
     assert not looks(detector, 2.5 * HUNG)
-    process.kill()
+    process.send_signal(signal.SIGKILL)
     process.wait()
     assert not looks(detector, 1.5 * HUNG)
 
 
-def test_neither_a_sleep_of_ours_nor_a_clock_that_is_set_back_counts(
-    begin: Callable[[str], subprocess.Popen[str]],
-) -> None:
+def test_neither_a_sleep_of_ours_nor_a_clock_that_is_set_back_counts(start: Callable[..., Child]) -> None:
     clock = SimpleNamespace(now=100.0, wall=1e9)
-    process = begin(BLOCKED)
+    process = start(BLOCKED).process
     wait_for(lambda: state_of(process.pid) == "S")  # on a busy machine it may still run
     detector = HungDetector(process.pid, clock=lambda: clock.now, wall=lambda: clock.wall)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import pytest
 
-from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, RESEND_LIMIT, TURN_SLICE, Synchronizer, TurnQueue
+from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, TURN_SLICE, Synchronizer, TurnQueue
 from msg_analysis.messages.acceptance import Refusal
 
 
@@ -28,7 +28,7 @@ def pair(window: int = 2, steps: int = 10) -> Synchronizer[str]:
 
 
 def everything(node: Synchronizer[str]) -> object:
-    return copy.deepcopy({key: value for key, value in vars(node).items() if key != "_limit"})
+    return copy.deepcopy({key: value for key, value in vars(node).items() if key not in ("_limit", "_uses", "_needed")})
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,6 @@ def test_another_value_is_noticed_for_as_long_as_the_true_one_can_take() -> None
         make_step(node)
     assert node.offer(1, LOCKSTEP_WINDOW, "forged") == Refusal.CONTRADICTION
     assert node.offer(1, LOCKSTEP_WINDOW - 1, "forged") == Refusal.REPEATED
-    assert node.buffered == 0
 
 
 def test_whose_states_are_lacking() -> None:
@@ -85,12 +84,11 @@ def test_whose_states_are_lacking() -> None:
 
 
 def test_what_is_long_past_is_no_repetition() -> None:
-    node: Synchronizer[str] = Synchronizer(
-        agent=0, steps=10**6, inputs=[[1]], peers=[1], start=RESEND_LIMIT + 100, window=LOCKSTEP_WINDOW
-    )
-    assert node.offer(1, RESEND_LIMIT + 100, "now") is None
-    assert node.offer(1, 100 - LOCKSTEP_WINDOW, "the oldest that is sent again") == Refusal.REPEATED
-    assert node.offer(1, 99 - LOCKSTEP_WINDOW, "forged") == Refusal.TOO_OLD
+    """A window and 6000 steps ago, which are sent again at most."""
+    node: Synchronizer[str] = Synchronizer(agent=0, steps=10**6, inputs=[[1]], peers=[1], start=6_100)
+    assert node.offer(1, 6_100, "now") is None
+    assert node.offer(1, 36, "the oldest that is sent again") == Refusal.REPEATED
+    assert node.offer(1, 35, "forged") == Refusal.TOO_OLD
 
 
 @pytest.mark.parametrize(
@@ -106,6 +104,7 @@ def test_what_is_long_past_is_no_repetition() -> None:
 )
 def test_refused_sojourns_change_nothing(sequence: int, first: int, last: int, reason: str) -> None:
     node = pair()
+    assert node.learn(1, 0, 0, 4) == Refusal.OUT_OF_SEQUENCE
     assert node.learn(0, 0, 0, 4) is None
     before = everything(node)
     assert node.learn(sequence, 1, first, last) == reason
@@ -116,7 +115,6 @@ def test_refused_sojourns_change_nothing(sequence: int, first: int, last: int, r
 def test_the_farthest_possible_step_is_taken() -> None:
     node = pair(window=2)
     assert [node.offer(1, k, str(k)) for k in range(4)] == [None] * 4
-    assert node.buffered == 4
     assert node.offer(1, 4, "4") == Refusal.TOO_NEW
 
 
@@ -129,7 +127,6 @@ def test_a_peer_without_a_link_still_holds_back() -> None:
     assert node.offer(1, 0, "0") is None  # of no use any more, but it shows that the peer moves
     assert node.offer(1, 0, "0") == Refusal.REPEATED
     assert node.ready()
-    assert node.buffered == 0
 
 
 def test_alone() -> None:
@@ -159,6 +156,53 @@ def test_waiting_for() -> None:
 def test_inputs_must_be_peers() -> None:
     with pytest.raises(ValueError, match=r"uses \[3\]"):
         Synchronizer(agent=0, steps=1, inputs=[[1, 3]], peers=[1])
+
+
+def lonely(held: int) -> Synchronizer[str]:
+    """Agent 0 at step 200, which hears agent 1, of which it holds the value of a step."""
+    node: Synchronizer[str] = Synchronizer(
+        needed=lambda _j, k: held if k <= 200 else k, delay=0, agent=0, steps=300, inputs=[[1]], peers=[1], start=200
+    )
+    assert node.learn(0, 0, 0, 299) is None
+    return node
+
+
+@pytest.mark.parametrize("held", [90, 150, 200])
+def test_it_waits_for_the_value_that_it_holds(held: int) -> None:
+    """Newer and older ones do not help; what comes twice must be the same."""
+    node = lonely(held)
+    assert node.waiting_for() == f"step {held} of agent 2"
+    assert node.lacking() == [1]
+    assert node.offer(1, 201, "new") is None
+    assert node.offer(1, held - 1, "old") == Refusal.REPEATED
+    assert not node.ready()
+    assert node.offer(1, held, "held") is None
+    assert node.offer(1, held, "held") == Refusal.REPEATED
+    assert node.offer(1, held, "forged") == Refusal.CONTRADICTION
+    assert node.known(1, held) == "held"
+    assert node.ready()
+    assert node.inputs() == (0, ["held"])
+    node.advance()
+    assert node.inputs() == (0, ["new"])
+
+
+def test_values_of_different_steps() -> None:
+    node: Synchronizer[str] = Synchronizer(
+        needed=lambda j, k: k - j, delay=0, agent=0, steps=300, inputs=[[1, 2]], peers=[1, 2], start=200
+    )
+    assert node.waiting_for() == "the graph of step 200"
+    node.learn(0, 0, 0, 299)
+    assert node.waiting_for() == "step 199 of agent 2, step 198 of agent 3"
+    assert [node.offer(1, 199, "one"), node.offer(2, 198, "two")] == [None, None]
+    assert node.inputs() == (0, ["one", "two"])
+
+
+def test_what_it_refuses_of_a_peer_that_is_heard_late() -> None:
+    node = lonely(200)
+    assert node.offer(2, 200, "") == Refusal.NOT_A_PEER
+    assert node.offer(1, 266, "") == Refusal.TOO_NEW
+    assert node.offer(1, 100, "") is None  # the progress of a peer that is behind
+    assert node.offer(1, 99, "") == Refusal.REPEATED
 
 
 class Player:
@@ -215,18 +259,12 @@ def test_the_middleware_gets_its_turn() -> None:
     for player in game.players:
         game.turns.join(player)
     assert game.seen == [0]
-    slices = 0
-    while game.deferred:
-        before = len(game.seen)
+    for before in range(1, 5):
         game.turns.ask(game.players[0])
         assert len(game.seen) == before
         game.deferred.pop()()
-        assert len(game.seen) == before + 1
-        assert game.ended[-1] == before + 1
-        assert len(game.deferred) <= 1
-        slices += 1
-        if slices == 4:
-            break
+        assert len(game.seen) == game.ended[-1] == before + 1
+        assert len(game.deferred) == 1
     while game.deferred:
         game.deferred.pop()()
     assert len(game.seen) >= 6

@@ -12,13 +12,14 @@ import random
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import product
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from msg_agents.stepping.synchronizer import Synchronizer, _Uses
+from msg_agents.stepping.synchronizer import HISTORY_STEPS, Synchronizer, _Uses
 from msg_analysis.messages.acceptance import Refusal
 
 PRIME = 2**61 - 1
@@ -35,6 +36,15 @@ class Case:
     window: int
     inputs: Inputs
     path: list[Sojourn]
+    delay: int = 0
+    lost: frozenset[tuple[int, int, int]] = frozenset()  # receiver, sender, step of the value
+
+    def needed(self, receiver: int, sender: int, step: int) -> int:
+        """The step of the value that is used: the last one received."""
+        step = max(0, step - self.delay)
+        while (receiver, sender, step) in self.lost:
+            step -= 1
+        return step
 
     @cached_property
     def peers(self) -> list[set[int]]:
@@ -58,9 +68,9 @@ def serial(case: Case) -> list[list[int]]:
     """[step][agent], computed by one loop that knows everything."""
     modes = [mode for _, mode, first, last in case.path for _ in range(first, last + 1)]
     states = [[agent + 1 for agent in range(case.agents)]]
-    for mode in modes:
-        now = states[-1]
-        states.append([law(now[i], i, mode, [(j, now[j]) for j in case.inputs[mode][i]]) for i in range(case.agents)])
+    for k, mode in enumerate(modes):
+        used = [[(j, states[case.needed(i, j, k)][j]) for j in row] for i, row in enumerate(case.inputs[mode])]
+        states.append([law(states[k][i], i, mode, used[i]) for i in range(case.agents)])
     return states
 
 
@@ -73,7 +83,7 @@ class Network:
     states: list[list[int]] = field(init=False)  # [agent][step]
     links: dict[tuple[int, int], deque[tuple[int, int]]] = field(init=False)
     graphs: list[deque[Sojourn]] = field(init=False)
-    unheard: set[tuple[int, int]] = field(default_factory=set)  # links over which a new process has not asked yet
+    unasked: set[tuple[int, int]] = field(default_factory=set)  # links over which a new process has not asked yet
     killed: bool = False
 
     def __post_init__(self) -> None:
@@ -87,10 +97,10 @@ class Network:
 
     def _node(self, agent: int, start: int) -> Synchronizer[int]:
         case = self.case
-        inputs = [mode[agent] for mode in case.inputs]
-        return Synchronizer(
-            agent=agent, steps=case.steps, inputs=inputs, peers=case.peers[agent], window=case.window, start=start
-        )
+        options = {"agent": agent, "steps": case.steps, "peers": case.peers[agent], "window": case.window}
+        if case.delay or case.lost:
+            options |= {"needed": partial(case.needed, agent), "delay": case.delay}
+        return Synchronizer(inputs=[mode[agent] for mode in case.inputs], start=start, **options)
 
     def _publish(self, agent: int, value: int) -> None:
         for (source, _), queue in self.links.items():
@@ -108,14 +118,14 @@ class Network:
                 self.links[source, target] = deque(enumerate(self.states[agent]))
             elif target == agent:
                 self.links[source, target].clear()
-                self.unheard.add((source, target))
+                self.unasked.add((source, target))
         self.check_bounds(agent)
 
     def events(self) -> list[tuple[str, int, int]]:
         """Everything that can happen now."""
         possible = [("state", j, i) for (j, i), queue in self.links.items() if queue]
         possible += [("graph", i, i) for i, queue in enumerate(self.graphs) if queue]
-        possible += [("again", j, i) for j, i in self.unheard]
+        possible += [("again", j, i) for j, i in self.unasked]
         return possible + [("step", i, i) for i, node in enumerate(self.nodes) if node.ready()]
 
     def happen(self, event: tuple[str, int, int]) -> None:
@@ -128,8 +138,8 @@ class Network:
             refused = node.learn(*self.graphs[target].popleft())
             assert refused in ((None, Refusal.REPEATED) if self.killed else (None,))
         elif kind == "again":
-            self.unheard.discard((source, target))
-            first = max(0, node.step - self.case.window - 1)
+            self.unasked.discard((source, target))
+            first = self.case.needed(target, source, max(0, node.step - self.case.window - 1))
             self.links[source, target].extend(list(enumerate(self.states[source]))[first:])
         else:
             step = node.step
@@ -144,7 +154,6 @@ class Network:
     def check_bounds(self, agent: int) -> None:
         """Of the one agent that an event changes."""
         window, node, made = self.case.window, self.nodes[agent], len(self.states[agent])
-        assert node.buffered <= window + 2
         assert made == node.step + 1
         for j in self.case.peers[agent]:
             assert made - len(self.states[j]) <= window + 1
@@ -181,7 +190,15 @@ def cases(draw: st.DrawFn) -> Case:
         (n, draw(st.integers(0, modes - 1)), first, last)
         for n, (first, last) in enumerate(zip(firsts, ends, strict=True))
     ]
-    return Case(agents, steps, window, inputs, path)
+    delay, loss = draw(st.sampled_from([0, 0, 0, 1, 3, 20])), draw(st.sampled_from([0.0, 0.0, 0.3, 0.9]))
+    lost = losses(agents, steps, loss, draw(st.randoms()))
+    return Case(agents, steps, window, inputs, path, delay, lost)
+
+
+def losses(agents: int, steps: int, loss: float, chance: random.Random) -> frozenset[tuple[int, int, int]]:
+    """Values that are lost; that of step 0 never is."""
+    values = product(range(agents), range(agents), range(1, steps + 1)) if loss else ()
+    return frozenset(value for value in values if chance.random() < loss)
 
 
 @settings(max_examples=300, deadline=None)
@@ -205,10 +222,25 @@ def test_any_network_in_any_order_is_the_serial_loop(case: Case, seed: int, slow
 @given(cases(), st.integers(0, 2**32))
 def test_agents_may_be_killed_at_any_time(case: Case, seed: int) -> None:
     """Each of them a few times, also while others wait for its answer."""
-    rng = random.Random(seed)
+    run_with_kills(case, random.Random(seed))
+
+
+@pytest.mark.parametrize(("delay", "loss", "seed"), [(0, 0.99, 1), (100, 0.5, 2), (70, 0.98, 3)])
+def test_values_older_than_all_that_is_kept_anyway(delay: int, loss: float, seed: int) -> None:
+    """With bursts of hundreds of steps, more than a window and what is kept after use."""
+    rng, steps = random.Random(seed), 700
+    pairs = [(i, j) for i in range(3) for j in range(3) if i != j]
+    inputs: Inputs = [[[j for i, j in pairs if i == agent and rng.random() < 0.6] for agent in range(3)] for _ in "ab"]
+    path = [(k, rng.randrange(2), k, k) for k in range(steps)]
+    case = Case(3, steps, 64, inputs, path, delay, losses(3, steps, loss, rng))
+    assert max(k - case.needed(i, j, k) for i, j in pairs for k in range(steps)) > HISTORY_STEPS
+    run_with_kills(case, rng)
+
+
+def run_with_kills(case: Case, rng: random.Random) -> None:
     network, lives = Network(case), 2 * case.agents
     while events := network.events():
-        if lives and rng.random() < 0.05:
+        if lives and rng.random() < 2 / case.steps:
             lives -= 1
             network.kill(rng.randrange(case.agents))
         else:

@@ -73,7 +73,7 @@ def test_gives_what_was_written(tmp_path: Path, noise: dict[str, float]) -> None
         assert np.array_equal(modes, trajectory.modes[steps])
         assert np.array_equal(states, trajectory.states[steps])
         assert np.array_equal(after, trajectory.states[steps + 1])
-        logs += [(steps, reader.logged())] if len(steps) else []
+        logs += [(steps, reader.logged)] if len(steps) else []
     assert seen == list(range(400))
     assert reader.missed == 0
     for steps, logged in logs:

@@ -49,6 +49,10 @@ def _get(web: WebServer, path: str, **headers: str) -> http.client.HTTPResponse:
     return connection.getresponse()
 
 
+def _dial(web: WebServer) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", int(web.address.rstrip("/").rpartition(":")[2])), timeout=20)
+
+
 class Events:
     """Reads a stream of events."""
 
@@ -66,6 +70,15 @@ class Events:
             elif line.startswith("data: "):
                 return name, json.loads(line.removeprefix("data: "))
         return None
+
+    def until(self, name: str) -> list[tuple[str, Any]]:
+        """Those up to the next one of this name; to the last one, if there is none."""
+        found: list[tuple[str, Any]] = []
+        while (event := self.next()) is not None:
+            found.append(event)
+            if event[0] == name:
+                break
+        return found
 
 
 def test_page(idle: WebServer) -> None:
@@ -108,8 +121,8 @@ def test_states_are_sent_when_there_are_new_ones(web: WebServer) -> None:
     found = [early.next(), early.next()]
     for moment in moments:
         web.show(moment)
-        while (event := early.next()) and event[0] != "moment":
-            found.append(event)
+        *others, event = early.until("moment")
+        found += others
         assert event == ("moment", {key: value for key, value in moment.items() if key != "trace"})
     assert found[2:] == [("trace", {"steps": [1], "agents": [[0.5, None]]}), ("trace", newer)]
     late = Events(web)
@@ -131,10 +144,7 @@ def test_events(web: WebServer) -> None:
     web.end({"text": "over", "verdict": "agrees"})
     web.end({"text": "over again", "verdict": None})
     for events in (early, late):
-        found = []
-        while event := events.next():
-            found.append(event)
-        assert found[-1] == ("end", {"text": "over", "verdict": "agrees", "report": None})
+        assert events.until("none")[-1] == ("end", {"text": "over", "verdict": "agrees", "report": None})
 
 
 def test_the_report_is_there_until_the_browsers_have_it(tmp_path: Path) -> None:
@@ -149,9 +159,7 @@ def test_the_report_is_there_until_the_browsers_have_it(tmp_path: Path) -> None:
         served.end({"text": "over", "verdict": "agrees"}, report)
         closing = threading.Thread(target=served.close)
         closing.start()
-        while (event := browser.next()) is not None and event[0] != "end":
-            pass
-        assert event == ("end", {"text": "over", "verdict": "agrees", "report": str(report)})
+        assert browser.until("end")[-1] == ("end", {"text": "over", "verdict": "agrees", "report": str(report)})
         assert browser.next() is None
         assert closing.is_alive()
         answer = _get(served, "/report")
@@ -165,7 +173,7 @@ def test_who_is_slow_or_goes_holds_nobody_up(web: WebServer) -> None:
     It misses those that came meanwhile. Another browser goes at once, and one reads.
     """
     web.begin({"name": "net"})
-    slow = socket.create_connection(("127.0.0.1", int(web.address.rstrip("/").rpartition(":")[2])), timeout=20)
+    slow = _dial(web)
     slow.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
     gone = _connection(web)
     gone.request("GET", "/events")
@@ -180,14 +188,10 @@ def test_who_is_slow_or_goes_holds_nobody_up(web: WebServer) -> None:
         web.show(MOMENT | {"reached": step} | large)
     reached = [-1]
     while reached[-1] < 5:
-        event = reader.next()
-        assert event is not None
-        if event[0] == "moment":
-            reached.append(event[1]["reached"])
+        reached.append(reader.until("moment")[-1][1]["reached"])
     assert reached == sorted(reached)
     web.end({"text": "over", "verdict": None})
-    while reader.next():
-        pass
+    reader.until("end")
     assert re.findall(rb'"reached": (\d+)', stream.read()) == [b"0", b"5"]
     slow.close()
 
@@ -198,13 +202,10 @@ def test_not_too_many(web: WebServer) -> None:
     assert all(stream.next() for stream in streams)
     one_more = Events(web)
     assert one_more.next() == ("setting", {"name": "net"})
-    while streams[0].next():  # the first one has made room; a browser would come back
-        pass
+    streams[0].until("none")  # the first one has made room; a browser would come back
     web.show(MOMENT)
     for stream in (streams[1], streams[-1], one_more):
-        while (event := stream.next()) and event[0] != "moment":
-            pass
-        assert event == ("moment", MOMENT)
+        assert stream.until("moment")[-1] == ("moment", MOMENT)
     assert _get(web, "/").status == 200
 
 
@@ -253,10 +254,6 @@ def test_dripping_requests(strict: WebServer) -> None:
         browser.close()
 
 
-def _dial(web: WebServer) -> socket.socket:
-    return socket.create_connection(("127.0.0.1", int(web.address.rstrip("/").rpartition(":")[2])), timeout=20)
-
-
 def _answers(web: WebServer) -> bool:
     try:
         return _get(web, "/").status == 200
@@ -269,10 +266,7 @@ def test_the_end_reaches_who_watches() -> None:
         events = Events(web)
         web.begin({"name": "net"})
         assert events.next() is not None
-    found = []
-    while event := events.next():
-        found.append(event[0])
-    assert found[-1] == "end"
+    assert events.until("none")[-1][0] == "end"
 
 
 def test_the_port_is_taken(idle: WebServer) -> None:

@@ -146,7 +146,7 @@ function show(data) {
     at("anytime").textContent = wide === null ? "–" : `${number(system.measured - wide)} … ${number(system.measured + wide)}`;
     if (seen && seen.log_evidence !== null) {
       const evidence = seen.evidence === null ? "more than 1e300" : number(seen.evidence, 2);
-      at("evidence").textContent = `${evidence} (${seen.disagrees ? `disagrees: ${seen.strongest}` : `disagrees at ${seen.threshold}`})`;
+      at("evidence").textContent = `${evidence} (${seen.disagrees ? `exceeded: ${seen.strongest}` : `threshold ${seen.threshold}`})`;
     }
     at("against").classList.toggle("far", Boolean(seen && seen.disagrees));
     const last = points[points.length - 1];
