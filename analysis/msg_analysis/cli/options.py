@@ -28,26 +28,6 @@ SMALLEST_SPLIT = 0.1  # MB
 RESULT_FILE = "result.json"
 
 
-def storage_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the arguments ``compression`` and ``split_size`` [MB, 10^6 bytes] to a command; see :func:`storage`."""
-    for option in (
-        click.option(
-            "--compression",
-            type=click.Choice(COMPRESSIONS),
-            default="zstd",
-            help="Compression of the chunks of the bag.",
-        ),
-        click.option(
-            "--split-size",
-            type=click.FloatRange(SMALLEST_SPLIT),
-            metavar="MB",
-            help="Start a new file of the bag after this many MB (10^6 bytes).",
-        ),
-    ):
-        command = option(command)
-    return command
-
-
 def storage(compression: Compression, split_size: float | None) -> Storage:
     """The storage that these options ask for; ``split_size`` [MB, 10^6 bytes] is None for one file."""
     from msg_analysis.bags.stored_file import MEGABYTE, Storage
@@ -63,10 +43,7 @@ _PLAIN = re.compile(r"[\w./~+,:@%=-]*")  # characters that a shell needs no quot
 
 
 class InputPath(click.Path):
-    """Path of a file with one of the suffixes, or of a directory with one of ``holds`` (names or patterns) in it.
-
-    A shell completes it to such paths, and to directories on the way to them.
-    """
+    """Path of a file with one of the suffixes, or of a directory with one of ``holds`` (patterns) in it."""
 
     def __init__(self, *suffixes: str, holds: Sequence[str] = ()) -> None:
         super().__init__(path_type=Path)
@@ -74,7 +51,7 @@ class InputPath(click.Path):
         self._holds = tuple(holds)
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        """Complete to wanted files and directories; see click.ParamType."""
+        """Complete to such paths, and to directories on the way to them; see click.ParamType."""
         del ctx, param
         found = _paths(incomplete, self._is_wanted)
         if not all(_PLAIN.fullmatch(path) for path in found):
@@ -167,7 +144,7 @@ def with_changes(document: Any, changes: Sequence[str]) -> Any:
     return document
 
 
-def load_experiment(path: Path, changes: Sequence[str]) -> Experiment:
+def load_experiment(path: Path, changes: Sequence[str] = ()) -> Experiment:
     """The experiment of a file with the values of ``--set``."""
     from msg_analysis import Experiment
     from msg_analysis.experiment.loading import read_yaml
@@ -181,17 +158,6 @@ def load_experiment(path: Path, changes: Sequence[str]) -> Experiment:
 def source_of(path: Path, changes: Sequence[str]) -> str:
     """How errors call a file with the values of ``--set``."""
     return " ".join([str(path), *(f"--set {change}" for change in changes)])
-
-
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
-verbose_option = click.option(
-    "-v", "--verbose", is_flag=True, help="Also print all tests and agents, the order of the agents, and the timing."
-)
-experiment_argument = click.argument("experiment", type=EXPERIMENT)
-seed_option = click.option("--seed", type=int, metavar="N", help="Seed of the run (run.seed).")
-duration_option = click.option(
-    "--duration", type=float, metavar="T", help="Overrides run.duration, in units of simulated time."
-)
 
 
 class PositiveFloat(click.FloatRange):
@@ -208,9 +174,43 @@ class PositiveFloat(click.FloatRange):
         return number
 
 
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+verbose_option = click.option(
+    "-v", "--verbose", is_flag=True, help="Also print all tests and agents, the order of the agents, and the timing."
+)
+experiment_argument = click.argument("experiment", type=EXPERIMENT)
+seed_option = click.option("--seed", type=int, metavar="N", help="Seed of the run (run.seed).")
+duration_option = click.option(
+    "--duration", type=float, metavar="T", help="Overrides run.duration, in units of simulated time."
+)
+
+
+def choice_option(name: str, choices: Sequence[str], text: str, **more: Any) -> Callable[..., Any]:
+    """An option with one of these words; ``text``: its help."""
+    return click.option(name, type=click.Choice(choices), help=text, **more)
+
+
+def positive_option(name: str, metavar: str, text: str, **more: Any) -> Callable[..., Any]:
+    """An option with a finite number above 0; ``text``: its help."""
+    return click.option(name, type=PositiveFloat(), metavar=metavar, help=text, **more)
+
+
+def out_option(metavar: str, text: str, **more: Any) -> Callable[..., Any]:
+    """The option ``--out``; ``text``: its help."""
+    return click.option("--out", type=PATH, metavar=metavar, help=text, **more)
+
+
 def level_option(what: str) -> Callable[..., Any]:
     """The option ``--level``, a probability; ``what`` is its help text."""
     return click.option("--level", type=PositiveFloat(0.5), metavar="P", default=0.01, help=what)
+
+
+def storage_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the arguments ``compression`` and ``split_size`` [MB, 10^6 bytes] to a command; see :func:`storage`."""
+    what = "Start a new file of the bag after this many MB (10^6 bytes)."
+    size = click.option("--split-size", type=click.FloatRange(SMALLEST_SPLIT), metavar="MB", help=what)
+    compression = choice_option("--compression", COMPRESSIONS, "Compression of the chunks of the bag.", default="zstd")
+    return size(compression(command))
 
 
 def suggest(*words: str) -> Callable[..., list[CompletionItem]]:

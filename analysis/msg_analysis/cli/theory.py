@@ -14,6 +14,7 @@ from msg_analysis.cli.console import examples, print_json, result_console
 from msg_analysis.cli.options import (
     FILE,
     SOURCE,
+    choice_option,
     experiment_argument,
     is_bag,
     json_option,
@@ -37,11 +38,8 @@ if TYPE_CHECKING:
 @click.option(
     "--times", metavar="TIMES", required=True, help="START:STOP:STEP or t1,t2,... in units of simulated time."
 )
-@click.option(
-    "--law",
-    type=click.Choice(["emulated", "continuous"]),
-    default="emulated",
-    help="Steps of the run, or the continuous time of the paper.",
+@choice_option(
+    "--law", ["emulated", "continuous"], "Steps of the run, or the continuous time of the paper.", default="emulated"
 )
 @click.option("--unreduced", is_flag=True, help="Consensus: errors of the states, not of the disagreement.")
 @click.option(
@@ -53,11 +51,10 @@ if TYPE_CHECKING:
 def transient(experiment: Path, times: str, *, table: Path | None, as_json: bool, **options: Any) -> None:
     """Predict the errors over time, from the start of a run."""
     from msg_analysis.common.files import require_place
-    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report.documents import describe_transient, write_transient_csv
 
     require_place(table)
-    loaded = Experiment.load(experiment)
+    loaded = load_experiment(experiment)
     loaded.require_available("predict")
     document = describe_transient(loaded, _parse_times(times), **options)
     if table:
@@ -101,10 +98,9 @@ def _parse_times(text: str) -> FloatArray:
 @json_option
 def facts(experiment: Path, as_json: bool) -> None:
     """Check the lemmas of the paper; bounds, graph indices."""
-    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report.documents import describe_facts
 
-    loaded = Experiment.load(experiment)
+    loaded = load_experiment(experiment)
     loaded.require_available("predict")
     document = describe_facts(loaded)
     if as_json:

@@ -1,10 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The sweep file and its grid: every point of it is a valid experiment before anything is computed.
-
-All mistakes are reported together, each once, with the points that have it.
-"""
+"""The sweep file and its grid: every point is checked before anything is computed; all mistakes are told together."""
 
 from __future__ import annotations
 
@@ -174,13 +171,9 @@ class KeyProblemError(Exception):
 
 
 def put(document: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """A copy of a document with another value at a place; only the containers on the way are copied.
-
-    Names in the document may have dots in them; missing sections are made. KeyProblemError: the key leads nowhere.
-    """
-    parts = _split(key)
+    """A copy of a document with another value at a place, in new sections if need be; KeyProblemError: nowhere."""
     changed = dict(document)
-    _put(changed, parts, value, key, "")
+    _put(changed, _split(key), value, key, "")
     return changed
 
 
@@ -275,10 +268,7 @@ class Sweep:
 
 
 def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) -> Sweep:
-    """Read a sweep file (YAML; JSON is YAML too) and check every point of it.
-
-    InputError: it, or the file of the experiment, cannot be read. ExperimentError: all mistakes, with their points.
-    """
+    """Read a sweep file in YAML or JSON. InputError: a file cannot be read; ExperimentError: all mistakes."""
     path = Path(path)
     mapping = read_yaml(path)
     if not isinstance(mapping, Mapping):
@@ -291,12 +281,10 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
     except ValidationError as error:
         found = [translate(detail, SweepSpec) for detail in error.errors(include_url=False)]
         raise ExperimentError(str(path), found) from error
-    directory = path.parent
-    base: Any = spec.experiment
+    directory, base = path.parent, spec.experiment
     if isinstance(base, str):
         file = find(base, directory)
-        directory = file.parent
-        base = read_yaml(file)
+        directory, base = file.parent, read_yaml(file)
         if not isinstance(base, Mapping):
             raise ExperimentError(
                 str(path), [problem("experiment", show(base), "expected a file of keys", "correct it")]

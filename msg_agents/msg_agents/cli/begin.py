@@ -16,7 +16,7 @@ import click
 
 from msg_analysis.cli.console import examples as example_lines
 from msg_analysis.cli.console import print_json, print_text, result_console
-from msg_analysis.cli.options import PATH, PositiveFloat, json_option
+from msg_analysis.cli.options import PATH, choice_option, json_option, positive_option
 from msg_analysis.errors import ExitCode, InputError
 from msg_analysis.experiment.examples import (
     FOLDER,
@@ -101,20 +101,19 @@ def examples(name: str | None, *, as_json: bool) -> None:
     default=DEFAULT.graphs,
     help="A graph of the network. Repeatable: the network switches between the graphs.",
 )
-@click.option(
+@choice_option(
     "--time",
-    type=click.Choice(["continuous", "discrete"]),
+    ["continuous", "discrete"],
+    "Continuous: Euler steps of run.dt; discrete: one step is one unit of time.",
     default=DEFAULT.time,
-    help="Continuous: Euler steps of run.dt; discrete: one step is one unit of time.",
 )
-@click.option(
+@positive_option(
     "--switching",
-    type=PositiveFloat(),
-    metavar="RATE",
+    "RATE",
+    "How often a graph is left: jumps per unit of time; in discrete time the probability of a jump after a step.",
     default=DEFAULT.switching,
-    help="How often a graph is left: jumps per unit of time; in discrete time the probability of a jump after a step.",
 )
-@click.option("--noise", type=PositiveFloat(), metavar="F", default=DEFAULT.noise, help="Noise gain of all agents.")
+@positive_option("--noise", "F", "Noise gain of all agents.", default=DEFAULT.noise)
 @click.option(
     "--loss",
     type=click.FloatRange(0, 1, max_open=True),
@@ -130,13 +129,7 @@ def examples(name: str | None, *, as_json: bool) -> None:
     metavar="AGENT",
     help="An agent that knows the reference, which the others follow. Repeatable; without one, the agents agree.",
 )
-@click.option(
-    "--duration",
-    type=PositiveFloat(),
-    metavar="T",
-    show_default="4000 steps",
-    help="Duration of the run, in units of simulated time.",
-)
+@positive_option("--duration", "T", "Duration of the run, in units of simulated time.", show_default="4000 steps")
 @json_option
 def new(file: Path, *, as_json: bool, **given: Any) -> None:
     """Write a new experiment, with comments, to FILE.

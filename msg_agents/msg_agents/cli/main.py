@@ -9,6 +9,7 @@ input, 3 incomplete data. Modules that take long to import are imported by the c
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,13 +23,14 @@ from msg_agents.environment import LAST_DOMAIN, RESTARTS, USER_TIMEOUT
 from msg_agents.terminal import Interruption
 from msg_analysis.cli.console import CommandGroup, examples
 from msg_analysis.cli.options import (
-    PATH,
     RUN_RECORD,
     YAML,
-    PositiveFloat,
+    choice_option,
     duration_option,
     experiment_argument,
     json_option,
+    out_option,
+    positive_option,
     seed_option,
     set_option,
     source_of,
@@ -65,13 +67,21 @@ _no_analyse = click.option(
 _no_fork = click.option(
     "--no-fork", is_flag=True, help="Start every process as a new Python, not forked from one with all imports."
 )
-_write_report = click.option(
+_write_report = choice_option(
     "--write-report",
-    type=click.Choice(["always", "on-failure", "never"]),
+    ["always", "on-failure", "never"],
+    "When to write report.html: on-failure means that the verdict is not `agrees`.",
     default="always",
-    show_default=True,
-    help="When to write report.html: on-failure means that the verdict is not `agrees`.",
 )
+
+
+def _out(where: str) -> Callable[..., Any]:
+    return out_option("DIR", where, default=Path("runs"))
+
+
+def _restarts(what: str) -> Callable[..., Any]:
+    text = f"How often, in total, killed {what} are restarted."
+    return click.option("--restarts", type=click.IntRange(0), metavar="N", default=RESTARTS, help=text)
 
 
 def _interruption() -> Interruption:
@@ -90,13 +100,7 @@ def _interruption() -> Interruption:
     ),
 )
 @experiment_argument
-@click.option(
-    "--out",
-    type=PATH,
-    metavar="DIR",
-    default=Path("runs"),
-    help="Directory in which the bag's directory <name>_<time> is created.",
-)
+@_out("Directory in which the bag's directory <name>_<time> is created.")
 @click.option("--no-record", is_flag=True, help="Do not record: no bag, no verdict.")
 @_no_analyse
 @_write_report
@@ -131,13 +135,7 @@ def _interruption() -> Interruption:
     shell_complete=suggest("auto", "one_per_agent"),
     help="Overrides run.processes: auto, one_per_agent or a number.",
 )
-@click.option(
-    "--restarts",
-    type=click.IntRange(0),
-    metavar="N",
-    default=RESTARTS,
-    help="How often, in total, killed agents or the switcher are restarted.",
-)
+@_restarts("agents or the switcher")
 @click.option(
     "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", show_default="a free one", help="ROS_DOMAIN_ID."
 )
@@ -233,15 +231,8 @@ def run(
                 until=until,
                 **given,
             )
-        finish(
-            result,
-            as_json,
-            view.display.end,
-            interruption=interruption,
-            analyse=not no_analyse,
-            report=write_report,
-            verbose=verbose,
-        )
+        how: dict[str, Any] = {"analyse": not no_analyse, "report": write_report, "verbose": verbose}
+        finish(result, as_json, view.display.end, interruption=interruption, **how)
 
 
 @click.command(
@@ -253,34 +244,15 @@ def run(
 @click.argument("run_record", type=RUN_RECORD)
 @click.argument("hosts", type=YAML)
 @click.option("--name", metavar="NAME", show_default="the name of this machine", help="Name of this host in HOSTS.")
-@click.option(
-    "--out",
-    type=PATH,
-    metavar="DIR",
-    default=Path("runs"),
-    help="Where <name>_<time> is created: bag, report and logs on the recorder's host, logs on the others.",
-)
-@click.option(
-    "--discovery-timeout",
-    type=PositiveFloat(),
-    metavar="SECONDS",
-    default=USER_TIMEOUT,
-    help="How long to wait for the other hosts [s].",
-)
-@click.option(
+@_out("Where <name>_<time> is created: bag, report and logs on the recorder's host, logs on the others.")
+@positive_option("--discovery-timeout", "SECONDS", "How long to wait for the other hosts [s].", default=USER_TIMEOUT)
+@positive_option(
     "--patience",
-    type=PositiveFloat(),
-    metavar="SECONDS",
+    "SECONDS",
+    "How long this host continues after another one has left the run before its end [s].",
     default=30.0,
-    help="How long this host continues after another one has left the run before its end [s].",
 )
-@click.option(
-    "--restarts",
-    type=click.IntRange(0),
-    metavar="N",
-    default=RESTARTS,
-    help="How often, in total, killed processes of this host are restarted.",
-)
+@_restarts("processes of this host")
 @_no_analyse
 @_write_report
 @_no_fork

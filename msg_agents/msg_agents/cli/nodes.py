@@ -23,8 +23,9 @@ from msg_analysis.cli.console import examples
 from msg_analysis.cli.options import (
     PATH,
     RUN_RECORD,
-    PositiveFloat,
     experiment_argument,
+    out_option,
+    positive_option,
     storage,
     storage_options,
     suggest,
@@ -49,12 +50,8 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options that the commands of single nodes share."""
     for option in (
         click.argument("run_record", type=RUN_RECORD),
-        click.option(
-            "--discovery-timeout",
-            type=PositiveFloat(),
-            metavar="SECONDS",
-            default=DISCOVERY_TIMEOUT,
-            help="How long to wait for the other nodes [s].",
+        positive_option(
+            "--discovery-timeout", "SECONDS", "How long to wait for the other nodes [s].", default=DISCOVERY_TIMEOUT
         ),
         use_sim_time,
         click.option(
@@ -84,17 +81,12 @@ _await = click.option(
     shell_complete=suggest("recorder"),
     help="A node, such as recorder, that must be present before the run starts. Repeatable.",
 )
-
-
-_patience = click.option(
+_patience = positive_option(
     "--patience",
-    type=PositiveFloat(),
-    metavar="SECONDS",
+    "SECONDS",
+    "How long to continue after other nodes have left before the end [s].",
     show_default="no limit",
-    help="How long to continue after other nodes have left before the end [s].",
 )
-
-
 _checkpoint = click.option(
     "--checkpoint",
     type=click.Path(file_okay=False, path_type=Path),
@@ -244,7 +236,7 @@ def switcher(
 
 @click.command(cls=RosCommand, epilog=examples("msg-agents recorder run.json --out runs/mine"))
 @_node_options
-@click.option("--out", type=PATH, metavar="BAG", required=True, help="Bag to write; must not exist.")
+@out_option("BAG", "Bag to write; must not exist.", required=True)
 @storage_options
 @_patience
 def recorder(
@@ -323,10 +315,7 @@ def load_record(path: Path) -> RunRecord:
 
 
 def read_record_ahead(path: Path) -> None:
-    """Read a run record, and prepare its model, for the processes that this one forks: they need not do it again.
-
-    Not one with a protocol, whose code its user wrote: it is imported in the processes of the nodes only.
-    """
+    """Read a run record, and prepare its model, for the processes that this one forks: they need not do it again."""
     from msg_analysis.errors import InputError
     from msg_analysis.model.run_record import RunRecord
 
@@ -334,7 +323,7 @@ def read_record_ahead(path: Path) -> None:
         return
     with suppress(InputError):  # the nodes will say it
         text = _text_of(path)
-        if '"protocol": {' not in text:
+        if '"protocol": {' not in text:  # whose code its user wrote: it is imported in the processes of the nodes only
             record = RunRecord.from_json(text, str(path))
             _ = record.model  # kept in the record
             _read_ahead[path] = record

@@ -18,7 +18,6 @@ from msg_analysis import Experiment, InputError, NotAvailableError, Run, read_ba
 from msg_analysis.cli.main import main
 from msg_analysis.messages.messages import ACTIVE_GRAPH, AGENT_STATE
 from msg_analysis.report import export as export_files
-from msg_analysis.report import export as run_tables
 
 DOCUMENT: dict[str, Any] = {
     "name": "net",
@@ -40,15 +39,18 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def exported(bag: Path) -> Path:
-    """All formats, in pieces of a few steps."""
-    folder = bag.parent / "data"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_tables, "ROWS", 7 * 6)
-        patch.setattr(export_files, "BLOCK_NUMBERS", 50)
-        result = export(bag, "--csv", "--parquet", "--npz", "--out", folder)
+    """All formats, by the command; in pieces of a few steps they are the same."""
+    folder, others = bag.parent / "data", bag.parent / "pieces"
+    result = export(bag, "--csv", "--parquet", "--npz", "--out", folder)
     assert result.exit_code == 0, result.output
     assert result.stdout.split() == [str(folder / name) for name in NAMES]
     assert sorted(file.name for file in folder.iterdir()) == sorted(NAMES)
+    for file in export_files.export_run(read_bag(bag), others, ["csv", "parquet", "npz"], rows=7 * 6):
+        if file.suffix == ".parquet":
+            assert pyarrow.parquet.ParquetFile(file).num_row_groups > 40
+            assert pyarrow.parquet.read_table(file).equals(pyarrow.parquet.read_table(folder / file.name))
+        else:
+            assert file.read_bytes() == (folder / file.name).read_bytes()
     return folder
 
 
@@ -200,10 +202,14 @@ def test_files_are_replaced_whole_or_not_at_all(bag: Path, tmp_path: Path, monke
     (tmp_path / "graphs.csv").write_text("old")
     run: Run = read_bag(bag)
 
-    def full(*_: Any) -> Any:
-        raise OSError(28, "No space left on device")
+    graphs = export_files._COLUMNS["graphs"]
 
-    monkeypatch.setitem(vars(run_tables), "_graphs", full)
+    def full(run: Run, first: int, end: int) -> Any:
+        if end > 0:
+            raise OSError(28, "No space left on device")
+        return graphs(run, first, end)
+
+    monkeypatch.setitem(export_files._COLUMNS, "graphs", full)
     with pytest.raises(InputError, match=r"graphs\.csv: cannot be written \(No space left on device\)"):
         export_files.export_run(run, tmp_path, ["csv"])
     assert (tmp_path / "graphs.csv").read_text() == "old"

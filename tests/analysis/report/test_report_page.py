@@ -125,7 +125,7 @@ def _checked(text: str) -> Page:
 def _made_up(agents: int) -> tuple[Comparison, str]:
     """A comparison of made-up numbers, and its report."""
     comparison = _comparison(_trajectory(agents, 60))
-    return comparison, render(comparison, comparison.trajectory)
+    return comparison, render(comparison)
 
 
 def _plots(page: Page) -> int:
