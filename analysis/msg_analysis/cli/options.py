@@ -210,7 +210,8 @@ def storage_options(command: Callable[..., None]) -> Callable[..., None]:
     what = "Start a new file of the bag after this many MB (10^6 bytes)."
     size = click.option("--split-size", type=click.FloatRange(SMALLEST_SPLIT), metavar="MB", help=what)
     compression = choice_option("--compression", COMPRESSIONS, "Compression of the chunks of the bag.", default="zstd")
-    return size(compression(command))
+    decorated: Callable[..., None] = size(compression(command))
+    return decorated
 
 
 def suggest(*words: str) -> Callable[..., list[CompletionItem]]:

@@ -27,7 +27,6 @@ from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import new_record, simulate
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
-COMMANDS = ["agent", "check", "prepare", "recorder", "run", "switcher"]
 
 
 def document() -> dict[str, Any]:
@@ -271,13 +270,3 @@ def test_prepare(experiment: Path) -> None:
     assert uuid.UUID(record["run"]).version == 4
     assert Experiment.parse(record["experiment"]) == Experiment.parse(document())
     assert np.array_equal(record["start"], simulate(Experiment.parse(document())).states[0])
-
-
-def test_help_and_version() -> None:
-    process = call("--help")
-    assert process.returncode == 0
-    for command in COMMANDS:
-        assert command in process.stdout
-    assert "Examples:" in call("run", "--help").stdout
-    assert call("--version").stdout.startswith("msg-agents, version ")
-    refused(execute("fly"), "fly")

@@ -82,8 +82,10 @@ def test_the_level_is_that_of_the_verdict(tmp_path: Path) -> None:
     write_trajectory(claimed(simulate(changed(law, noise={"process": 1.03})), law), tmp_path / "bag")
     compared = json.loads(call("compare", tmp_path / "bag", "--json").stdout)
     least = min(test["p_adjusted"] for test in compared["tests"])
-    document = json.loads(call("compare", tmp_path / "bag", "--json", "--level", least * 1.01).stdout)
-    assert (document["verdict"], document["level"]) == ("disagrees", pytest.approx(least * 1.01))
+    result = call("compare", tmp_path / "bag", "--json", "--level", least * 1.01)
+    document = json.loads(result.stdout)
+    assert (result.exit_code, document["verdict"]) == (1, "disagrees")
+    assert document["level"] == pytest.approx(least * 1.01)
     assert document["blame"]
     document = json.loads(call("compare", tmp_path / "bag", "--json", "--level", least / 2).stdout)
     assert document["verdict"] == "agrees"

@@ -3,8 +3,6 @@
 import csv
 import dataclasses
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -346,14 +344,3 @@ def test_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (result.exit_code, result.stdout) == (2, "")
     assert "choose another place with --out" in result.stderr
     assert call("figures", "4").exit_code == 2
-
-
-def test_help_of_leaders_is_light() -> None:
-    code = (
-        "import sys\nfrom msg_analysis.cli.main import main\n"
-        "for command in ('leaders', 'figures'):\n    main([command, '--help'], standalone_mode=False)\n"
-        "print([name for name in ('numpy', 'matplotlib', 'rich') if name in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
-    assert "Examples:" in done.stdout
-    assert done.stdout.endswith("[]\n")
