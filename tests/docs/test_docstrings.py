@@ -7,15 +7,7 @@ from pathlib import Path
 
 import griffe
 import pytest
-from docstring_rule import (
-    FOLDERS,
-    ROOT,
-    Api,
-    findings,
-    found_at,
-    members,
-    written,
-)
+from docstring_rule import FOLDERS, ROOT, Api, findings, found_at, members, written
 
 
 def paths() -> list[str]:

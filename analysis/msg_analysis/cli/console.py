@@ -111,10 +111,8 @@ def _exit_codes() -> Iterator[None]:
 
 
 def _open_closed_streams() -> None:
-    """Occupy the numbers of closed standard streams, so that no file or socket gets them and receives what is printed.
-
-    Printing to a closed stdout then fails, as in other programs; what is printed to a closed stderr is dropped.
-    """
+    """Occupy the numbers of closed standard streams: a file or socket would get them, and receive what is printed."""
+    # Printing to a closed stdout then fails, as in other programs; what is printed to a closed stderr is dropped.
     for number, mode in ((0, os.O_WRONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(number)
@@ -285,11 +283,7 @@ class SweepProgress(_Progress):
     def __init__(self, title: str) -> None:
         super().__init__(title, time_left=True)
 
-    def checked(self, done: int, total: int) -> None:
-        """Show how many of the points have been checked."""
-        self.done(done, total, 0)
-
-    def done(self, done: int, total: int, failed: int) -> None:
+    def done(self, done: int, total: int, failed: int = 0) -> None:
         """Show how many points are done, and how many of these failed; a ``SweepProgress`` of ``run_jobs``."""
         without = f"{failed} without a result" if failed else ""
         self._show(self._title, done, total, without, without)

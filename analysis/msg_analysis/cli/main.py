@@ -30,14 +30,13 @@ from msg_analysis.cli.options import (
     out_option,
     seed_option,
     set_option,
-    storage,
     storage_options,
 )
 from msg_analysis.common.resources import __version__
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
-    from msg_analysis.bags.stored_file import Compression
+    from msg_analysis.bags.stored_file import Storage
     from msg_analysis.sweeps.workers import OtherSoftware
 
 
@@ -86,8 +85,7 @@ def simulate(
     seed: int | None,
     duration: float | None,
     changes: tuple[str, ...],
-    compression: Compression,
-    split_size: float | None,
+    storage: Storage,
     as_json: bool,
 ) -> None:
     """Simulate EXPERIMENT without ROS and write its bag.
@@ -98,9 +96,8 @@ def simulate(
     directory = out or Path(f"{loaded.name}_twin")
     if directory.exists():
         raise InputError(f"{directory}: exists already: remove it, or choose another name with --out")
-    chosen = storage(compression, split_size)
     run = loaded.simulate(seed=seed, duration=duration)
-    run.save(directory, chosen)
+    run.save(directory, storage)
     if as_json:
         made = {"bag": str(directory), "run": str(run.record.run), "experiment": loaded.name}
         print_json(made | {"seed": run.experiment.run.seed, "steps": run.experiment.steps})

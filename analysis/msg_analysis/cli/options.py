@@ -9,6 +9,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Sequence
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,24 +20,13 @@ from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
     from msg_analysis import Experiment
-    from msg_analysis.bags.stored_file import Compression, Storage
+    from msg_analysis.bags.stored_file import Compression
 
 # As in the modules of bags and results, whose imports take longer than --help may take.
 BAG_SUFFIXES = (".mcap", ".mcap.zstd", ".db3", ".db3.zstd")
 COMPRESSIONS = ("none", "zstd", "lz4")
 SMALLEST_SPLIT = 0.1  # MB
 RESULT_FILE = "result.json"
-
-
-def storage(compression: Compression, split_size: float | None) -> Storage:
-    """The storage that these options ask for; ``split_size`` [MB, 10^6 bytes] is None for one file."""
-    from msg_analysis.bags.stored_file import MEGABYTE, Storage
-
-    try:
-        size = None if split_size is None else round(split_size * MEGABYTE)
-    except (ValueError, OverflowError) as error:  # nan, inf
-        raise InputError(f"--split-size: {split_size}: expected a number of MB") from error
-    return Storage(compression, size)
 
 
 _PLAIN = re.compile(r"[\w./~+,:@%=-]*")  # characters that a shell needs no quotes for
@@ -206,11 +196,22 @@ def level_option(what: str) -> Callable[..., Any]:
 
 
 def storage_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the arguments ``compression`` and ``split_size`` [MB, 10^6 bytes] to a command; see :func:`storage`."""
+    """Add ``--compression`` and ``--split-size``; the command gets the ``storage`` that they ask for."""
+
+    @wraps(command)
+    def with_storage(*arguments: Any, compression: Compression, split_size: float | None, **options: Any) -> None:
+        from msg_analysis.bags.stored_file import MEGABYTE, Storage
+
+        try:
+            size = None if split_size is None else round(split_size * MEGABYTE)
+        except (ValueError, OverflowError) as error:  # nan, inf
+            raise InputError(f"--split-size: {split_size}: expected a number of MB") from error
+        command(*arguments, storage=Storage(compression, size), **options)
+
     what = "Start a new file of the bag after this many MB (10^6 bytes)."
-    size = click.option("--split-size", type=click.FloatRange(SMALLEST_SPLIT), metavar="MB", help=what)
-    compression = choice_option("--compression", COMPRESSIONS, "Compression of the chunks of the bag.", default="zstd")
-    decorated: Callable[..., None] = size(compression(command))
+    decorate = click.option("--split-size", type=click.FloatRange(SMALLEST_SPLIT), metavar="MB", help=what)
+    compress = choice_option("--compression", COMPRESSIONS, "Compression of the chunks of the bag.", default="zstd")
+    decorated: Callable[..., None] = decorate(compress(with_storage))
     return decorated
 
 

@@ -88,7 +88,7 @@ def sweep(
         def checked(done: int, total: int) -> None:
             if done == 1 and not scheduler:
                 warm_up()  # the file can be read: the workers import while its points are checked
-            checking.checked(done, total)
+            checking.done(done, total)
 
         plan = load_sweep(sweep_file, checked)
     from msg_analysis.common.text import finite

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -162,11 +163,9 @@ def plan(
 
 def _parse_share(text: str) -> float:
     """A share of 1 from ``1%``, ``1 %`` or ``0.01``; InputError for anything else."""
-    number = text.strip()
-    try:
+    number, share = text.strip(), -1.0
+    with suppress(ValueError):
         share = float(number.removesuffix("%")) / (100.0 if number.endswith("%") else 1.0)
-    except ValueError:
-        share = -1.0
     if not 0.0 < share < 1.0:
         raise InputError(f"--precision {text}: expected a share above 0, below 1: for example 1% or 0.01")
     return share
@@ -176,12 +175,10 @@ def _parse_duration(text: str | None) -> float | None:
     """Seconds from a number and one of ``UNITS``, s if there is none; InputError for anything else."""
     if text is None:
         return None
-    number = text.strip()
+    number, seconds = text.strip(), -1.0
     unit = next((unit for unit in ("min", "s", "h", "d") if number.endswith(unit)), "")
-    try:
+    with suppress(ValueError):
         seconds = float(number.removesuffix(unit)) * UNITS[unit or "s"]
-    except ValueError:
-        seconds = -1.0
     if not 0.0 < seconds < float("inf"):
         raise InputError(f"--budget {text}: expected a number above 0 with s, min, h or d: for example 10min")
     return seconds

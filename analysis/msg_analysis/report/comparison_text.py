@@ -139,7 +139,7 @@ def _print_tests(document: dict[str, Any], console: Console, verbose: bool) -> N
         mark = mark if test["p"] is not None else Text("not tested", style="dim")
         name = with_names(str(test["name"]), document.get("names"))
         rows.append((name, p_text(test["p"]), p_text(test["p_adjusted"]), mark))
-    print_rows(console, line, ("test", "p", "p adjusted", ""), rows, most=len(rows))
+    print_rows(console, line, ("test", "p", "p adjusted", ""), rows)
 
 
 def _print_errors(document: dict[str, Any], console: Console, verbose: bool) -> None:

@@ -207,10 +207,10 @@ def _laws(prediction: Prediction) -> dict[str, Moments]:
     return {name: moments for name, moments in laws.items() if moments is not None}
 
 
-def _errors(a: Moments | None, b: Moments | None) -> dict[str, Any]:
-    nodes_a, nodes_b = (moments.node_errors.tolist() if moments else [] for moments in (a, b))
-    pairs = zip(nodes_a, nodes_b, strict=True) if len(nodes_a) == len(nodes_b) else ()  # else not the same agents
-    system = relative(*(moments.system_error if moments else None for moments in (a, b)))
+def _errors(*laws: Moments | None) -> dict[str, Any]:
+    nodes = [moments.node_errors.tolist() if moments else [] for moments in laws]
+    pairs = zip(*nodes, strict=True) if len(nodes[0]) == len(nodes[1]) else ()  # else not the same agents
+    system = relative(*(moments.system_error if moments else None for moments in laws))
     return {"system_error": system, "node_errors": [relative(*pair) for pair in pairs]}
 
 

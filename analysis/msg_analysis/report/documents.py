@@ -10,6 +10,7 @@ import dataclasses
 import io
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -25,7 +26,6 @@ from msg_analysis.common.text import agent_name
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import loading, validation
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.experiment.graphs import Graph
 from msg_analysis.inference.autocovariance import (
     LoggedAutocovariance,
     LoggedDensity,
@@ -221,7 +221,14 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     states, matrices = loading.memory_needed(
         experiment.agents, chain.modes, experiment.steps, experiment.width, experiment.noise.delay, experiment.truth
     )
-    limits = [_stability_limit(experiment, graph) for graph in experiment.graph_list]
+    limits: list[float | None] = [None] * chain.modes
+    if experiment.time != "discrete" and not experiment.noise.delay and not experiment.protocol:
+        found = (validation.stability_limit(graph, experiment.leader_gains) for graph in experiment.graph_list)
+        limits = [limit if math.isfinite(limit) else None for limit in found]
+    predicted = None
+    with suppress(InputError):  # experiments without a prediction are described, too
+        experiment.require_available("predict")
+        predicted = predict(experiment).emulated.system_error
     return {
         "name": experiment.name,
         "problem": experiment.problem,
@@ -248,7 +255,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
             )
         ],
         "stability_limit": min((limit for limit in limits if limit is not None), default=None),
-        "predicted_system_error": _predicted_system_error(experiment),
+        "predicted_system_error": predicted,
         "memory": {"states": states, "matrices": matrices},
         "unavailable": experiment.unavailable(),
     }
@@ -329,18 +336,3 @@ def _protocol(experiment: Experiment) -> dict[str, Any] | None:
         "parameters": {key: value for key, value in parameters.items() if key != "name"},
         "absent": protocol.absent,
     }
-
-
-def _stability_limit(experiment: Experiment, graph: Graph) -> float | None:
-    if experiment.time == "discrete" or experiment.noise.delay or experiment.protocol:
-        return None
-    limit = validation.stability_limit(graph, experiment.leader_gains)
-    return limit if math.isfinite(limit) else None
-
-
-def _predicted_system_error(experiment: Experiment) -> float | None:
-    try:
-        experiment.require_available("predict")
-        return predict(experiment).emulated.system_error
-    except InputError:  # experiments without a prediction are described, too
-        return None

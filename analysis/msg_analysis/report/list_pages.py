@@ -62,12 +62,26 @@ def render_sweep(
     lines = {key: _figures(models, shown, "lines", number) for number, (key, shown) in enumerate(pictures.items())}
     maps = _figures(models, first, "map", 0) if first.series[0].values else []
     plots, packed = pack(models)
-    places = [(series, place) for series in first.series for place in series.places]
+    values = []
+    for key in sweep.keys:
+        words = [value_text(value) for value in sweep.spec.over[key]]
+        several = f"{len(words)} values, {words[0]} to {words[-1]}" if len(words) > 8 else ", ".join(words)
+        values.append((axis_name(key, sweep.names), several))
+    table = [
+        {
+            "keys": [value_text(place.x), *(value_text(value) for _, value in series.values)],
+            "value": number_text(place.value),
+            "half": half_width_text((place.low, place.high)),
+            "expected": number_text(place.predicted if first.measured else place.reference),
+            "lost": place.value is None,
+        }
+        for series in first.series
+        for place in series.places
+    ]
     return page_template("sweep.html.j2").render(
         sweep=sweep,
         column=column_words(first.y, sweep.names),
-        measured=first.measured,
-        referred=any(place.reference is not None for _, place in places),
+        referred=any(place.reference is not None for place in first.places),
         dashed=any(sweep_plots.dashed(shown) for shown in pictures.values()),
         summary=summary,
         verdict=verdict,
@@ -78,20 +92,16 @@ def render_sweep(
         by_factors=sweep_plots.by_factors(first),
         maps=maps,
         axis_names={key: axis_name(key, sweep.names) for key in keys},
-        values=[(axis_name(key, sweep.names), _values(sweep.spec.over[key])) for key in sweep.keys],
+        values=values,
         first=first,
         second=first.series[0].values[0][0] if first.series[0].values else None,
-        hidden_panels=max(0, len(sweep_plots.panels(first)) - sweep_plots.MOST_PANELS),
-        hidden_lines=any(
-            len(panel.series) > sweep_plots.MOST_LINES
-            for shown in pictures.values()
-            for panel in sweep_plots.panels(shown)
-        ),
+        panels=len(sweep_plots.panels(first)),
+        longest=max(len(panel.series) for shown in pictures.values() for panel in sweep_plots.panels(shown)),
         most_lines=sweep_plots.MOST_LINES,
         most_panels=sweep_plots.MOST_PANELS,
         heads=[key_words(key, sweep.names) for key in (first.x, *(key for key, _ in first.series[0].values))],
-        table=[_point_row(first, series.values, place) for series, place in places],
-        table_open=len(places) <= _OPEN_TABLE,
+        table=table,
+        table_open=len(table) <= _OPEN_TABLE,
         failures=list(dict.fromkeys(f"point {row['point']}: {row['reason']}" for row in rows if row.get("reason"))),
         plots=plots,
         packed=packed,
@@ -107,22 +117,6 @@ def _figures(models: dict[str, UIElement], shown: Picture, kind: str, number: in
         models[name] = draw(shown, panel, name)
         found.append((name, panel.title))
     return found
-
-
-def _values(values: Sequence[Any]) -> str:
-    """The values of a key, in words."""
-    words = [value_text(value) for value in values]
-    return f"{len(words)} values, {words[0]} to {words[-1]}" if len(words) > 8 else ", ".join(words)
-
-
-def _point_row(shown: Picture, values: Sequence[tuple[str, Any]], place: Any) -> Mapping[str, Any]:
-    return {
-        "keys": [value_text(place.x), *(value_text(value) for _, value in values)],
-        "value": number_text(place.value),
-        "half": half_width_text((place.low, place.high)),
-        "expected": number_text(place.predicted if shown.measured else place.reference),
-        "lost": place.value is None,
-    }
 
 
 _Documents = dict[str, tuple[int, dict[str, str]]]  # each once, although many runs have it: place and texts, by JSON

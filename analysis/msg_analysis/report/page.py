@@ -223,7 +223,10 @@ def render(
     models, drawn = _models(document, comparison, candidates, happened)
     places, packed = pack(models)
     timing = document["timing"]
-    return page_template("report.html.j2").render(
+    apart = [place + 1 for place in furthest([node["z"] for node in agent_errors(document)[0]], _FIRST_LINES)]
+    return page_template(
+        "report.html.j2"
+    ).render(
         named=lambda text: with_names(text, experiment.names),
         document=document,
         title=page_title(comparison),
@@ -255,11 +258,11 @@ def render(
         versions=trajectory.record.versions,
         plots=places,
         packed=packed,
-        first_agents=_first_agents(document, candidates.involved),
+        first_agents=_first(_FIRST_LINES, *candidates.involved, *apart),  # whose convergence is drawn at first
         style=plot_style,
         most_lines=error_plots.MOST_LINES,
         drawn=drawn,
-        shown=_shown_agents(experiment.agents, candidates.involved),
+        shown=_first(_FIRST_TRAJECTORIES, *candidates.involved, *range(1, experiment.agents + 1)),
         candidates=candidates,
         events=happened,
         more_events=more_events,
@@ -330,16 +333,8 @@ def _models(
     return {name: model for name, model in models.items() if model is not None}, drawn
 
 
-def _shown_agents(agents: int, candidates: Sequence[int]) -> list[int]:
-    """The agents (from 1) whose trajectories are drawn at first: the candidates, and the first ones."""
-    others = [agent for agent in range(1, agents + 1) if agent not in candidates]
-    return sorted([*candidates[:_FIRST_TRAJECTORIES], *others[: max(_FIRST_TRAJECTORIES - len(candidates), 0)]])
-
-
-def _first_agents(document: dict[str, Any], candidates: Sequence[int]) -> list[int]:
-    """The agents (from 1) whose convergence is drawn at first: the candidates, then those with the largest abs(z)."""
-    known = [agent + 1 for agent in furthest([node["z"] for node in agent_errors(document)[0]], _FIRST_LINES)]
-    return sorted(list(dict.fromkeys([*candidates, *known]))[:_FIRST_LINES])
+def _first(most: int, *agents: int) -> list[int]:
+    return sorted(list(dict.fromkeys(agents))[:most])
 
 
 def _explanation(document: dict[str, Any]) -> str:

@@ -74,13 +74,12 @@ def print_rows(
     title: str,
     heads: Sequence[str],
     rows: Iterable[Sequence[str | Text]],
-    what: str = "rows",
+    what: str = "",
     where: str = "--json",
-    most: int = ROWS,
 ) -> None:
-    """Print a heading and a ``number_table`` of plain texts; of too many rows (``what``), the first ones."""
+    """Print a heading and a ``number_table`` of plain texts: all rows, or the first ones where they are called so."""
     table = number_table(console, title, *heads)
-    for row in first_rows(table, rows, what, where, most):
+    for row in first_rows(table, rows, what, where) if what else rows:
         table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
     print_table(console, table)
 
@@ -142,12 +141,12 @@ def fact_table(console: Console, title: str) -> Table:
     return table
 
 
-def first_rows(table: Table, rows: Iterable[Row], what: str, where: str = "--json", most: int = ROWS) -> list[Row]:
-    """The first ``most`` rows for a table; a caption says how many (``what``) are left out, and where they are."""
+def first_rows(table: Table, rows: Iterable[Row], what: str, where: str = "--json") -> list[Row]:
+    """The first ``ROWS`` rows for a table; a caption says how many (``what``) are left out, and where they are."""
     shown = list(rows)
-    if len(shown) > most:
-        table.caption = f"{len(shown) - most} more {what}: use {where}"
-    return shown[:most]
+    if len(shown) > ROWS:
+        table.caption = f"{len(shown) - ROWS} more {what}: use {where}"
+    return shown[:ROWS]
 
 
 def interval_text(interval: Sequence[float | None] | None) -> str:
@@ -405,7 +404,7 @@ def print_sweep(sweep: Sweep, document: dict[str, Any], picture: Picture, consol
         others = [half_width_text((place.low, place.high)), number_text(place.predicted)]
         numbers = [number_text(place.value), *(others if picture.measured else [number_text(place.reference)])]
         rows.append([*([label] if several else []), value_text(place.x), *numbers])
-    print_rows(console, f"{sweep.name}: {picture.y}", heads, rows)
+    print_rows(console, f"{sweep.name}: {picture.y}", heads, rows, "rows")
     for row in [row for row in document["points"] if row["status"] == FAILED][:ROWS]:
         console.print(Text(f"point {row['point']}: no result: {row['reason']}"))
     for row in [row for row in document["points"] if row.get("verdict") == "disagrees"][:ROWS]:

@@ -42,7 +42,7 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
     title = "Mean-square error in the steady state"
     print_errors(console, title, list(laws), system, agents, document.get("names"), ["certainty", *certainty])
     shares = [(name, number_text(share)) for name, share in zip(document["modes"], document["stationary"], strict=True)]
-    print_rows(console, "Graphs", ["graph", "share of time"], shares, "graphs")
+    print_rows(console, "Graphs", ["graph", "share of time"], shares)
     for key, title in LAW_NAMES.items():
         if key in document and document[key] is None:
             console.print(f"{title.capitalize()}: infinite, or not defined with this noise", style="dim")
@@ -127,7 +127,14 @@ def print_facts(document: dict[str, Any], console: Console) -> None:
         lower, upper = number_text(bounds["lower"]), number_text(bounds["upper"])
         console.print(Text("Bounds of the system error for all switching rates", style="bold"))
         console.print(Text(f"  {lower} <= E <= {upper}   ({bounds['note']})"))
-    _print_graphs(document, console)
+    if shown := [entry for entry in document["graphs"] if entry]:
+        table = number_table(console, "Undirected connected graphs", "graph", "Kirchhoff index")
+        first = ", ".join(agent_name(agent, document.get("names")) for agent in (1, 2))
+        table.add_column(Text(f"information centrality of agents {first}, ..."), overflow="fold")
+        for entry in shown:
+            values = listed([number_text(value) for value in entry["information_centrality"]])
+            table.add_row(Text(entry["name"]), number_text(entry["kirchhoff_index"]), values)
+        print_table(console, table)
     for law, form in (document["two_topology"] or {}).items():
         _print_form(law, form, document.get("names"), console)
     for note in document["notes"]:
@@ -142,19 +149,6 @@ def _print_lemmas(facts: list[dict[str, Any]], console: Console) -> None:
     for fact in facts:
         holds = Text("holds", style="green") if fact["holds"] else Text("does not hold", style="bold red")
         table.add_row(fact["name"], fact["statement"], str(fact["multiplicity"]), number_text(fact["others"]), holds)
-    print_table(console, table)
-
-
-def _print_graphs(document: dict[str, Any], console: Console) -> None:
-    if not (shown := [entry for entry in document["graphs"] if entry]):
-        return
-    table = number_table(console, "Undirected connected graphs", "graph")
-    table.add_column("Kirchhoff index", justify="right")
-    first = ", ".join(agent_name(agent, document.get("names")) for agent in (1, 2))
-    table.add_column(Text(f"information centrality of agents {first}, ..."), overflow="fold")
-    for entry in shown:
-        values = listed([number_text(value) for value in entry["information_centrality"]])
-        table.add_row(Text(entry["name"]), number_text(entry["kirchhoff_index"]), values)
     print_table(console, table)
 
 

@@ -11,6 +11,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -52,10 +53,9 @@ def _axis(value: object) -> Axis:
         if len(value) > 1 or not isinstance(listed, list) or not listed:
             raise expected("values to be a list with at least one entry, and no other key")
         return Axis(listed)
-    first, last = value.get("from"), value.get("to")
-    if not is_number(first) or not is_number(last) or ("count" in value) == ("step" in value):
+    if not is_number(value.get("from")) or not is_number(value.get("to")) or ("count" in value) == ("step" in value):
         raise expected("numbers `from` and `to`, and either `count` or `step`")
-    return _range(float(first), float(last), value)  # type: ignore[arg-type]
+    return _range(float(value["from"]), float(value["to"]), value)
 
 
 def _range(first: float, last: float, value: dict[str, Any]) -> Axis:
@@ -100,13 +100,11 @@ def _experiment(value: object) -> str | dict[str, Any]:
 
 
 def _precision(value: str) -> str:
-    try:
+    with suppress(InputError):
         until = Until.parse(value)
-    except InputError as error:
-        raise expected("a precision such as 5%") from error
-    if until.decided:  # the runs of a sweep are tested together
-        raise expected("a precision such as 5%")
-    return str(until)
+        if not until.decided:  # the runs of a sweep are tested together
+            return str(until)
+    raise expected("a precision such as 5%")
 
 
 class SweepSpec(BaseModel):

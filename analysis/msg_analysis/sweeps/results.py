@@ -157,9 +157,8 @@ class SweepVerdict:
     @property
     def exit_code(self) -> int:
         """0 agrees or only predictions, 1 disagrees, 3 something failed."""
-        if self.verdict == "disagrees":
-            return ExitCode.DISAGREES
-        return ExitCode.INCOMPLETE if self.verdict == "incomplete" else ExitCode.FINE
+        codes = {"disagrees": ExitCode.DISAGREES, "incomplete": ExitCode.INCOMPLETE}
+        return codes.get(self.verdict or "", ExitCode.FINE)
 
 
 def evaluate_sweep(outcomes: Sequence[Outcome], level: float) -> SweepVerdict:
@@ -170,19 +169,15 @@ def evaluate_sweep(outcomes: Sequence[Outcome], level: float) -> SweepVerdict:
     if tested:
         for place, p in zip(tested, holm(np.array([*tested.values()], dtype=float)), strict=True):
             adjusted[place] = float(p)
-    verdicts = tuple(_verdict(outcome, p, level) for outcome, p in zip(outcomes, adjusted, strict=True))
+    verdicts: list[str | None] = []
+    for outcome, p in zip(outcomes, adjusted, strict=True):
+        verdict = "unpredicted" if outcome.result.get("unpredicted") else "agrees"
+        verdict = "disagrees" if p is not None and p < level else verdict
+        verdicts.append(None if outcome.status == FAILED or "verdict" not in outcome.result else verdict)
     whole = "agrees" if any(verdicts) else None
     if any(outcome.status == FAILED for outcome in outcomes):
         whole = "incomplete"
-    return SweepVerdict(tuple(adjusted), verdicts, "disagrees" if "disagrees" in verdicts else whole)
-
-
-def _verdict(outcome: Outcome, p_holm: float | None, level: float) -> str | None:
-    if outcome.status == FAILED or "verdict" not in outcome.result:
-        return None
-    if p_holm is not None and p_holm < level:
-        return "disagrees"
-    return "unpredicted" if outcome.result.get("unpredicted") else "agrees"
+    return SweepVerdict(tuple(adjusted), tuple(verdicts), "disagrees" if "disagrees" in verdicts else whole)
 
 
 def rows_of(sweep: Sweep, outcomes: Sequence[Outcome], verdict: SweepVerdict) -> list[Row]:

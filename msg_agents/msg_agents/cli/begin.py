@@ -136,6 +136,10 @@ def new(file: Path, *, as_json: bool, **given: Any) -> None:
 
     FILE must not exist. Without options, a terminal asks for the values; otherwise what is not given has its default.
     """
+    from msg_analysis.common.files import require_place, write_whole
+    from msg_analysis.experiment.experiment import Experiment
+    from msg_analysis.experiment.loading import parse_yaml
+
     if file.exists():
         raise InputError(f"{file}: exists already: remove it, or choose another name")
     context = click.get_current_context()
@@ -146,7 +150,11 @@ def new(file: Path, *, as_json: bool, **given: Any) -> None:
     asked = untouched and sys.stdin.isatty() and sys.stderr.isatty()
     chosen = _ask(context.command) if asked else Choices(**given)
     _check(chosen)
-    name = _write(file, chosen)
+    require_place(file)
+    name = experiment_name(file.stem)
+    text = experiment_text(name, chosen)
+    Experiment.parse(parse_yaml(text, str(file)), source=str(file)).require_available()
+    write_whole(file, text.encode())
     if as_json:
         print_json({"file": str(file), "experiment": name})
         return
@@ -154,20 +162,6 @@ def new(file: Path, *, as_json: bool, **given: Any) -> None:
     print_text(str(file))
     print_text(f"Next: msg-analysis predict {word}")
     print_text(f"      msg-agents run {word}")
-
-
-def _write(file: Path, chosen: Choices) -> str:
-    """Check the experiment as a whole, write it, and give its name."""
-    from msg_analysis.common.files import require_place, write_whole
-    from msg_analysis.experiment.experiment import Experiment
-    from msg_analysis.experiment.loading import parse_yaml
-
-    require_place(file)
-    name = experiment_name(file.stem)
-    text = experiment_text(name, chosen)
-    Experiment.parse(parse_yaml(text, str(file)), source=str(file)).require_available()
-    write_whole(file, text.encode())
-    return name
 
 
 def _check(chosen: Choices) -> None:
@@ -254,7 +248,8 @@ def doctor(*, as_json: bool) -> None:
         counted = {"errors": counts["error"], "warnings": counts["warning"]}
         print_json({"can_run": can_run, **counted, "checks": [check.to_json() for check in found]})
     else:
-        console.print(_summary(counts["error"], counts["warning"]), soft_wrap=True)
+        noted = f" ({counts['warning']} warning{'s' * (counts['warning'] > 1)})" if counts["warning"] else ""
+        console.print(f"A run can{'' if can_run else 'not'} work here{noted}.", soft_wrap=True)
     if not can_run:
         sys.exit(ExitCode.BAD_INPUT)
 
@@ -272,8 +267,3 @@ def _print_check(console: Console, check: Check) -> None:
         console.print(row)
     else:
         console.print(Text(" ").join([status, name, Text(check.text)]))
-
-
-def _summary(errors: int, warnings: int) -> str:
-    noted = f" ({warnings} warning{'s' * (warnings > 1)})" if warnings else ""
-    return f"A run cannot work here{noted}." if errors else f"A run can work here{noted}."

@@ -34,7 +34,6 @@ from msg_analysis.cli.options import (
     seed_option,
     set_option,
     source_of,
-    storage,
     storage_options,
     suggest,
     verbose_option,
@@ -44,7 +43,7 @@ from msg_analysis.cli.runs import runs
 
 if TYPE_CHECKING:
     from msg_agents.run.result import ReportWhen
-    from msg_analysis.bags.stored_file import Compression
+    from msg_analysis.bags.stored_file import Storage
 
 
 class _Commands(CommandGroup):
@@ -77,6 +76,11 @@ _write_report = choice_option(
 
 def _out(where: str) -> Callable[..., Any]:
     return out_option("DIR", where, default=Path("runs"))
+
+
+def _override(key: str, metavar: str, values: str, *offered: str) -> Callable[..., Any]:
+    text = f"Overrides run.{key}: {values}."
+    return click.option(f"--{key}", metavar=metavar, shell_complete=suggest(*offered), help=text)
 
 
 def _restarts(what: str) -> Callable[..., Any]:
@@ -114,37 +118,18 @@ def _interruption() -> Interruption:
     help="End earlier, in order: when the 95 % interval of the system error that is valid at all times has a "
     "half-width of PRECISION, such as 1%; decided: at 5%, or when the evidence exceeds its threshold.",
 )
-@click.option(
-    "--pace",
-    metavar="PACE",
-    shell_complete=suggest("lockstep", "realtime"),
-    help="Overrides run.pace: lockstep or realtime.",
-)
+@_override("pace", "PACE", "lockstep or realtime", "lockstep", "realtime")
 @click.option(
     "--speed", type=float, metavar="SPEED", help="Overrides run.speed: units of simulated time per second (realtime)."
 )
-@click.option(
-    "--delivery",
-    metavar="HOW",
-    shell_complete=suggest("best_effort", "reliable"),
-    help="Overrides run.delivery: best_effort or reliable (realtime).",
-)
-@click.option(
-    "--processes",
-    metavar="P",
-    shell_complete=suggest("auto", "one_per_agent"),
-    help="Overrides run.processes: auto, one_per_agent or a number.",
-)
+@_override("delivery", "HOW", "best_effort or reliable (realtime)", "best_effort", "reliable")
+@_override("processes", "P", "auto, one_per_agent or a number", "auto", "one_per_agent")
 @_restarts("agents or the switcher")
 @click.option(
     "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", show_default="a free one", help="ROS_DOMAIN_ID."
 )
-@click.option(
-    "--await",
-    "readers",
-    multiple=True,
-    metavar="NODE",
-    help=f"A node of yours that must read the states before the run starts, within {USER_TIMEOUT:g} s. Repeatable.",
+@nodes.await_option(
+    f"A node of yours that must read the states before the run starts, within {USER_TIMEOUT:g} s. Repeatable."
 )
 @nodes.use_sim_time
 @click.option(
@@ -178,8 +163,7 @@ def run(
     use_sim_time: bool,
     channel_file: Path | None,
     no_fork: bool,
-    compression: Compression,
-    split_size: float | None,
+    storage: Storage,
     web: int | None,
     web_host: str,
     executor: str | None,
@@ -222,7 +206,7 @@ def run(
                 None if no_record else out,
                 readers=readers,
                 use_sim_time=use_sim_time,
-                storage=storage(compression, split_size),
+                storage=storage,
                 fork=not no_fork,
                 view=view,
                 environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
@@ -275,8 +259,7 @@ def host(
     write_report: ReportWhen,
     no_fork: bool,
     only_profile: bool,
-    compression: Compression,
-    split_size: float | None,
+    storage: Storage,
     verbose: bool,
     as_json: bool,
 ) -> None:
@@ -310,7 +293,7 @@ def host(
             out,
             domain=places.domain,
             restarts=restarts,
-            storage=storage(compression, split_size),
+            storage=storage,
             fork=not no_fork,
             view=view,
             environment=places.environment(what, folder),

@@ -26,7 +26,6 @@ from msg_analysis.cli.options import (
     experiment_argument,
     out_option,
     positive_option,
-    storage,
     storage_options,
     suggest,
 )
@@ -35,7 +34,7 @@ from msg_analysis.errors import ExitCode
 if TYPE_CHECKING:
     from msg_agents.nodes.base import NetworkNode
     from msg_agents.stepping.monitoring import ClockOffsets
-    from msg_analysis.bags.stored_file import Compression
+    from msg_analysis.bags.stored_file import Storage
     from msg_analysis.model.run_record import RunRecord
 
 
@@ -73,14 +72,14 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-_await = click.option(
-    "--await",
-    "readers",
-    multiple=True,
-    metavar="NODE",
-    shell_complete=suggest("recorder"),
-    help="A node, such as recorder, that must be present before the run starts. Repeatable.",
-)
+def await_option(text: str, *offered: str) -> Callable[..., Any]:
+    """The option ``--await``, for names of nodes; ``text``: its help."""
+    return click.option(
+        "--await", "readers", multiple=True, metavar="NODE", shell_complete=suggest(*offered), help=text
+    )
+
+
+_await = await_option("A node, such as recorder, that must be present before the run starts. Repeatable.", "recorder")
 _patience = positive_option(
     "--patience",
     "SECONDS",
@@ -239,9 +238,7 @@ def switcher(
 @out_option("BAG", "Bag to write; must not exist.", required=True)
 @storage_options
 @_patience
-def recorder(
-    run_record: Path, *, out: Path, compression: Compression, split_size: float | None, **options: Any
-) -> None:
+def recorder(run_record: Path, *, out: Path, storage: Storage, **options: Any) -> None:
     """Record the run in RUN_RECORD to a bag."""
     record = load_record(run_record)
 
@@ -249,7 +246,7 @@ def recorder(
         from msg_agents.nodes.recorder import Recorder, keep_freed_memory
 
         keep_freed_memory()
-        return [Recorder(record=record, directory=out, storage=storage(compression, split_size))]
+        return [Recorder(record=record, directory=out, storage=storage)]
 
     _run_nodes(nodes, record, **options)
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
+from msg_agents.cli.nodes import await_option
 from msg_agents.cli.ros_command import RosCommand, domain_option, enter
 from msg_analysis.cli.console import examples, print_json, print_text
 from msg_analysis.cli.options import BAG, json_option, positive_option
@@ -102,7 +103,7 @@ class _Rate(click.types.FloatParamType):
     metavar="N",
     help="Start when every topic has N readers (except latched topics, whose readers miss nothing).",
 )
-@click.option("--await", "readers", multiple=True, metavar="NODE", help="Start when NODE reads the topics. Repeatable.")
+@await_option("Start when NODE reads the topics. Repeatable.")
 @positive_option("--wait-timeout", "SECONDS", "How long to wait for readers [s].", default=30.0)
 @domain_option
 @json_option

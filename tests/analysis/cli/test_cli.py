@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
+from programs import run
 
 from experiments import golden, predict, simulate, write_trajectory
 from msg_analysis.bags.stored_file import Storage
-from msg_analysis.cli import main as cli
 from msg_analysis.experiment import experiment as experiments
 
 ROOT = Path(__file__).parents[3]
@@ -20,7 +20,7 @@ LINE_RING = str(GOLDEN / "line_ring.yaml")
 
 
 def call(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(cli.main, [str(argument) for argument in arguments])
+    return run("msg-analysis", *arguments)
 
 
 @pytest.fixture(scope="module")

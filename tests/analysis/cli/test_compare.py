@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
+from programs import run
 from rich.console import Console
 
 from experiments import changed, claimed, golden, simulate, write_trajectory
-from msg_analysis.cli.main import main
 from msg_analysis.report.saved_results import print_results
 from msg_analysis.runs import read_result
 
@@ -20,7 +20,7 @@ EXPERIMENT = Path(__file__).parents[3] / "analysis/msg_analysis/experiment/bundl
 
 
 def call(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+    return run("msg-analysis", *arguments)
 
 
 @pytest.fixture(scope="module")

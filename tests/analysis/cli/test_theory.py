@@ -7,21 +7,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
+from programs import run
 
 from experiments import GOLDEN, Experiment, predict
 from msg_analysis import read_bag
 from msg_analysis.cli import console
-from msg_analysis.cli import main as cli
 from msg_analysis.paper import examples
 
 LINE_RING = str(GOLDEN / "line_ring.yaml")
 NO_TIMES = ["soon", "0:1", "1:0:0.5", "0,nan"]
 
 
+def call(*arguments: str | Path) -> Result:
+    return run("msg-analysis", *arguments)
+
+
 def document_of(*arguments):
     result = call(*arguments, "--json")
-    assert result.exit_code == 0, result.output
+    assert (result.exit_code, result.stderr) == (0, "")
     return json.loads(result.stdout)
 
 
@@ -243,14 +247,8 @@ ROOT = Path(__file__).parents[3]
 EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"
 
 
-def call(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(cli.main, [str(argument) for argument in arguments])
-
-
 def leaders(*arguments: str | Path) -> dict:
-    result = call("leaders", *arguments, "--json")
-    assert (result.exit_code, result.stderr) == (0, "")
-    return json.loads(result.stdout)
+    return document_of("leaders", *arguments)
 
 
 @pytest.mark.parametrize("method", ["auto", "exhaustive", "greedy", "swap"])

@@ -10,26 +10,21 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
+from programs import run as call
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from experiments import document
 from msg_analysis import Experiment, InputError, NotAvailableError, Run, read_bag
-from msg_analysis.cli.main import main
 from msg_analysis.messages.messages import ACTIVE_GRAPH, AGENT_STATE
 from msg_analysis.report import export as export_files
 
-DOCUMENT: dict[str, Any] = {
-    "name": "net",
-    "names": ["one, 1", 'two "2"', "three"],
-    "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
-    "switching": {"rates": {"line": {"ring": 1}, "ring": {"line": 1}}},
-    "run": {"duration": 15, "replicas": 2, "seed": 4},
-}
+DOCUMENT = document(names=["one, 1", 'two "2"', "three"], run={"duration": 15, "seed": 4})
 
 
 def export(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(main, ["export", *map(str, arguments)])
+    return call("msg-analysis", "export", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -157,12 +152,13 @@ def test_what_is_missing_is_empty(tmp_path: Path) -> None:
 
 def test_numbers_of_other_runs(tmp_path: Path) -> None:
     """What agents publish, and in real time when; without names there is no column for them."""
-    document = {key: value for key, value in DOCUMENT.items() if key != "names"}
-    noisy = Experiment.parse(document | {"noise": {"broadcast": 0.5, "loss": 0.1}}).simulate(duration=1)
+    noisy = Experiment.parse(document(run=DOCUMENT["run"]) | {"noise": {"broadcast": 0.5, "loss": 0.1}}).simulate(
+        duration=1
+    )
     frame = noisy.to_dataframe()
     assert list(frame.columns) == ["step", "time", "agent", "replica", "state", "published"]
     assert frame["published"].tolist() == noisy.published.ravel().tolist()
-    timed = Experiment.parse(document).with_run(pace="realtime", duration=1).simulate()
+    timed = Experiment.parse(document(run=DOCUMENT["run"])).with_run(pace="realtime", duration=1).simulate()
     frame = timed.to_dataframe()
     assert list(frame.columns) == ["step", "time", "agent", "replica", "state", "made"]
     assert frame["made"].tolist() == np.repeat(timed.made.ravel() / 1e9, 2).tolist()

@@ -6,11 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from programs import run as call
 
 from experiments import Experiment, Run, RunRecord, compare, line_ring, new_record, simulate
 from msg_analysis import write_report
-from msg_analysis.cli.main import main
 from msg_analysis.common.text import agent_name, agent_text, with_names
 from msg_analysis.errors import InputError
 from msg_analysis.inference.pool import compare_pooled
@@ -154,20 +153,17 @@ def test_every_command(named_run: Run, tmp_path: Path) -> None:
         ["predict", file], ["info", file], ["leaders", file, "--count", "2"], ["facts", file], ["compare", bag],
     ]  # fmt: skip
     for command in commands:
-        texts, document = (
-            CliRunner().invoke(main, [str(word) for word in [*command, *option]]).stdout for option in ([], ["--json"])
-        )
+        texts, document = (call("msg-analysis", *command, *option).stdout for option in ([], ["--json"]))
         assert "Bonn" in texts, command
         assert "agent 2" not in texts, command
         assert json.loads(document)["names"] == NAMES, command
     assert json.loads(document)["leaders"] == [2]
-    plan = CliRunner().invoke(main, ["plan", str(file)]).stdout
-    assert "agent Kiel x 0.5" in plan
+    assert "agent Kiel x 0.5" in call("msg-analysis", "plan", file).stdout
     saved = tmp_path / "saved.json"
     saved.write_text(document)
-    assert "Bonn" in CliRunner().invoke(main, ["tabulate", str(saved)]).stdout
+    assert "Bonn" in call("msg-analysis", "tabulate", saved).stdout
     table = tmp_path / "transient.csv"
-    CliRunner().invoke(main, ["transient", str(file), "--times", "0,1", "--csv", str(table)])
+    call("msg-analysis", "transient", file, "--times", "0,1", "--csv", table)
     assert "mean of agent Kiel" in table.read_text().partition("\n")[0]
 
 
