@@ -119,10 +119,7 @@ def simulate(
     default="auto",
 )
 @choice_option(
-    "--law",
-    ["continuous", "emulated", "discrete"],
-    "Law of the agents.",
-    show_default="the paper's, if there is one",
+    "--law", ["continuous", "emulated", "discrete"], "Law of the agents.", show_default="the paper's, if there is one"
 )
 @click.option(
     "--gain",

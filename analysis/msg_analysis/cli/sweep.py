@@ -91,8 +91,9 @@ def sweep(
             checking.done(done, total)
 
         plan = load_sweep(sweep_file, checked)
+    from msg_analysis.common.files import write_whole
     from msg_analysis.common.text import finite
-    from msg_analysis.report.list_pages import write_sweep_page
+    from msg_analysis.report.list_pages import render_sweep
     from msg_analysis.report.sweep_plots import write_figure
     from msg_analysis.report.tables import describe_sweep, print_sweep, summary
     from msg_analysis.sweeps.points import options
@@ -110,7 +111,8 @@ def sweep(
             files = write_tables(rows, document, directory)
             shown = picture(plan, rows, column)
             files += write_figure(shown, f"{plan.name}: {plan.kind}", directory)
-            files.append(write_sweep_page(plan, rows, column, summary(document), judgement.verdict, directory))
+            page = render_sweep(plan, rows, column, summary(document), judgement.verdict)
+            files.append(write_whole(directory / "sweep.html", page.encode()))
         except OSError as error:
             raise InputError(f"{error.filename or directory}: cannot be written: {error.strerror}") from error
     if as_json:

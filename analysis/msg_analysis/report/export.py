@@ -259,7 +259,6 @@ def _send_graphs(rerun: Any, recording: Any, trajectory: Run, names: list[str]) 
 
 Form = Literal["csv", "parquet", "npz", "rrd"]
 FORMS: tuple[Form, ...] = get_args(Form)
-ARRAY_FILE, RECORDING_FILE = "run.npz", "run.rrd"
 _OLDEST = (1980, 1, 1, 0, 0, 0)  # of files in an archive: the same run gives the same bytes
 
 
@@ -272,10 +271,10 @@ def export_run(trajectory: Run, directory: Path, forms: Sequence[Form], rows: in
         for table in run_tables(trajectory)
     }
     if "npz" in forms:
-        writers[directory / ARRAY_FILE] = lambda file, shown: _write_arrays(trajectory, file, shown, rows)
+        writers[directory / "run.npz"] = lambda file, shown: _write_arrays(trajectory, file, shown, rows)
     if "rrd" in forms:
         require_rerun()
-        writers[directory / RECORDING_FILE] = lambda file, shown: write_recording(trajectory, file, shown)
+        writers[directory / "run.rrd"] = lambda file, shown: write_recording(trajectory, file, shown)
     with _readable(directory):
         directory.mkdir(parents=True, exist_ok=True)
     for path in writers:

@@ -40,13 +40,6 @@ from msg_analysis.sweeps.results import (
 _OPEN_TABLE = 30  # most rows with which the table is open at first
 
 
-def write_sweep_page(
-    sweep: Sweep, rows: Sequence[Row], column: str | None, summary: str, verdict: str | None, directory: Path
-) -> Path:
-    """Write ``sweep.html``, whole or not at all. Arguments as in ``render_sweep``."""
-    return write_whole(directory / "sweep.html", render_sweep(sweep, rows, column, summary, verdict).encode())
-
-
 def render_sweep(
     sweep: Sweep,
     rows: Sequence[Row],  # of ``rows_of``

@@ -224,9 +224,8 @@ def render(
     places, packed = pack(models)
     timing = document["timing"]
     apart = [place + 1 for place in furthest([node["z"] for node in agent_errors(document)[0]], _FIRST_LINES)]
-    return page_template(
-        "report.html.j2"
-    ).render(
+    template = page_template("report.html.j2")
+    return template.render(
         named=lambda text: with_names(text, experiment.names),
         document=document,
         title=page_title(comparison),

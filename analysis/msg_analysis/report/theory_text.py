@@ -12,16 +12,7 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from msg_analysis.common.text import (
-    agent_name,
-    counted,
-    duration_text,
-    listed,
-    number_text,
-    p_text,
-    percent,
-    z_text,
-)
+from msg_analysis.common.text import agent_name, counted, duration_text, listed, number_text, p_text, percent, z_text
 from msg_analysis.report.tables import fact_table, interval_text, number_table, print_errors, print_rows, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 

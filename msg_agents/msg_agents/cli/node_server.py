@@ -23,8 +23,7 @@ MODULES = (
     "numpy.random",
     "rclpy.experimental.events_executor",
     "setproctitle",
-)
-"""What the processes of nodes import, at the latest when they need it."""
+)  # what the processes of nodes import, at the latest when they need it
 
 NODES = ("agent", "recorder", "switcher")  # commands that take a run record
 

@@ -18,11 +18,9 @@ from msg_analysis.cli.options import PATH
 
 
 class RosCommand(click.Command):
-    """Takes arguments for ROS 2 as any ROS node does: ``--ros-args ... [--]``.
+    """Takes arguments for ROS 2; parameters among them replace options that are not on the command line."""
 
-    rclpy reads these itself; parameters among them replace options that are not on the command line. Those given to one
-    node are found by ``node_name`` (default: the name of the command).
-    """
+    # rclpy reads the others itself. Parameters of one node are found by its name; by default that of the command.
 
     def __init__(self, *args: Any, node_name: str | None = None, **options: Any) -> None:
         super().__init__(*args, **options)

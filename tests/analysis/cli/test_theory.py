@@ -107,12 +107,7 @@ def test_without_noise_nothing_settles(tmp_path):
         ("plan", "line_ring", ["--budget", "soon", "--speed", "9"], "--budget soon: expected a number above 0 with s"),
         ("plan", "line_ring", ["--budget", "10ms", "--speed", "1"], "--budget 10ms: expected a number above 0 with s"),
         ("plan", "line_ring", ["--budget", "1h"], "give its speed in steps per second too"),
-        (
-            "spectrum",
-            "line_ring",
-            ["--figure", "picture.gif"],
-            "picture.gif: expected a name that ends with .png, .svg",
-        ),
+        ("spectrum", "line_ring", ["--figure", "a.gif"], "a.gif: expected a name that ends with .png, .svg"),
         ("spectrum", "line_ring", ["--figure", "/nowhere/a.png"], "no such directory /nowhere"),
         ("leaders", "line_ring", ["--count", "5"], "count 5: expected 1 to 4"),
         ("leaders", "line_ring", [], "has no leaders: give their number"),
