@@ -99,10 +99,7 @@ def evidence(time: FloatArray, logarithms: FloatArray, threshold: float, crossed
 
 
 def node_errors(
-    nodes: Sequence[Mapping[str, Any]],
-    level: float,
-    candidates: Candidates = NOBODY,
-    names: Sequence[str] | None = None,
+    nodes: Sequence[Mapping[str, Any]], level: float, candidates: Candidates, names: Sequence[str] | None
 ) -> UIElement:
     """Node errors with 95 % intervals next to the predicted ones; marked if p < ``level``; agents can be chosen."""
     agents = np.arange(1, len(nodes) + 1)
@@ -210,8 +207,8 @@ def agent_convergence(
 def innovation_sizes(
     ratios: FloatArray,  # (m,); NaN for an agent without noise
     samples: int,  # innovations per agent
-    candidates: Candidates = NOBODY,
-    names: Sequence[str] | None = None,
+    candidates: Candidates,
+    names: Sequence[str] | None,
 ) -> UIElement:
     """Variance of each agent's one-step residuals relative to the predicted one, and where 95 % of such ratios lie."""
     agents = np.arange(1, len(ratios) + 1)
@@ -238,24 +235,13 @@ def innovation_sizes(
     return plot
 
 
-def lateness(timing: Mapping[str, Any]) -> UIElement:
-    """Histogram of how late the steps of a run in real time were; ``timing`` of a comparison."""
-    histogram = timing["histogram"]
-    return _histogram(histogram["lateness_ms"], histogram["steps"], TIMES["lateness_ms"], "steps", timing["period_ms"])
-
-
-def staleness(timing: Mapping[str, Any]) -> UIElement:
-    """Histogram of the age of the neighbours' values that a run in real time used; ``timing`` of a comparison."""
-    histogram, label = timing["histogram"], TIMES["staleness_ms"]
-    return _histogram(histogram["staleness_ms"], histogram["uses"], label, "values used", timing["period_ms"])
-
-
-def _histogram(
-    edges: Sequence[float], counts: Sequence[int], label: str, what: Literal["steps", "values used"], period: float
-) -> Any:
-    left, right, count = np.array(edges[:-1]), np.array(edges[1:]), np.array(counts)
-    beyond = (left >= period) & (what == "steps")
-    plot = new_figure(250, x_axis_label=label, y_axis_label=what, min_border_right=12)
+def histogram(timing: Mapping[str, Any], key: Literal["lateness_ms", "staleness_ms"]) -> UIElement:
+    """How late the steps of a run in real time were, or how old the neighbours' values that they used."""
+    found, period, steps = timing["histogram"], timing["period_ms"], key == "lateness_ms"
+    left, right = np.array(found[key][:-1]), np.array(found[key][1:])
+    count, what = (np.array(found["steps"]), "steps") if steps else (np.array(found["uses"]), "values used")
+    beyond = (left >= period) & steps
+    plot = new_figure(250, x_axis_label=TIMES[key], y_axis_label=what, min_border_right=12)
     # log10(count + 1): an empty bar has height 0.
     data = {
         "left": left,
@@ -275,7 +261,7 @@ def _histogram(
     plot.x_range = Range1d(left[0] - period / 100, 1.02 * max(right[-1], period if far else period / 20))
     plot.xgrid.grid_line_color = None
     if far:
-        name = "deadline" if what == "steps" else "one period"
+        name = "deadline" if steps else "one period"
         top = float(np.log10(most + 1.0))
         plot.line([period] * 2, [0.0, top], color=BLACK, line_width=1.5, line_dash="dashed", legend_label=name)
         place_legend(plot)

@@ -295,14 +295,14 @@ def _models(
     trajectory = comparison.trajectory
     experiment, steps = trajectory.record.experiment, max(document["steps"], 0)
     covariance, ratios = document["covariance"], document["innovations"]["ratios"]
-    predicted = document["system_error"]["predicted"]
+    predicted, nodes, names = document["system_error"]["predicted"], agent_errors(document)[0], experiment.names
     measured, expected, z = (
         None if covariance[key] is None else np.array(covariance[key], dtype=float)
         for key in ("measured", "predicted", "z")
     )
     models: dict[str, UIElement | None] = {
-        "nodes": error_plots.node_errors(agent_errors(document)[0], document["level"], candidates, experiment.names),
-        **covariances(measured, expected, z, candidates, experiment.names),
+        "nodes": error_plots.node_errors(nodes, document["level"], candidates, names),
+        **covariances(measured, expected, z, candidates, names),
     }
     if len(comparison.running["time"]) > 1:
         models["running"] = error_plots.convergence(comparison.running, predicted)
@@ -313,22 +313,18 @@ def _models(
     models |= figures
     known = trajectory.modes[:steps]
     if len(known):
-        names = [graph.name for graph in experiment.graph_list]
-        models["occupancy"] = run_plots.occupancy(known, names, experiment.chain.stationary)
+        graphs = [graph.name for graph in experiment.graph_list]
+        models["occupancy"] = run_plots.occupancy(known, graphs, experiment.chain.stationary)
         if not document["unpredicted"]:
             reference = None if experiment.problem == "consensus" else experiment.reference
             states = bounded(trajectory.values[:steps])
-            models["agents"] = error_plots.agent_convergence(
-                states, reference, experiment.step_length, agent_errors(document)[0]
-            )
+            models["agents"] = error_plots.agent_convergence(states, reference, experiment.step_length, nodes)
     if ratios is not None and any(ratio is not None for ratio in ratios):
-        sizes = np.array(ratios, dtype=float)  # None: nan
-        models["innovations"] = error_plots.innovation_sizes(
-            sizes, document["innovations"]["samples"], candidates, experiment.names
-        )
+        sizes, samples = np.array(ratios, dtype=float), document["innovations"]["samples"]  # None: nan
+        models["innovations"] = error_plots.innovation_sizes(sizes, samples, candidates, names)
     if document["timing"]:
-        models["lateness"] = error_plots.lateness(document["timing"])
-        models["staleness"] = error_plots.staleness(document["timing"])
+        models["lateness"] = error_plots.histogram(document["timing"], "lateness_ms")
+        models["staleness"] = error_plots.histogram(document["timing"], "staleness_ms")
     return {name: model for name, model in models.items() if model is not None}, drawn
 
 
@@ -343,11 +339,9 @@ def _explanation(document: dict[str, Any]) -> str:
             f"{completeness['missing']} of {completeness['expected']} states" if completeness["missing"] else "",
             f"the graph of {completeness['missing_modes']} steps" if completeness["missing_modes"] else "",
         ]
-        numbers = (
-            f"The numbers below are those of the first {document['steps']} steps, up to the first gap."
-            if document["system_error"]["measured"] is not None
-            else "The first gap is too early to compute errors."
-        )
+        numbers = f"The numbers below are those of the first {document['steps']} steps, up to the first gap."
+        if document["system_error"]["measured"] is None:
+            numbers = "The first gap is too early to compute errors."
         return f"Missing: {' and '.join(filter(None, lost))}. {numbers}"
     if document["unpredicted"]:
         results = [f"{test['name']}: {'rejected' if test['rejected'] else 'ok'}" for test in tests]
@@ -357,10 +351,8 @@ def _explanation(document: dict[str, Any]) -> str:
     rejected = [test for test in tests if test["rejected"]]
     if not rejected:
         return f"All {len(tests)} tests are ok. {chance}"
-    names = document["names"]
-    named = ", ".join(
-        f"{with_names(test['name'], names)} (p = {minus_sign(p_text(test['p_adjusted']))})" for test in rejected[:6]
-    )
+    shown = [f"{test['name']} (p = {minus_sign(p_text(test['p_adjusted']))})" for test in rejected[:6]]
+    named = with_names(", ".join(shown), document["names"])
     more = f" and {len(rejected) - 6} more" if len(rejected) > 6 else ""
     return f"Rejected: {len(rejected)} of {len(tests)} tests: {named}{more}. {chance}"
 
