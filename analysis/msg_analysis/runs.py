@@ -83,14 +83,16 @@ def result_row(path: Path, document: dict[str, Any]) -> Result:
     given = document.get("names")
     names = list(map(str, given)) if isinstance(given, list) else None
     blame = [with_names(str(cause.get("words")), names) for cause in _parts(document, "blame", file)]
-    leaders = document.get("leaders")
+    leaders = document["leaders"] if isinstance(document.get("leaders"), list) else ()
     identity = document.get("experiment_identity")
     return Result(
         file=str(path),
         experiment=_part(document, "experiment", str, file),
         seeds=" ".join(str(seed) for seed in seeds if seed is not None),
         bags=len(bags) or 1,
-        leaders=" ".join(_leader(leader, names) for leader in leaders) if isinstance(leaders, list) else "",
+        leaders=" ".join(
+            agent_name(leader, names) if isinstance(leader, int) else str(leader) for leader in leaders or ()
+        ),
         verdict=_part(document, "verdict", str, file),
         simulated_time=_number(document, "simulated_time", file) or 0.0,
         measured=_number(total, "measured", file),
@@ -130,21 +132,14 @@ def _number(document: Any, key: str, file: Path) -> float | None:
 
 
 def tested_error(document: dict[str, Any], file: Path) -> dict[str, float | None] | None:
-    """The system error of a document with the standard error that tests use; None where it has none.
-
-    In runs that are too short for one over all paths of the graphs, that is the one given the path; then the measured
-    error is corrected for the path. Keys: ``measured``, ``standard_error``, ``predicted``.
-    """
+    """The system error of a document with the standard error that tests use; None where it has none."""
+    # In runs that are too short for one over all paths of the graphs: that given the path, with the error corrected.
     given = document.get("given_path")
     for part in (document, given if isinstance(given, dict) else {}):
         error = part.get("system_error")
         if isinstance(error, dict) and error.get("standard_error") is not None:
             return {key: _number(error, key, file) for key in ("measured", "standard_error", "predicted")}
     return None
-
-
-def _leader(leader: object, names: Sequence[str] | None) -> str:
-    return agent_name(leader, names) if isinstance(leader, int) else str(leader)
 
 
 Status = Literal["compared", "not compared", "recording", "torn", "empty", "foreign", "damaged"]
@@ -156,11 +151,7 @@ _OURS = {"log", ".recording"}  # what a run makes before anything is recorded
 
 @dataclass(frozen=True, slots=True)
 class RunEntry:
-    """A folder of a run; None where it has no such thing.
-
-    The system error is that of the saved result, with the standard error that tests use (``given_path``: given the path
-    of the graphs).
-    """
+    """A folder of a run, with the system error of its saved result; None where it has no such thing."""
 
     folder: str
     status: Status
@@ -177,7 +168,7 @@ class RunEntry:
     high: float | None = None
     predicted: float | None = None
     z: float | None = None
-    given_path: bool = False
+    given_path: bool = False  # whether the standard error is that given the path of the graphs
     report: str | None = None  # file
 
     def to_json(self) -> dict[str, Any]:
@@ -186,10 +177,7 @@ class RunEntry:
 
 
 def list_runs(folder: Path) -> list[RunEntry]:
-    """The runs in a folder, oldest first: each of its folders, whatever is in it.
-
-    InputError: it is not there, not a folder, or a bag itself.
-    """
+    """The runs in a folder, oldest first: each of its folders. InputError: it is not there, no folder, or a bag."""
     try:
         with os.scandir(folder) as entries:
             inside = list(entries)
@@ -349,10 +337,7 @@ class RunFilter:
 
 
 def moment(text: str, option: str, now: datetime, *, end: bool = False) -> datetime:
-    """A date, a date with a time, or an age before ``now``, as a time with its zone; without one it is local.
-
-    A date alone is its beginning, or with ``end`` its end. InputError: ``text`` of the ``option`` is none of these.
-    """
+    """A date (its beginning, or its ``end``), a local or zoned date and time, or an age before ``now``; InputError."""
     age = _AGE.fullmatch(text)
     try:
         if age:

@@ -34,7 +34,7 @@ def on_files(files: Files, /, *, config: MkDocsConfig) -> Files:
     """Simulate the example, compare it with its prediction, and add the report to the site."""
     run = simulate(Experiment.parse(yaml.safe_load(examples.text_of(EXAMPLE))))
     run.record.versions.pop("host", None)  # the report is published
-    html = render(compare(run), run, host="the computer that built this site", command=" && ".join(COMMANDS))
+    html = render(compare(run), host="the computer that built this site", command=" && ".join(COMMANDS))
     files.append(File.generated(config, FILE, content=html))
     return files
 

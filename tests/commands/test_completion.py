@@ -10,18 +10,14 @@ from pathlib import Path
 
 import click
 import pytest
-from click.testing import CliRunner
-from programs import COMMANDS, PROGRAMS, command_of
+from programs import COMMANDS, PROGRAMS, command_of, run
 
 from msg_analysis.experiment.examples import names
 from msg_analysis.experiment.experiment import Experiment
 
 BIN = Path(sys.executable).parent
-PAIR = {
-    "name": "pair",
-    "graphs": {"apart": {"path": [1, 2, 3]}},
-    "run": {"dt": 0.1, "duration": 5, "start": "zero"},
-}
+APART = {"apart": {"path": [1, 2, 3]}}
+PAIR = {"name": "pair", "graphs": APART, "run": {"dt": 0.1, "duration": 5, "start": "zero"}}
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +26,10 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("place")
     for name in ("line.yaml", "ring.yml", "result.json", "notes.txt", ".hidden.yaml"):
         (place / name).write_text("")
-    run = Experiment.parse(PAIR).simulate()
-    run.save(place / "runs" / "lab_1")
-    run.save(place / "runs" / "lab_2")
-    (place / "run.json").write_text(run.record.to_json())
+    made = Experiment.parse(PAIR).simulate()
+    made.save(place / "runs" / "lab_1")
+    made.save(place / "runs" / "lab_2")
+    (place / "run.json").write_text(made.record.to_json())
     (place / "empty").mkdir()
     return place
 
@@ -50,7 +46,7 @@ def complete(line: str, shell: str = "bash") -> list[str]:
     program, *rest = line.split(" ")
     variable = f"_{program.replace('-', '_').upper()}_COMPLETE"
     words = {"COMP_WORDS": line, "COMP_CWORD": rest[-1] if shell == "fish" else str(len(rest))}
-    result = CliRunner().invoke(PROGRAMS[program], [], prog_name=program, env={variable: f"{shell}_complete", **words})
+    result = run(program, **{variable: f"{shell}_complete", **words})
     assert (result.exit_code, result.stderr) == (0, ""), result
     if shell == "zsh":
         kinds = iter(result.stdout.strip("\n").splitlines())
@@ -142,7 +138,7 @@ def test_in_bash(folder: Path) -> None:
 def test_what_a_shell_reads_at_its_start(program: str, shell: str, tmp_path: Path) -> None:
     """Is a script of that shell, where it is here to be asked."""
     variable = f"_{program.replace('-', '_').upper()}_COMPLETE"
-    result = CliRunner().invoke(PROGRAMS[program], [], prog_name=program, env={variable: f"{shell}_source"})
+    result = run(program, **{variable: f"{shell}_source"})
     assert result.exit_code == 0
     assert f"{variable}={shell}_complete" in result.stdout
     if found := shutil.which(shell):

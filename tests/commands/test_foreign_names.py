@@ -11,6 +11,7 @@ import pytest
 from rich.panel import Panel
 from rich.table import Table
 
+from experiments import document
 from msg_analysis.common.console import SafeConsole
 from msg_analysis.common.text import visible
 from msg_analysis.experiment.experiment import Experiment
@@ -23,17 +24,10 @@ OF_RICH = re.compile(r"\x1b\[[0-9;]*m|\x1b\[\?25[hl]|\x1b\[[0-9]*[AK]|\r")  # st
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("hostile")
-    document = {
-        "name": "net",
-        "problem": "consensus",
-        "time": "continuous",
-        "names": [f"n{i}{HOSTILE}" for i in (1, 2, 3)],
-        "graphs": {f"a{HOSTILE}": {"path": [1, 2, 3]}, f"b{HOSTILE}": {"cycle": [1, 2, 3]}},
-        "switching": {"generator": [[-1, 1], [1, -1]]},
-        "run": {"dt": 0.05, "duration": 10, "replicas": 2, "seed": 3},
-    }
-    (folder / "net.yaml").write_text(json.dumps(document))
-    (folder / "wrong.yaml").write_text(json.dumps(document | {f"key{HOSTILE}": 1, "problem": HOSTILE}))
+    graphs = {f"a{HOSTILE}": {"path": [1, 2, 3]}, f"b{HOSTILE}": {"cycle": [1, 2, 3]}}
+    net = document(names=[f"n{i}{HOSTILE}" for i in (1, 2, 3)], graphs=graphs, run={"duration": 10, "seed": 3})
+    (folder / "net.yaml").write_text(json.dumps(net))
+    (folder / "wrong.yaml").write_text(json.dumps(net | {f"key{HOSTILE}": 1, "problem": HOSTILE}))
     (folder / "sweep.yaml").write_text(f'experiment: net.yaml\nkind: predict\nover: {{"x{chr(92)}e[2J": [1, 2]}}\n')
     run = Experiment.load(folder / "net.yaml").simulate()
     run.save(folder / "bag")

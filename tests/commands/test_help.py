@@ -14,8 +14,7 @@ from runpy import run_path
 
 import click
 import pytest
-from click.testing import CliRunner
-from programs import COMMANDS, PROGRAMS, command_of, context_of
+from programs import COMMANDS, PROGRAMS, command_of, context_of, run
 
 import msg_analysis.bags.stored_file as storage_module
 from msg_analysis.cli import options as cli_options
@@ -26,16 +25,8 @@ DOCS = Path(__file__).parents[2] / "docs"
 HOOK = run_path(str(DOCS / "hooks/commands.py"))
 HEAVY = (
     *("numpy", "scipy", "networkx", "pydantic", "matplotlib", "rich", "jinja2", "yaml", "mcap", "zstandard", "lz4"),
-    *(
-        "rclpy",
-        "dask",
-        "distributed",
-        "pyarrow",
-        "bokeh",
-        "pandas",
-        "msg_analysis.experiment.experiment",
-        "msg_agents.run.runner",
-    ),
+    *("rclpy", "dask", "distributed", "pyarrow", "bokeh", "pandas"),
+    *("msg_analysis.experiment.experiment", "msg_agents.run.runner"),
 )
 METAVARS = {  # of options that are called the same, wherever they are
     "--seed": {"N"},
@@ -58,7 +49,7 @@ def long_name(option: click.Option) -> str:
 
 
 def help_of(program: str, *words: str) -> str:
-    result = CliRunner().invoke(PROGRAMS[program], [*words, "--help"], prog_name=program, env={"COLUMNS": "80"})
+    result = run(program, *words, "--help", COLUMNS="80")
     assert (result.exit_code, result.stderr) == (0, "")
     return result.stdout
 
@@ -112,7 +103,7 @@ def test_overview_and_version() -> None:
         assert max(map(len, text.splitlines())) <= 80
         for name in group.commands:
             assert re.search(rf"^  {name} +\S", text, re.MULTILINE), name
-        version = CliRunner().invoke(group, ["--version"], prog_name=program)
+        version = run(program, "--version")
         assert re.fullmatch(rf"{program}, version \d+\.\d+\.\d+\n", version.stdout)
 
 
@@ -152,7 +143,7 @@ def test_the_list_of_commands_has_all_in_groups_and_cuts_nothing(program: str) -
     assert isinstance(group, CommandGroup)
     assert sorted(itertools.chain(*group.sections.values())) == sorted(group.commands)
     for width in ("80", "50"):
-        text = CliRunner().invoke(group, ["--help"], prog_name=program, env={"COLUMNS": width}).stdout
+        text = run(program, "--help", COLUMNS=width).stdout
         assert "..." not in text.partition("Start here:")[2]
     for name, command in group.commands.items():
         sentence = " ".join((command.help or "").partition("\n\n")[0].split())
@@ -197,7 +188,7 @@ def test_help_imports_nothing_heavy(program: str) -> None:
     ],
 )
 def test_a_slip_of_the_pen_is_told_the_nearest(words: list[str], suggestion: str) -> None:
-    result = CliRunner().invoke(PROGRAMS[words[0]], words[1:], prog_name=words[0])
+    result = run(*words)
     assert (result.exit_code, result.stdout) == (2, "")
     assert re.search(rf"(Did you mean|Possible options).*{suggestion}", result.stderr)
 
@@ -205,12 +196,17 @@ def test_a_slip_of_the_pen_is_told_the_nearest(words: list[str], suggestion: str
 @pytest.mark.parametrize(("program", "name"), COMMANDS)
 def test_wrong_usage(program: str, name: str) -> None:
     """Of every command: exit code 2, nothing on stdout, what is wrong and where to read on on stderr."""
-    result = CliRunner().invoke(PROGRAMS[program], [name, "--no-such-option"], prog_name=program)
+    result = run(program, name, "--no-such-option")
     assert (result.exit_code, result.stdout) == (2, "")
     assert f"Try '{program} {name} --help' for help." in result.stderr
     assert "No such option '--no-such-option'" in result.stderr
-    many = CliRunner().invoke(PROGRAMS[program], [name, *["x"] * 9], prog_name=program)
-    endless = any(each.nargs == -1 for each in command_of(program, name).params)
-    if not endless:
-        assert (many.exit_code, many.stdout) == (2, "")
-        assert "Traceback" not in many.stderr
+
+
+@pytest.mark.parametrize(
+    ("program", "name"),
+    [command for command in COMMANDS if all(each.nargs != -1 for each in command_of(*command).params)],
+)
+def test_too_many_arguments(program: str, name: str) -> None:
+    many = run(program, name, *"xxxxxxxxx")
+    assert (many.exit_code, many.stdout) == (2, "")
+    assert "Traceback" not in many.stderr

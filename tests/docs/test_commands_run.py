@@ -14,15 +14,10 @@ from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
-import click
 import pytest
-from click.testing import CliRunner
 from pages import EXPERIMENTS, FENCED, INDENTED, PAGES, PRINTING, ROOT, blocks, console, experiments, missing
+from programs import PROGRAMS, run
 
-from msg_agents.cli.main import main as agents
-from msg_analysis.cli.main import main as analysis
-
-OURS: dict[str, click.Group] = {"msg-agents": agents, "msg-analysis": analysis}
 OTHERS = "cd|colcon|dask|docker (?:build|compose|run)|export|for|make|pip|python3?|rosdep|ros2|scp|sed|source|sudo|wait"
 COMMAND = re.compile(rf"(?:\$ )?((?:[A-Z_]+=\S+ )*(?:\.venv/bin/)?(?:msg-agents|msg-analysis|{OTHERS})\b.*)")
 SYNOPSIS = re.compile(r" \[|\.\.\.| (?:EXPERIMENT|SWEEP|RESULT|RUN_RECORD|A B)\b")  # test_pages.py knows their options
@@ -111,7 +106,7 @@ def test_lists() -> None:
     known = TESTED | NOT_RUN
     assert [pattern for pattern in known if not any(re.match(pattern, each) for each in commands())] == []
     assert [file for file in TESTED.values() if not (ROOT / file).exists()] == []
-    assert {command.split()[0] for command in HERE} == set(OURS)
+    assert {command.split()[0] for command in HERE} == set(PROGRAMS)
     assert len(HERE) > 30
 
 
@@ -141,7 +136,7 @@ def twins(tmp_path_factory: pytest.TempPathFactory) -> Path:
             ["simulate", "line_ring", "--duration", DURATION, "--seed", seed, "--out", bag],
             ["compare", bag, "--json"],
         ):
-            result = CliRunner().invoke(analysis, call)
+            result = run("msg-analysis", *call)
             assert result.exit_code == 0, result.output
         (place / f"leader_{seed}.json").write_text(result.stdout)
     return place
@@ -172,7 +167,7 @@ def test_command_runs(command: str, twins: Path, tmp_path: Path, monkeypatch: py
     for file in twins.glob("*.json"):
         shutil.copy(file, tmp_path)
     arguments = [match for word in arguments for match in ([*map(str, Path().glob(word))] if "*" in word else [word])]
-    result = CliRunner().invoke(OURS[program], arguments, prog_name=program)
+    result = run(program, *arguments)
     assert result.exit_code == (2 if "bad.yaml" in command else 0), result.output
     assert result.output
     assert missing(SHOWN.get(command, []), result.output) == []

@@ -33,7 +33,7 @@ def test_gallery(script: Path, elsewhere: Path, capsys: pytest.CaptureFixture[st
     matplotlib.pyplot.close("all")
 
 
-def test_what_the_page_begins_with(elsewhere: Path) -> None:
+def test_python_of_the_page(elsewhere: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A reader copies it."""
     (elsewhere / "line_ring.yaml").write_text(LINE_RING.read_text())
     page = (DOCS / "python.md").read_text(encoding="utf-8")
@@ -41,4 +41,5 @@ def test_what_the_page_begins_with(elsewhere: Path) -> None:
     compile(network, "docs/python.md", "exec")  # tests/integration/test_python.py runs it
     for script in (first, *others):
         exec(compile(script, "docs/python.md", "exec"), {})
+    assert "agrees" in capsys.readouterr().out
     assert {file.name for file in elsewhere.glob("*.png")} == {"run.png", "comparison.png", "rates.png"}

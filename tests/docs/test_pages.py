@@ -9,18 +9,14 @@ import shlex
 import shutil
 from pathlib import Path
 
-import click
 import pytest
 import yaml
-from click.testing import CliRunner
 from pages import EXPERIMENTS, PAGES, PRINTING, ROOT, Shown, blocks, console, experiments, missing, typed
+from programs import PROGRAMS, run
 
-from msg_agents.cli.main import main as agents
-from msg_analysis.cli.main import main as analysis
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import simulate
 
-PROGRAMS: dict[str, click.Group] = {"msg-agents": agents, "msg-analysis": analysis}
 NEEDS_NETWORK = ("msg-agents check", "msg-analysis compare runs/loud")  # shown by tests/integration/test_docs.py
 
 
@@ -110,7 +106,7 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def printed(command: str, exit_code: int = 0) -> str:
     program, *arguments = shlex.split(command)
-    result = CliRunner().invoke(PROGRAMS[Path(program).name], arguments)
+    result = run(Path(program).name, *arguments)
     assert result.exit_code == exit_code, result.output
     return result.stdout
 
@@ -126,10 +122,10 @@ def compared(document: str) -> str:
 
     No bag is made on the way: what is read from it is what was written, as tests/analysis/bags says.
     """
-    run = simulate(Experiment.parse(json.loads(document)))
+    twin = simulate(Experiment.parse(json.loads(document)))
     Path("twin").mkdir()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("msg_analysis.inference.pool.read_bag", lambda bag: run)
+        patch.setattr("msg_analysis.inference.pool.read_bag", lambda bag: twin)
         return printed("msg-analysis compare twin")
 
 
@@ -150,7 +146,7 @@ def test_what_is_printed(page: Path, shown: Shown, workplace: Path) -> None:
     assert missing(shown.lines, output) == []
 
 
-@pytest.mark.parametrize("name", ["quickstart", "leaders", "messages", "python", "commands"])
+@pytest.mark.parametrize("name", ["quickstart", "leaders", "messages", "commands"])
 def test_python_runs(name: str, workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With a short bag of the name that the page gives to it, one to salvage, and tables of it."""
     printed("msg-analysis simulate line_ring.yaml --duration 10 --out line_ring_twin")

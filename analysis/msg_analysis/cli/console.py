@@ -111,10 +111,8 @@ def _exit_codes() -> Iterator[None]:
 
 
 def _open_closed_streams() -> None:
-    """Occupy the numbers of closed standard streams, so that no file or socket gets them and receives what is printed.
-
-    Printing to a closed stdout then fails, as in other programs; what is printed to a closed stderr is dropped.
-    """
+    """Occupy the numbers of closed standard streams: a file or socket would get them, and receive what is printed."""
+    # Printing to a closed stdout then fails, as in other programs; what is printed to a closed stderr is dropped.
     for number, mode in ((0, os.O_WRONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(number)
@@ -261,17 +259,14 @@ class _Progress:
         left = (total - done) * (when - self._begun) / new - (now - when)
         return f"{text}, {duration_text(math.ceil(max(left, 0.0)))} left"
 
-    def _show(self, title: str, done: int, total: int, words: str, in_short: str) -> None:
+    def _show(self, title: str, done: int, total: int, text: str, in_short: str) -> None:
         if self._first is None:
             self._first = done
         self._newest = done, total, time.monotonic()
         self._bar.update(self._task, completed=done, total=total, description=title, words=in_short)
         if not self._console.is_terminal and time.monotonic() - self._told >= _LINE_PERIOD:
             self._told = time.monotonic()
-            self._console.print(self._line(title, done, total, words))
-
-    def _line(self, title: str, done: int, total: int, words: str) -> str:
-        return ", ".join(filter(None, (f"{title}: {done} of {total}", words, self._times() if self._time_left else "")))
+            self._console.print(f"{title}: {text}" + (f", {self._times()}" if self._time_left else ""))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -285,14 +280,10 @@ class SweepProgress(_Progress):
     def __init__(self, title: str) -> None:
         super().__init__(title, time_left=True)
 
-    def checked(self, done: int, total: int) -> None:
-        """Show how many of the points have been checked."""
-        self.done(done, total, 0)
-
-    def done(self, done: int, total: int, failed: int) -> None:
+    def done(self, done: int, total: int, failed: int = 0) -> None:
         """Show how many points are done, and how many of these failed; a ``SweepProgress`` of ``run_jobs``."""
         without = f"{failed} without a result" if failed else ""
-        self._show(self._title, done, total, without, without)
+        self._show(self._title, done, total, f"{done} of {total}" + (f", {without}" if failed else ""), without)
 
 
 class SolveProgress(_Progress):
@@ -304,7 +295,8 @@ class SolveProgress(_Progress):
     def __call__(self, stage: str, done: int, total: int, best: float) -> None:
         """Show stage, evaluations done and to do, and the smallest system error so far; see ``SearchProgress``."""
         found = f"{best:.6g}"
-        self._show(f"{self._title}: {stage}", done, total, f"smallest system error {found}", f"E {found}")
+        text = f"{done} of {total}, smallest system error {found}"
+        self._show(f"{self._title}: {stage}", done, total, text, f"E {found}")
 
 
 class WorkProgress(_Progress):
@@ -323,7 +315,5 @@ class WorkProgress(_Progress):
             return
         self._shown = now
         self._bar.start()
-        self._show(what, 100 * done // max(total, 1), 100, "%", "%")
-
-    def _line(self, title: str, done: int, total: int, words: str) -> str:  # noqa: ARG002  always of 100
-        return f"{title}: {done} {words}"
+        percent = 100 * done // max(total, 1)
+        self._show(what, percent, 100, f"{percent} %", "%")

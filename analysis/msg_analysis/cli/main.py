@@ -21,22 +21,26 @@ from msg_analysis.cli.options import (
     BAG,
     PATH,
     SOURCE,
+    choice_option,
     duration_option,
     experiment_argument,
     is_bag,
     json_option,
     load_experiment,
+    out_option,
     seed_option,
     set_option,
-    storage,
     storage_options,
 )
 from msg_analysis.common.resources import __version__
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
-    from msg_analysis.bags.stored_file import Compression
+    from msg_analysis.bags.stored_file import Storage
     from msg_analysis.sweeps.workers import OtherSoftware
+
+
+FORMATS = ("png", "svg", "pdf")  # of figures
 
 
 @click.group(cls=CommandGroup)
@@ -68,7 +72,7 @@ def predict(experiment: Path, changes: tuple[str, ...], as_json: bool) -> None:
     epilog=examples("msg-analysis simulate line_ring", "msg-analysis simulate line_ring --seed 8 --out twin_8")
 )
 @experiment_argument
-@click.option("--out", type=PATH, metavar="BAG", show_default="<name>_twin", help="Bag to write; must not exist.")
+@out_option("BAG", "Bag to write; must not exist.", show_default="<name>_twin")
 @seed_option
 @duration_option
 @set_option
@@ -81,8 +85,7 @@ def simulate(
     seed: int | None,
     duration: float | None,
     changes: tuple[str, ...],
-    compression: Compression,
-    split_size: float | None,
+    storage: Storage,
     as_json: bool,
 ) -> None:
     """Simulate EXPERIMENT without ROS and write its bag.
@@ -93,19 +96,11 @@ def simulate(
     directory = out or Path(f"{loaded.name}_twin")
     if directory.exists():
         raise InputError(f"{directory}: exists already: remove it, or choose another name with --out")
-    chosen = storage(compression, split_size)
     run = loaded.simulate(seed=seed, duration=duration)
-    run.save(directory, chosen)
+    run.save(directory, storage)
     if as_json:
-        print_json(
-            {
-                "bag": str(directory),
-                "run": str(run.record.run),
-                "experiment": loaded.name,
-                "seed": run.experiment.run.seed,
-                "steps": run.experiment.steps,
-            }
-        )
+        made = {"bag": str(directory), "run": str(run.record.run), "experiment": loaded.name}
+        print_json(made | {"seed": run.experiment.run.seed, "steps": run.experiment.steps})
     else:
         click.echo(directory)
 
@@ -117,17 +112,14 @@ def simulate(
 )
 @experiment_argument
 @click.option("--count", type=int, metavar="K", show_default="as many as EXPERIMENT has", help="Number of leaders.")
-@click.option(
+@choice_option(
     "--method",
-    type=click.Choice(["auto", "exhaustive", "greedy", "swap"]),
+    ["auto", "exhaustive", "greedy", "swap"],
+    "Search method. auto: exhaustive up to 1000 sets, otherwise swap.",
     default="auto",
-    help="Search method. auto: exhaustive up to 1000 sets, otherwise swap.",
 )
-@click.option(
-    "--law",
-    type=click.Choice(["continuous", "emulated", "discrete"]),
-    show_default="the paper's, if there is one",
-    help="Law of the agents.",
+@choice_option(
+    "--law", ["continuous", "emulated", "discrete"], "Law of the agents.", show_default="the paper's, if there is one"
 )
 @click.option(
     "--gain",
@@ -164,13 +156,13 @@ def leaders(experiment: Path, *, count: int | None, changes: tuple[str, ...], as
     )
 )
 @click.argument("example", type=click.Choice(["1", "2", "3", "all"]), default="all")
-@click.option("--out", type=PATH, metavar="DIR", default=Path("figures"), help="Output directory.")
+@out_option("DIR", "Output directory.", default=Path("figures"))
 @click.option(
     "--format",
     "formats",
-    type=click.Choice(["png", "svg", "pdf"]),
+    type=click.Choice(FORMATS),
     multiple=True,
-    default=("png", "svg", "pdf"),
+    default=FORMATS,
     help="Format of the figures. Repeatable.",
 )
 @click.option("--emulate", is_flag=True, help="Also run networks (takes minutes) and draw the measured values.")
@@ -190,9 +182,8 @@ def figures(
     """Draw the figures of the paper, and write their numbers.
 
     The names of the files are printed; existing files of these names are replaced. With --emulate, networks are
-    run, and the measured points are drawn
-    on the curves in separate files; finished runs are kept. Exit code 1: some point disagrees with theory, 3: some
-    network failed.
+    run, and the measured points are drawn on the curves in separate files; finished runs are kept. Exit code 1: some
+    point disagrees with theory, 3: some network failed.
     """
     from msg_analysis.paper.figures import write_figures
 
@@ -263,7 +254,7 @@ def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
 @click.option("--parquet", is_flag=True, help="Write states.parquet, graphs.parquet and errors.parquet.")
 @click.option("--npz", is_flag=True, help="Write run.npz, the arrays of Python.")
 @click.option("--rrd", is_flag=True, help="Write run.rrd, a recording for the viewer Rerun; needs rerun-sdk.")
-@click.option("--out", type=PATH, metavar="DIR", show_default="<name of BAG>_export", help="Output directory.")
+@out_option("DIR", "Output directory.", show_default="<name of BAG>_export")
 @json_option
 def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Path | None, as_json: bool) -> None:
     """Convert a bag to CSV, Parquet, NumPy or Rerun files.

@@ -9,6 +9,7 @@ import math
 import os
 import re
 from collections.abc import Callable, Sequence
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
     from msg_analysis import Experiment
-    from msg_analysis.bags.stored_file import Compression, Storage
+    from msg_analysis.bags.stored_file import Compression
 
 # As in the modules of bags and results, whose imports take longer than --help may take.
 BAG_SUFFIXES = (".mcap", ".mcap.zstd", ".db3", ".db3.zstd")
@@ -28,45 +29,11 @@ SMALLEST_SPLIT = 0.1  # MB
 RESULT_FILE = "result.json"
 
 
-def storage_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the arguments ``compression`` and ``split_size`` [MB, 10^6 bytes] to a command; see :func:`storage`."""
-    for option in (
-        click.option(
-            "--compression",
-            type=click.Choice(COMPRESSIONS),
-            default="zstd",
-            help="Compression of the chunks of the bag.",
-        ),
-        click.option(
-            "--split-size",
-            type=click.FloatRange(SMALLEST_SPLIT),
-            metavar="MB",
-            help="Start a new file of the bag after this many MB (10^6 bytes).",
-        ),
-    ):
-        command = option(command)
-    return command
-
-
-def storage(compression: Compression, split_size: float | None) -> Storage:
-    """The storage that these options ask for; ``split_size`` [MB, 10^6 bytes] is None for one file."""
-    from msg_analysis.bags.stored_file import MEGABYTE, Storage
-
-    try:
-        size = None if split_size is None else round(split_size * MEGABYTE)
-    except (ValueError, OverflowError) as error:  # nan, inf
-        raise InputError(f"--split-size: {split_size}: expected a number of MB") from error
-    return Storage(compression, size)
-
-
 _PLAIN = re.compile(r"[\w./~+,:@%=-]*")  # characters that a shell needs no quotes for
 
 
 class InputPath(click.Path):
-    """Path of a file with one of the suffixes, or of a directory with one of ``holds`` (names or patterns) in it.
-
-    A shell completes it to such paths, and to directories on the way to them.
-    """
+    """Path of a file with one of the suffixes, or of a directory with one of ``holds`` (patterns) in it."""
 
     def __init__(self, *suffixes: str, holds: Sequence[str] = ()) -> None:
         super().__init__(path_type=Path)
@@ -74,7 +41,7 @@ class InputPath(click.Path):
         self._holds = tuple(holds)
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        """Complete to wanted files and directories; see click.ParamType."""
+        """Complete to such paths, and to directories on the way to them; see click.ParamType."""
         del ctx, param
         found = _paths(incomplete, self._is_wanted)
         if not all(_PLAIN.fullmatch(path) for path in found):
@@ -167,7 +134,7 @@ def with_changes(document: Any, changes: Sequence[str]) -> Any:
     return document
 
 
-def load_experiment(path: Path, changes: Sequence[str]) -> Experiment:
+def load_experiment(path: Path, changes: Sequence[str] = ()) -> Experiment:
     """The experiment of a file with the values of ``--set``."""
     from msg_analysis import Experiment
     from msg_analysis.experiment.loading import read_yaml
@@ -181,17 +148,6 @@ def load_experiment(path: Path, changes: Sequence[str]) -> Experiment:
 def source_of(path: Path, changes: Sequence[str]) -> str:
     """How errors call a file with the values of ``--set``."""
     return " ".join([str(path), *(f"--set {change}" for change in changes)])
-
-
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
-verbose_option = click.option(
-    "-v", "--verbose", is_flag=True, help="Also print all tests and agents, the order of the agents, and the timing."
-)
-experiment_argument = click.argument("experiment", type=EXPERIMENT)
-seed_option = click.option("--seed", type=int, metavar="N", help="Seed of the run (run.seed).")
-duration_option = click.option(
-    "--duration", type=float, metavar="T", help="Overrides run.duration, in units of simulated time."
-)
 
 
 class PositiveFloat(click.FloatRange):
@@ -208,9 +164,55 @@ class PositiveFloat(click.FloatRange):
         return number
 
 
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object and nothing else.")
+verbose_option = click.option(
+    "-v", "--verbose", is_flag=True, help="Also print all tests and agents, the order of the agents, and the timing."
+)
+experiment_argument = click.argument("experiment", type=EXPERIMENT)
+seed_option = click.option("--seed", type=int, metavar="N", help="Seed of the run (run.seed).")
+duration_option = click.option(
+    "--duration", type=float, metavar="T", help="Overrides run.duration, in units of simulated time."
+)
+
+
+def choice_option(name: str, choices: Sequence[str], text: str, **more: Any) -> Callable[..., Any]:
+    """An option with one of these words; ``text``: its help."""
+    return click.option(name, type=click.Choice(choices), help=text, **more)
+
+
+def positive_option(name: str, metavar: str, text: str, **more: Any) -> Callable[..., Any]:
+    """An option with a finite number above 0; ``text``: its help."""
+    return click.option(name, type=PositiveFloat(), metavar=metavar, help=text, **more)
+
+
+def out_option(metavar: str, text: str, **more: Any) -> Callable[..., Any]:
+    """The option ``--out``; ``text``: its help."""
+    return click.option("--out", type=PATH, metavar=metavar, help=text, **more)
+
+
 def level_option(what: str) -> Callable[..., Any]:
     """The option ``--level``, a probability; ``what`` is its help text."""
     return click.option("--level", type=PositiveFloat(0.5), metavar="P", default=0.01, help=what)
+
+
+def storage_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add ``--compression`` and ``--split-size``; the command gets the ``storage`` that they ask for."""
+
+    @wraps(command)
+    def with_storage(*arguments: Any, compression: Compression, split_size: float | None, **options: Any) -> None:
+        from msg_analysis.bags.stored_file import MEGABYTE, Storage
+
+        try:
+            size = None if split_size is None else round(split_size * MEGABYTE)
+        except (ValueError, OverflowError) as error:  # nan, inf
+            raise InputError(f"--split-size: {split_size}: expected a number of MB") from error
+        command(*arguments, storage=Storage(compression, size), **options)
+
+    what = "Start a new file of the bag after this many MB (10^6 bytes)."
+    decorate = click.option("--split-size", type=click.FloatRange(SMALLEST_SPLIT), metavar="MB", help=what)
+    compress = choice_option("--compression", COMPRESSIONS, "Compression of the chunks of the bag.", default="zstd")
+    decorated: Callable[..., None] = decorate(compress(with_storage))
+    return decorated
 
 
 def suggest(*words: str) -> Callable[..., list[CompletionItem]]:

@@ -17,6 +17,7 @@ from msg_analysis.cli.options import (
     PATH,
     RESULT,
     SOURCE,
+    choice_option,
     is_bag,
     json_option,
     level_option,
@@ -51,9 +52,7 @@ if TYPE_CHECKING:
 @click.option("--until", metavar="WHEN", help="Only runs up to then; a date is included.")
 @seed_option
 @click.option("--last", type=click.IntRange(1), metavar="N", help="Only the newest N of these.")
-@click.option(
-    "--sort", type=click.Choice(["date", "name", "seed", "verdict", "error"]), default="date", help="Order of the list."
-)
+@choice_option("--sort", ["date", "name", "seed", "verdict", "error"], "Order of the list.", default="date")
 @click.option("--page", type=FILE, metavar="FILE", help="Write these runs as a page for browsers, and print its name.")
 @click.option(
     "--open", "shown", is_flag=True, help="Open the page in a browser; without --page it is FOLDER/index.html."
@@ -142,7 +141,6 @@ def diff(a: Path, b: Path, *, as_json: bool) -> None:
         raise InputError(f"{bag} is a bag, {experiment} an experiment: expected two bags or two experiment files")
     if bags[0]:
         from msg_analysis.cli.console import WorkProgress
-        from msg_analysis.common.resources import watched
         from msg_analysis.report.differences import bag_difference
         from msg_analysis.report.differences import print_bag_difference as show
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from msg_analysis.cli.console import complain, examples, print_json, print_note, print_text, result_console
-from msg_analysis.cli.options import PATH, YAML, json_option
+from msg_analysis.cli.options import YAML, choice_option, json_option, out_option
 from msg_analysis.errors import ExitCode, InputError, killed_by
 from msg_analysis.sweeps.points import require_libraries
 
@@ -24,12 +24,11 @@ if TYPE_CHECKING:
     from msg_analysis.sweeps.workers import OtherSoftware
 
 
-other_software = click.option(
+other_software = choice_option(
     "--other-software",
-    type=click.Choice(["refuse", "redo", "keep"]),
+    ["refuse", "redo", "keep"],
+    "What to do with results that other versions made.",
     default="refuse",
-    show_default=True,
-    help="What to do with results that other versions made.",
 )
 
 
@@ -41,7 +40,7 @@ other_software = click.option(
     )
 )
 @click.argument("sweep_file", metavar="SWEEP", type=YAML)
-@click.option("--out", type=PATH, metavar="DIR", show_default="sweeps/<name>", help="Directory of the results.")
+@out_option("DIR", "Directory of the results.", show_default="sweeps/<name>")
 @click.option(
     "--workers",
     type=click.IntRange(1),
@@ -72,8 +71,7 @@ def sweep(
     """Predict, simulate or run at many values of the keys.
 
     The file SWEEP describes them. Results are kept: after an interruption, the same command continues. Tables
-    (Parquet, CSV, JSON), a figure and
-    an interactive page are written next to them.
+    (Parquet, CSV, JSON), a figure and an interactive page are written next to them.
 
     Exit code 0: success, 1: some run disagrees with its prediction, all runs tested together, 3: some point has no
     result.
@@ -90,11 +88,12 @@ def sweep(
         def checked(done: int, total: int) -> None:
             if done == 1 and not scheduler:
                 warm_up()  # the file can be read: the workers import while its points are checked
-            checking.checked(done, total)
+            checking.done(done, total)
 
         plan = load_sweep(sweep_file, checked)
+    from msg_analysis.common.files import write_whole
     from msg_analysis.common.text import finite
-    from msg_analysis.report.list_pages import write_sweep_page
+    from msg_analysis.report.list_pages import render_sweep
     from msg_analysis.report.sweep_plots import write_figure
     from msg_analysis.report.tables import describe_sweep, print_sweep, summary
     from msg_analysis.sweeps.points import options
@@ -103,16 +102,8 @@ def sweep(
     directory = out or Path("sweeps") / plan.name
     network = options(directory, keep_bags, workers or 1) if plan.kind == "network" else None
     with ResultStore.open(directory) as store:
-        done = _conduct(
-            context,
-            plan.name,
-            [point.job for point in plan.points],
-            store,
-            workers=workers,
-            scheduler=scheduler,
-            network=network,
-            **how,
-        )
+        jobs, how = [point.job for point in plan.points], how | {"workers": workers, "scheduler": scheduler}
+        done = _conduct(context, plan.name, jobs, store, network=network, **how)
         judgement = evaluate_sweep(done.outcomes, plan.spec.level)
         rows = rows_of(plan, done.outcomes, judgement)
         document = finite(describe_sweep(plan, done, judgement, rows))
@@ -120,7 +111,8 @@ def sweep(
             files = write_tables(rows, document, directory)
             shown = picture(plan, rows, column)
             files += write_figure(shown, f"{plan.name}: {plan.kind}", directory)
-            files.append(write_sweep_page(plan, rows, column, summary(document), judgement.verdict, directory))
+            page = render_sweep(plan, rows, column, summary(document), judgement.verdict)
+            files.append(write_whole(directory / "sweep.html", page.encode()))
         except OSError as error:
             raise InputError(f"{error.filename or directory}: cannot be written: {error.strerror}") from error
     if as_json:
@@ -133,10 +125,7 @@ def sweep(
 
 
 class _EndedBySignal(KeyboardInterrupt):
-    """A signal that ends the program as Ctrl-C does, with another exit code."""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
+    """A signal, the argument, that ends the program as Ctrl-C does, with another exit code."""
 
 
 def _end(number: int, _: object) -> None:
@@ -167,7 +156,7 @@ def _conduct(context: click.Context, title: str, jobs: Sequence[Job], store: Res
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the exit
             click.echo(f"\ninterrupted: {kept}", err=True)
             if isinstance(error, _EndedBySignal):
-                context.exit(killed_by(error.number))
+                context.exit(killed_by(error.args[0]))
             raise
         complain(f"{error}: {kept}")
         context.exit(ExitCode.INCOMPLETE)
@@ -202,17 +191,12 @@ def emulate(
         return ExitCode.INCOMPLETE
     files = write_figures(numbers, out, formats, points)
     if as_json:
-        rows = [asdict(point) | {"agent": _number(point.agent)} for point in points]
-        for row in rows:
-            row["run"]["leader"] = _number(row["run"]["leader"])
+        rows = [asdict(point) for point in points]
+        for place, key in [(row, "agent") for row in rows] + [(row["run"], "leader") for row in rows]:
+            place[key] = None if place[key] is None else place[key] + 1  # from 1; None: the system
         print_json({"files": [str(file) for file in files], "points": rows, "agree": not disagreeing(points)})
     else:
         for path in files:
             click.echo(path)
         print_text(summary(points, len(runs) - len(failed)))
     return ExitCode.DISAGREES if disagreeing(points) else ExitCode.INCOMPLETE if failed else ExitCode.FINE
-
-
-def _number(agent: int | None) -> int | None:
-    """Number of an agent in texts and JSON, from 1; None for the system."""
-    return None if agent is None else agent + 1

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from msg_analysis.cli.console import examples, print_json, result_console
 from msg_analysis.cli.options import (
     FILE,
     SOURCE,
+    choice_option,
     experiment_argument,
     is_bag,
     json_option,
@@ -37,11 +39,8 @@ if TYPE_CHECKING:
 @click.option(
     "--times", metavar="TIMES", required=True, help="START:STOP:STEP or t1,t2,... in units of simulated time."
 )
-@click.option(
-    "--law",
-    type=click.Choice(["emulated", "continuous"]),
-    default="emulated",
-    help="Steps of the run, or the continuous time of the paper.",
+@choice_option(
+    "--law", ["emulated", "continuous"], "Steps of the run, or the continuous time of the paper.", default="emulated"
 )
 @click.option("--unreduced", is_flag=True, help="Consensus: errors of the states, not of the disagreement.")
 @click.option(
@@ -53,11 +52,10 @@ if TYPE_CHECKING:
 def transient(experiment: Path, times: str, *, table: Path | None, as_json: bool, **options: Any) -> None:
     """Predict the errors over time, from the start of a run."""
     from msg_analysis.common.files import require_place
-    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report.documents import describe_transient, write_transient_csv
 
     require_place(table)
-    loaded = Experiment.load(experiment)
+    loaded = load_experiment(experiment)
     loaded.require_available("predict")
     document = describe_transient(loaded, _parse_times(times), **options)
     if table:
@@ -101,10 +99,9 @@ def _parse_times(text: str) -> FloatArray:
 @json_option
 def facts(experiment: Path, as_json: bool) -> None:
     """Check the lemmas of the paper; bounds, graph indices."""
-    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report.documents import describe_facts
 
-    loaded = Experiment.load(experiment)
+    loaded = load_experiment(experiment)
     loaded.require_available("predict")
     document = describe_facts(loaded)
     if as_json:
@@ -166,11 +163,9 @@ def plan(
 
 def _parse_share(text: str) -> float:
     """A share of 1 from ``1%``, ``1 %`` or ``0.01``; InputError for anything else."""
-    number = text.strip()
-    try:
+    number, share = text.strip(), -1.0
+    with suppress(ValueError):
         share = float(number.removesuffix("%")) / (100.0 if number.endswith("%") else 1.0)
-    except ValueError:
-        share = -1.0
     if not 0.0 < share < 1.0:
         raise InputError(f"--precision {text}: expected a share above 0, below 1: for example 1% or 0.01")
     return share
@@ -180,12 +175,10 @@ def _parse_duration(text: str | None) -> float | None:
     """Seconds from a number and one of ``UNITS``, s if there is none; InputError for anything else."""
     if text is None:
         return None
-    number = text.strip()
+    number, seconds = text.strip(), -1.0
     unit = next((unit for unit in ("min", "s", "h", "d") if number.endswith(unit)), "")
-    try:
+    with suppress(ValueError):
         seconds = float(number.removesuffix(unit)) * UNITS[unit or "s"]
-    except ValueError:
-        seconds = -1.0
     if not 0.0 < seconds < float("inf"):
         raise InputError(f"--budget {text}: expected a number above 0 with s, min, h or d: for example 10min")
     return seconds

@@ -3,8 +3,7 @@
 
 """The three numerical examples of the paper as numbers: certainty over the switching rates.
 
-The paper's pictures of the graphs of examples 2 and 3 are not part of its text: those used here are reconstructions,
-and are marked as such wherever they are shown.
+The paper's text has no graphs of examples 2 and 3: those used here are reconstructions, and are marked as such.
 """
 
 from __future__ import annotations
@@ -37,10 +36,6 @@ SCALES = (0.5, 1.0, 5.0, 10.0)  # example 2: values of epsilon
 NODE_SCALES = (0.5, 10.0)  # example 2: values of epsilon with drawn node certainties
 
 
-def _two_graphs(r12: float, r21: float) -> list[list[float]]:
-    return [[-r12, r12], [r21, -r21]]
-
-
 def _three_graphs(r12: float, r21: float) -> list[list[float]]:
     """r32 = r12 and r21 = r23; no jumps between graphs 1 and 3."""
     return [[-r12, r12, 0.0], [r21, -2.0 * r21, r21], [0.0, r12, -r12]]
@@ -52,7 +47,7 @@ class Network:
 
     name: str
     graphs: dict[str, Any]  # as in an experiment file
-    rates: Callable[[float, float], list[list[float]]] = _two_graphs  # (n, n) generator of r12 and r21
+    rates: Callable[[float, float], list[list[float]]] = lambda r12, r21: [[-r12, r12], [r21, -r21]]  # (n, n)
 
     def generator(self, epsilon: float, r12: float, r21: float) -> FloatArray:
         """(n, n) the scaled generator."""
@@ -178,10 +173,7 @@ def example_2(points: int = 60) -> Example:
 
 
 def example_3(points: int = 60) -> Example:
-    """One leader held at the reference, two graphs, q12 = q21 = epsilon: centrality and certainty over epsilon.
-
-    At ``points`` values of epsilon and 0.1, 1 and 10.
-    """
+    """One leader held at the reference, two graphs, q12 = q21 = epsilon: at ``points`` values and 0.1, 1 and 10."""
     epsilon = np.unique(np.append(np.geomspace(1e-2, 1e2, points), [0.1, 1.0, 10.0]))
     rates = (epsilon, np.ones_like(epsilon), np.ones_like(epsilon))
     return Example(

@@ -192,10 +192,7 @@ _NOTE = (
 def write_figures(
     numbers: Sequence[int], directory: str | Path, formats: Sequence[str] = FORMATS, measured: Sequence[Measured] = ()
 ) -> list[Path]:
-    """Write ``example_<number>`` in every format and as CSV; with measured points, ``example_<number>_emulated``.
-
-    Each file is whole or not written (InputError). The same versions of the packages write the same bytes.
-    """
+    """Write ``example_<number>``, or with measured points ``example_<number>_emulated``; InputError: it cannot be."""
     directory = Path(directory)
     written = []
     try:
@@ -303,13 +300,10 @@ def _draw_3(example: Example, measured: Sequence[Measured]) -> Figure:
             high = max([c.value.max() for c in curves] + [point.high for point in found])
             axes.set_ylim(low - 0.06 * (high - low), high + 0.36 * (high - low))
             _plot(axes, "epsilon", [(_agent(c), c) for c in curves], "agent", measured)
-            orders = [
-                "-".join(
-                    str(agent + 1) for agent in examples.order(curves, int(np.abs(curves[0].epsilon - at).argmin()))
-                )
-                + rf" at $\epsilon$ = {at:g}"
-                for at in (0.1, 1.0, 10.0)
-            ]
+            orders = []
+            for at in (0.1, 1.0, 10.0):
+                order = examples.order(curves, int(np.abs(curves[0].epsilon - at).argmin()))
+                orders.append("-".join(str(agent + 1) for agent in order) + rf" at $\epsilon$ = {at:g}")
             axes.text(0.03, 0.985, "\n".join(orders), transform=axes.transAxes, va="top", size=7, color=DARK_GREY)
         lead.set(ylabel="agent 1 above agent 3 [%]", ylim=(-2, 2))
         lead.set_yscale("symlog", linthresh=0.01, linscale=0.6)
@@ -327,10 +321,7 @@ def _draw_3(example: Example, measured: Sequence[Measured]) -> Figure:
 def _plot(
     axes: Axes, swept: str, curves: Sequence[tuple[str, Curve]], heading: str, measured: Sequence[Measured] = ()
 ) -> None:
-    """Curves over one of their rates, with a legend on the right under a heading; set the limits before.
-
-    Measured points, if any, have the markers instead of the curves.
-    """
+    """Curves over one of their rates, or measured points on them, and a legend; set the limits before."""
     logarithmic = axes.get_xscale() == "log"
     points = [_on_curve(label, curve, swept, measured) for label, curve in curves]
     ends = [end for found in points for point in found for end in (point.low, point.high)]

@@ -16,7 +16,7 @@ from rich.text import Text
 from msg_analysis.common.text import agent_text, measured_text, number_text, p_text, percent, with_names, z_text
 from msg_analysis.inference.realtime_laws import SUPPORT
 from msg_analysis.model.run_record import RunRecord
-from msg_analysis.report.tables import fact_table, first_rows, gaps, interval_text, number_table, print_table
+from msg_analysis.report.tables import fact_table, first_rows, gaps, interval_text, print_rows, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 
 if TYPE_CHECKING:
@@ -46,32 +46,29 @@ _FEW_AGENTS, _WORST = 8, 5  # most agents of whom each has a row; rows of larger
 
 
 def print_comparison(document: dict[str, Any], console: Console, *, verbose: bool = False) -> None:
-    """Print the verdict, what is wrong or missing, rejected tests and errors; with ``verbose`` everything.
+    """Print a comparison, perhaps that of a network with its rejected messages; with ``verbose`` everything."""
 
-    ``document`` may be that of a run, with its rejected messages (``strangers``).
-    """
+    def say(*lines: str) -> None:
+        for line in lines:
+            console.print(Text(line))
+
     console.print(verdict_line(document), style=_STYLES[document["verdict"]])
-    for line in _facts(document):
-        console.print(Text(line))
+    say(*_facts(document))
     for cause in document.get("blame") or []:
         console.print(Text(with_names(sentence(cause["words"]), document.get("names"))), style="bold red")
-    for line in trust_words(document):
-        console.print(Text(line))
+    say(*trust_words(document))
     _print_bags(document.get("bags") or [], console)
     _print_tests(document, console, verbose)
     _print_errors(document, console, verbose)
     if verbose or (document.get("any_time") or {}).get("disagrees"):
-        for line in any_time_words(document):
-            console.print(Text(line))
+        say(*any_time_words(document))
     if document.get("laws"):
         if verbose:
             _print_timing(document["timing"], document["laws"], console)
-        for line in [with_names(document["laws"]["why"], document.get("names")), *lost_words(document)]:
-            console.print(Text(line))
+        say(with_names(document["laws"]["why"], document.get("names")), *lost_words(document))
     _print_rejected(document.get("strangers") or [], console)
     if verbose:
-        for line in _details(document):
-            console.print(Text(line))
+        say(*_details(document))
 
 
 def _facts(document: dict[str, Any]) -> list[str]:
@@ -110,24 +107,16 @@ def _details(document: dict[str, Any]) -> list[str]:
 
 
 def _print_bags(bags: Sequence[dict[str, Any]], console: Console) -> None:
-    """The runs of a pooled comparison; nothing for a single run."""
-    if not bags:
+    if not bags:  # a single run
         return
-    table = number_table(console, f"{len(bags)} runs", "bag", "seed", "time", "system error", "z", "missing", "")
-    for bag in first_rows(table, bags, "runs"):
+    rows = []
+    for bag in bags:
         error = bag["system_error"]
-        table.add_row(
-            Text(bag["bag"]),
-            str(bag["seed"]),
-            number_text(bag["simulated_time"]),
-            number_text(error["measured"]),
-            z_text(error["z"]),
-            str(bag["missing"]),
-            bag["verdict"],
-        )
-    print_table(console, table)
-    torn = [bag["bag"] for bag in bags if not bag["complete"]]
-    if torn:
+        numbers = (number_text(bag["simulated_time"]), number_text(error["measured"]), z_text(error["z"]))
+        rows.append((bag["bag"], str(bag["seed"]), *numbers, str(bag["missing"]), bag["verdict"]))
+    heads = ("bag", "seed", "time", "system error", "z", "missing", "")
+    print_rows(console, f"{len(bags)} runs", heads, rows, "runs")
+    if torn := [bag["bag"] for bag in bags if not bag["complete"]]:
         console.print(Text(f"Incomplete: {', '.join(torn)}. Leave them out for a verdict on the others."))
 
 
@@ -144,17 +133,13 @@ def _print_tests(document: dict[str, Any], console: Console, verbose: bool) -> N
     if not rejected and not verbose:
         console.print(line)
         return
-    table = number_table(console, line, "test", "p", "p adjusted", "")
-    for test in [*rejected, *(test for test in tests if verbose and not test["rejected"])]:
-        name = Text(with_names(str(test["name"]), document.get("names")))
-        table.add_row(name, p_text(test["p"]), p_text(test["p_adjusted"]), _mark(test))
-    print_table(console, table)
-
-
-def _mark(test: dict[str, Any]) -> Text:
-    if test["p"] is None:
-        return Text("not tested", style="dim")
-    return Text("rejected", style="bold red") if test["rejected"] else Text("ok", style="green")
+    rows = []
+    for test in sorted(tests if verbose else rejected, key=lambda test: not test["rejected"]):
+        mark = Text("rejected", style="bold red") if test["rejected"] else Text("ok", style="green")
+        mark = mark if test["p"] is not None else Text("not tested", style="dim")
+        name = with_names(str(test["name"]), document.get("names"))
+        rows.append((name, p_text(test["p"]), p_text(test["p_adjusted"]), mark))
+    print_rows(console, line, ("test", "p", "p adjusted", ""), rows)
 
 
 def _print_errors(document: dict[str, Any], console: Console, verbose: bool) -> None:
@@ -170,8 +155,7 @@ def _print_errors(document: dict[str, Any], console: Console, verbose: bool) -> 
         table.add_row(Text(label), measured, interval_text(entry.get("interval")), predicted, z_text(entry.get("z")))
 
     row("system", document["system_error"])
-    given = document.get("given_path")
-    if given:
+    if given := document.get("given_path"):
         row("system, corrected*", given["system_error"])
     agents, corrected = agent_errors(document)
     shown: Sequence[int] = range(len(agents))
@@ -192,21 +176,19 @@ def _print_errors(document: dict[str, Any], console: Console, verbose: bool) -> 
 
 def _print_timing(timing: dict[str, Any], laws: dict[str, Any], console: Console) -> None:
     """How well a run in real time kept its time, and which models it supports."""
-    table = number_table(console, "Timing: quantiles", "", *QUANTILES.values())
-    for key, title in TIMES.items():
-        values = timing[key]
-        table.add_row(Text(title), *(number_text(values[quantile], 3) for quantile in QUANTILES))
-    print_table(console, table)
+    rows: list[Sequence[str]] = [
+        [title, *(number_text(timing[key][quantile], 3) for quantile in QUANTILES)] for key, title in TIMES.items()
+    ]
+    print_rows(console, "Timing: quantiles", ["", *QUANTILES.values()], rows)
     facts = fact_table(console, "Real time")
     for title, text in timing_facts(timing):
         facts.add_row(title, text)
     console.print(facts)
-    table = number_table(console, "Models", "system error", "predicted", "z", "")
+    rows = []
     for key, title in REAL_TIME_LAWS.items():
-        law = laws[key]
-        error = law["system_error"]
-        table.add_row(title, number_text(error["predicted"]), z_text(error["z"]), Text(SUPPORT[law["supported"]]))
-    print_table(console, table)
+        error, support = laws[key]["system_error"], SUPPORT[laws[key]["supported"]]
+        rows.append((title, number_text(error["predicted"]), z_text(error["z"]), support))
+    print_rows(console, "Models", ("system error", "predicted", "z", ""), rows)
 
 
 def _print_rejected(messages: Sequence[dict[str, Any]], console: Console) -> None:
@@ -263,11 +245,9 @@ def sentence(words: str) -> str:
 
 
 def agent_errors(document: dict[str, Any]) -> tuple[list[dict[str, Any]], bool]:
-    """The agent errors, and whether they are corrected for the graph sequence.
-
-    They are where only these have intervals: in runs that are too short for intervals over all paths.
-    """
+    """The agent errors, and whether they are corrected for the graph sequence."""
     given = (document.get("given_path") or {}).get("node_errors") or []
+    # Where only these have intervals: in runs that are too short for intervals over all paths.
     corrected = bool(document["system_error"].get("standard_error") is None and given)
     found = given if corrected else document["node_errors"] or []
     return [{"p_adjusted": error.get("p_holm"), **error} for error in found], corrected  # results of before have p_holm
@@ -275,8 +255,7 @@ def agent_errors(document: dict[str, Any]) -> tuple[list[dict[str, Any]], bool]:
 
 def any_time_words(document: dict[str, Any]) -> list[str]:
     """The sequential test in sentences; empty where there is none."""
-    seen = document.get("any_time")
-    if not seen:
+    if not (seen := document.get("any_time")):
         return []
     evidence, limit = seen["evidence"], f"threshold {seen['threshold']:g}"
     shown = number_text(evidence, 2) if evidence is not None else "more than 1e300"

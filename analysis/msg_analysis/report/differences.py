@@ -38,7 +38,7 @@ from msg_analysis.inference.comparison import flat
 from msg_analysis.inference.pool import compare
 from msg_analysis.model.run import Run
 from msg_analysis.report.comparison_text import agent_errors
-from msg_analysis.report.tables import fact_table, first_rows, number_table, print_table
+from msg_analysis.report.tables import fact_table, number_table, print_errors, print_rows, print_table
 from msg_analysis.runs import read_document, result_row, tested_error
 from msg_analysis.theory.leader_search import SearchProgress
 from msg_analysis.theory.leaders import AUTO_SETS, select_leaders
@@ -47,10 +47,7 @@ from msg_analysis.theory.settling import asymptotic_rates
 
 
 def state_difference(a: Run, b: Run, *, block_numbers: int = BLOCK_NUMBERS) -> dict[str, Any]:
-    """The key ``states`` of the difference of two runs; steps count from 0, agents and replicas from 1.
-
-    States of a step count as equal if both are missing; +0 and -0 are different.
-    """
+    """The key ``states`` of the difference of two runs: missing in both is equal, +0 and -0 are different."""
     if a.states.shape[1:] != b.states.shape[1:]:
         shapes = [run.states.shape[1:] for run in (a, b)]
         why = " and ".join(f"{agents} agents with {counted(width, 'number')} each" for agents, width in shapes)
@@ -150,10 +147,7 @@ def relative(a: float | None, b: float | None) -> dict[str, float | None]:
 
 
 def measured(a: Mapping[str, Any] | None, b: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Two measured errors with ``measured`` and ``standard_error``: their difference, and it in standard errors, ``z``.
-
-    The standard error of the difference is that of independent runs; None where one is not known.
-    """
+    """Two measured errors of independent runs: their difference, its standard error, and it in standard errors."""
     one, other = a or {}, b or {}
     difference = error = None
     if one.get("measured") is not None and other.get("measured") is not None:
@@ -169,10 +163,7 @@ _RATES = ("mean", "second_moment", "graph")
 
 
 def experiment_difference(a: Experiment, b: Experiment, watch: SearchProgress | None = None) -> dict[str, Any]:
-    """The document of ``msg-analysis diff`` of two experiments; keys in docs/commands.md.
-
-    An experiment without a prediction has the reason instead. ``watch``: of the search of leaders.
-    """
+    """The document of ``diff`` of two experiments; ``watch``: of the search of leaders."""
     pair = (a, b)
     found = [_prediction(experiment) for experiment in pair]
     laws = [_laws(prediction) if isinstance(prediction, Prediction) else {} for prediction in found]
@@ -216,10 +207,10 @@ def _laws(prediction: Prediction) -> dict[str, Moments]:
     return {name: moments for name, moments in laws.items() if moments is not None}
 
 
-def _errors(a: Moments | None, b: Moments | None) -> dict[str, Any]:
-    nodes_a, nodes_b = (moments.node_errors.tolist() if moments else [] for moments in (a, b))
-    pairs = zip(nodes_a, nodes_b, strict=True) if len(nodes_a) == len(nodes_b) else ()  # else not the same agents
-    system = relative(*(moments.system_error if moments else None for moments in (a, b)))
+def _errors(*laws: Moments | None) -> dict[str, Any]:
+    nodes = [moments.node_errors.tolist() if moments else [] for moments in laws]
+    pairs = zip(*nodes, strict=True) if len(nodes[0]) == len(nodes[1]) else ()  # else not the same agents
+    system = relative(*(moments.system_error if moments else None for moments in laws))
     return {"system_error": system, "node_errors": [relative(*pair) for pair in pairs]}
 
 
@@ -264,15 +255,13 @@ _NUMBERS = ("measured", "standard_error", "predicted")
 
 
 def bag_difference(a: Path, b: Path) -> dict[str, Any]:
-    """The document of ``msg-analysis diff`` of two bags; keys in docs/commands.md. Differences are B - A.
-
-    BagError or InputError: a bag or its run record cannot be read. Verdict and errors come from the saved result of
-    the run, if there is one, else they are computed.
-    """
+    """The document of ``diff`` of two bags. InputError: a bag or its run record cannot be read."""
     runs = [read_bag(path) for path in (a, b)]
     results = [_result(path, run) for path, run in zip((a, b), runs, strict=True)]
     one, other = (run.record for run in runs)
     sides = [_bag_side(*each) for each in zip((a, b), runs, results, strict=True)]
+    agents = [agent_errors(result)[0] if "node_errors" in result else [] for result in results]
+    pairs = zip(*agents, strict=True) if len(agents[0]) == len(agents[1]) else ()  # else not the same agents
     return {
         "kind": "bags",
         "a": sides[0],
@@ -284,7 +273,7 @@ def bag_difference(a: Path, b: Path) -> dict[str, Any]:
         "errors": {
             "independent": one.experiment.run.seed != other.experiment.run.seed,
             "system": measured(*(side["system_error"] for side in sides)),
-            "agents": _agents(*results),
+            "agents": [measured(*map(_with_interval, pair)) for pair in pairs],
         },
     }
 
@@ -328,13 +317,6 @@ def _result(path: Path, run: Run) -> dict[str, Any]:
         return {"verdict": None, "unpredicted": str(error)}
 
 
-def _agents(*results: dict[str, Any]) -> list[dict[str, Any]]:
-    """The agent errors side by side, where both runs have as many agents; empty otherwise."""
-    a, b = (agent_errors(result)[0] if "node_errors" in result else [] for result in results)
-    pairs = zip(a, b, strict=True) if len(a) == len(b) else ()
-    return [measured(*map(_with_interval, pair)) for pair in pairs]
-
-
 def _with_interval(error: dict[str, Any]) -> dict[str, Any]:
     """Measured, standard error and prediction, with the 95 % interval."""
     value, deviation = error.get("measured"), error.get("standard_error")
@@ -352,17 +334,19 @@ _RATE_WORDS = {"mean": "of means", "second_moment": "of second moments", "graph"
 def print_bag_difference(document: dict[str, Any], console: Console) -> None:
     """Print a document of ``bag_difference``."""
     a, b = document["a"], document["b"]
-    facts = number_table(console, "Runs", "", "A", "B")
-    for key in ("bag", "experiment", "seed", "steps"):
-        facts.add_row(key, *(Text(str(side[key])) for side in (a, b)))
-    facts.add_row("states missing", *(Text(_missing(side)) for side in (a, b)))
-    facts.add_row("verdict", *(Text(side["verdict"] or "none") for side in (a, b)))
-    print_table(console, facts)
+    rows = [(key, str(a[key]), str(b[key])) for key in ("bag", "experiment", "seed", "steps")]
+    rows += [("states missing", _missing(a), _missing(b)), ("verdict", a["verdict"] or "none", b["verdict"] or "none")]
+    print_rows(console, "Runs", ("", "A", "B"), rows)
     _print_keys("Experiment", document["keys"], console)
     _print_keys("Versions", document["versions"], console)
     for line in _states(document):
         console.print(Text(line))
-    _print_error_differences(document["errors"], _names(document), console)
+    errors, heads = document["errors"], ("A", "B", "B - A", "in standard errors")
+    agents = map(_measured, errors["agents"])
+    title, system = "Measured mean-square errors", _measured(errors["system"])
+    print_errors(console, title, heads, system, agents, _names(document))
+    if not errors["independent"]:
+        console.print(Text("Both runs have the same seed: their errors are not independent.", style="dim"))
     _print_unpredicted(document, console)
 
 
@@ -379,17 +363,11 @@ def print_experiment_difference(document: dict[str, Any], console: Console) -> N
     _print_keys("Keys", document["keys"], console)
     _print_unpredicted(document, console)
     for law, errors in document["predictions"].items():
-        table = number_table(
-            console, f"Mean-square error in the steady state, {LAW_NAMES[law]}", "", "A", "B", "change"
-        )
-        table.add_row("system", *_relative(errors["system_error"]), end_section=True)
-        for place, error in enumerate(first_rows(table, errors["node_errors"], "agents"), start=1):
-            table.add_row(Text(agent_text(place, _names(document))), *_relative(error))
-        print_table(console, table)
-    table = number_table(console, "Decay rates of the steps of the run", "", "A", "B", "change")
-    for key, title in _RATE_WORDS.items():
-        table.add_row(title, *_relative(document["rates"][key]))
-    print_table(console, table)
+        title, system = f"Mean-square error in the steady state, {LAW_NAMES[law]}", _relative(errors["system_error"])
+        agents = map(_relative, errors["node_errors"])
+        print_errors(console, title, ("A", "B", "change"), system, agents, _names(document))
+    rows = [[title, *_relative(document["rates"][key])] for key, title in _RATE_WORDS.items()]
+    print_rows(console, "Decay rates of the steps of the run", ("", "A", "B", "change"), rows)
     leaders = number_table(console, "Leaders", "", "agents", "gain", "system error")
     for name, key in (("A", "a"), ("B", "b")):
         side, names = document["leaders"][key], document[key]["names"]
@@ -432,8 +410,9 @@ def _states(document: dict[str, Any]) -> list[str]:
     elif first is None:
         lines.append(f"States: equal to the last bit up to x({states['compared']}), where both runs have them")
     else:
+        named = listed([agent_name(agent, names) for agent in first["agents"]])
         everybody = len(first["agents"]) == document["a"]["agents"]
-        agents = "all agents" if everybody else _agent_list(first["agents"], names)
+        agents = "all agents" if everybody else f"agent{'s' * (len(first['agents']) > 1)} {named}"
         agent = agent_text(largest["agent"], names)
         lines += [
             f"States: first difference at step {first['step']} (time {number_text(first['time'])}), {agents}, by "
@@ -455,16 +434,6 @@ def _states(document: dict[str, Any]) -> list[str]:
     else:
         lines.append("Graphs: equal in all steps that both runs have")
     return lines
-
-
-def _print_error_differences(errors: dict[str, Any], names: Sequence[str] | None, console: Console) -> None:
-    table = number_table(console, "Measured mean-square errors", "", "A", "B", "B - A", "in standard errors")
-    table.add_row("system", *_measured(errors["system"]), end_section=True)
-    for place, error in enumerate(first_rows(table, errors["agents"], "agents"), start=1):
-        table.add_row(Text(agent_text(place, names)), *_measured(error))
-    print_table(console, table)
-    if not errors["independent"]:
-        console.print(Text("Both runs have the same seed: their errors are not independent.", style="dim"))
 
 
 def _measured(error: dict[str, Any]) -> list[str]:
@@ -492,7 +461,3 @@ def _names(document: dict[str, Any]) -> list[str] | None:
     """The names of the agents, where both have the same ones."""
     names: list[str] | None = document["a"]["names"]
     return names if names == document["b"]["names"] else None
-
-
-def _agent_list(agents: Sequence[int], names: Sequence[str] | None) -> str:
-    return f"{'agent' if len(agents) == 1 else 'agents'} {listed([agent_name(agent, names) for agent in agents])}"

@@ -7,21 +7,25 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from msg_analysis.bags.files import FileInventory, total_channels
 from msg_analysis.bags.reading import read_bag
+from msg_analysis.bags.writing import recording_pid
 from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import agent_name
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import loading, validation
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.experiment.graphs import Graph
 from msg_analysis.inference.autocovariance import (
     LoggedAutocovariance,
     LoggedDensity,
@@ -39,7 +43,6 @@ from msg_analysis.theory.spectrum import Spectrum, spectrum
 from msg_analysis.theory.transient import TransientLaw, point_start, solve_transient, start_of
 
 if TYPE_CHECKING:
-    from msg_analysis.bags.files import FileInventory
     from msg_analysis.bags.salvage import SalvageReport
 
 
@@ -83,7 +86,6 @@ def measure_spectrum(bag: Path, level: float) -> MeasuredSpectrum:
     experiment = trajectory.record.experiment
     experiment.require_available("predict")
     prediction = predict(experiment, trajectory.record.step_model)
-    predicted, complete = spectrum(prediction), trajectory.completeness.complete
     observation = Observation.of(trajectory, prediction)
     reason = why_not_tested(observation)
     density = LoggedDensity.of(observation) if observation.steps >= 8 else None
@@ -95,7 +97,7 @@ def measure_spectrum(bag: Path, level: float) -> MeasuredSpectrum:
         note = "the log is not tested: lost messages make too many kinds of steps"
     elif log.steps < observation.steps:
         note = f"the first {log.steps} of {observation.steps} steps are tested"
-    return MeasuredSpectrum(predicted, level, log, density, note, complete)
+    return MeasuredSpectrum(spectrum(prediction), level, log, density, note, trajectory.completeness.complete)
 
 
 Result = TypeVar("Result")
@@ -110,10 +112,7 @@ def describe_transient(
     moments: bool = False,
     fraction: float = 0.05,  # of the steady system error, for the settling time
 ) -> dict[str, Any]:
-    """The document of ``msg-analysis transient``: moments, settling time, rates; arguments of ``solve_transient``.
-
-    In discrete time its law is "discrete". With ``moments``, nu(t) and c(t) of every mode are in it, too.
-    """
+    """The document of ``transient``, with the arguments of ``solve_transient``; ``moments``: of every mode, too."""
     solved = solve_transient(experiment, times, law=law, unreduced=unreduced)
     found = solved.course
     document: dict[str, Any] = {
@@ -126,9 +125,8 @@ def describe_transient(
         "graph_law": found.laws.tolist(),
         "mean": found.mean.tolist(),
     }
-    document |= dict(
-        zip(_mean_squares(document), (found.system_error.tolist(), found.node_errors.tolist()), strict=True)
-    )
+    system, nodes = _mean_squares(document)
+    document |= {system: found.system_error.tolist(), nodes: found.node_errors.tolist()}
     document |= _settling(experiment, solved.system, solved.steady, solved.unit or 1.0, fraction)
     if moments:
         document["mode_means"] = found.mode_means.tolist()
@@ -161,11 +159,7 @@ def _settling(
 
 
 def describe_facts(experiment: Experiment) -> dict[str, Any]:
-    """The document of ``msg-analysis facts``: lemmas, bounds, indices of the graphs, two graphs in closed form.
-
-    None: a graph that is directed or disconnected; the closed form unless two graphs can each be held fixed; what the
-    network is too large for, with the reason in ``notes``.
-    """
+    """The document of ``facts``; None: of a graph, of another number of graphs, or too large (``notes``)."""
     prediction = predict(experiment)
     laws = {"discrete" if experiment.time == "discrete" else "emulated": prediction.system}
     if prediction.continuous_moments is not None:
@@ -204,15 +198,13 @@ def write_transient_csv(document: dict[str, Any], path: Path) -> None:
     header += [f"{nodes.removesuffix('s').replace('_', ' ')} of agent {i}" for i in agents]
     keys = ("times", "graph_law", "mean", system, nodes)
     rows = zip(*(document[key] for key in keys), strict=True)
-    temporary = path.with_name(path.name + ".part")
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(header)
+    writer.writerows([time, *law, *mean, error, *errors] for time, law, mean, error, errors in rows)
     try:
-        with temporary.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(header)
-            writer.writerows([time, *law, *mean, error, *errors] for time, law, mean, error, errors in rows)
-        temporary.replace(path)
+        write_whole(path, text.getvalue().encode())
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written ({error.strerror}): choose another place") from error
 
 
@@ -222,16 +214,20 @@ def _mean_squares(document: dict[str, Any]) -> tuple[str, str]:
 
 
 def describe_experiment(experiment: Experiment) -> dict[str, Any]:
-    """The document of ``msg-analysis info EXPERIMENT --json``; the experiment need not be one that can be run.
-
-    None: infinite or not computable; a stability limit with a delay or a protocol is not known. Memory in bytes.
-    """
+    """The document of ``info EXPERIMENT``, also of one that cannot be run; None: infinite or not known."""
     document = experiment.to_document()
     chain = experiment.chain
     states, matrices = loading.memory_needed(
         experiment.agents, chain.modes, experiment.steps, experiment.width, experiment.noise.delay, experiment.truth
     )
-    limits = [_stability_limit(experiment, graph) for graph in experiment.graph_list]
+    limits: list[float | None] = [None] * chain.modes
+    if experiment.time != "discrete" and not experiment.noise.delay and not experiment.protocol:
+        found = (validation.stability_limit(graph, experiment.leader_gains) for graph in experiment.graph_list)
+        limits = [limit if math.isfinite(limit) else None for limit in found]
+    predicted = None
+    with suppress(InputError):  # experiments without a prediction are described, too
+        experiment.require_available("predict")
+        predicted = predict(experiment).emulated.system_error
     return {
         "name": experiment.name,
         "problem": experiment.problem,
@@ -258,20 +254,14 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
             )
         ],
         "stability_limit": min((limit for limit in limits if limit is not None), default=None),
-        "predicted_system_error": _predicted_system_error(experiment),
+        "predicted_system_error": predicted,
         "memory": {"states": states, "matrices": matrices},
         "unavailable": validation.unavailable(experiment),
     }
 
 
 def describe_bag(path: Path) -> dict[str, Any]:
-    """The document of ``msg-analysis info BAG --json``, for a whole or a torn bag; keys in docs/commands.md.
-
-    InputError if no file of it can be read; a bag that is not a run has a ``problem``, and None for the run's keys.
-    """
-    from msg_analysis.bags.files import total_channels  # imported here: experiments do not need it
-    from msg_analysis.bags.writing import recording_pid
-
+    """The document of ``info BAG``, also of a torn one; InputError if no file of it can be read."""
     inventory: list[FileInventory] = []
     run = _describe_run(path, inventory)
     entries = {entry.file.path: entry for entry in inventory}
@@ -293,46 +283,28 @@ def describe_bag(path: Path) -> dict[str, Any]:
     }
 
 
-def _describe_run(path: Path, inventory: list[FileInventory]) -> dict[str, Any]:
-    from msg_analysis.bags.reading import read_bag
+_OF_RUN = (
+    *("run", "experiment", "seed", "agents", "names", "replicas", "steps", "simulated_time"),
+    *("completeness", "prefix", "protocol"),
+)
 
+
+def _describe_run(path: Path, inventory: list[FileInventory]) -> dict[str, Any]:
     try:
         trajectory = read_bag(path, inventory)
     except InputError as error:
         if all(entry.problem for entry in inventory):
             raise
-        keys = (
-            "run",
-            "experiment",
-            "seed",
-            "agents",
-            "names",
-            "replicas",
-            "steps",
-            "simulated_time",
-            "completeness",
-            "prefix",
-        )
-        return {"problem": str(error), **dict.fromkeys(keys), "protocol": None, "versions": {}}
-    record = trajectory.record
-    run = record.experiment.run
-    completeness = trajectory.completeness
-    return {
-        "problem": None,
-        "run": str(record.run),
-        "experiment": record.experiment.name,
-        "seed": run.seed,
-        "agents": record.experiment.agents,
-        "names": record.experiment.names,
-        "replicas": run.replicas,
-        "steps": record.experiment.steps,
-        "simulated_time": run.duration,
-        "completeness": dataclasses.asdict(completeness)
-        | {"complete": completeness.complete, "stretch": trajectory.stretch},
-        "prefix": trajectory.prefix,
-        "protocol": _protocol(record.experiment),
-        "versions": record.versions,
-    }
+        return {"problem": str(error), **dict.fromkeys(_OF_RUN), "versions": {}}
+    record, count = trajectory.record, trajectory.completeness
+    experiment = record.experiment
+    values = (
+        *(str(record.run), experiment.name, experiment.run.seed, experiment.agents, experiment.names),
+        *(experiment.run.replicas, experiment.steps, experiment.run.duration),
+        dataclasses.asdict(count) | {"complete": count.complete, "stretch": trajectory.stretch},
+        *(trajectory.prefix, _protocol(experiment)),
+    )
+    return {"problem": None, **dict(zip(_OF_RUN, values, strict=True)), "versions": record.versions}
 
 
 def _describe_file(entry: FileInventory) -> dict[str, Any]:
@@ -350,32 +322,16 @@ def _describe_file(entry: FileInventory) -> dict[str, Any]:
 
 
 def describe_salvage(out: Path, report: SalvageReport) -> dict[str, Any]:
-    """The document of ``msg-analysis salvage --json``: the report's fields, and the run read from the new bag."""
+    """The document of ``salvage``: the report's fields, and the run read from the new bag."""
     return {"bag": str(out), **dataclasses.asdict(report), **_describe_run(out, [])}
 
 
 def _protocol(experiment: Experiment) -> dict[str, Any] | None:
-    """The protocol of the agents; None for the built-in law."""
     protocol = experiment.protocol
-    if protocol is None:
+    if protocol is None:  # the built-in law
         return None
     parameters = experiment.to_document()["protocol"]
     return protocol.info.to_json() | {
         "parameters": {key: value for key, value in parameters.items() if key != "name"},
         "absent": protocol.absent,
     }
-
-
-def _stability_limit(experiment: Experiment, graph: Graph) -> float | None:
-    if experiment.time == "discrete" or experiment.noise.delay or experiment.protocol:
-        return None
-    limit = validation.stability_limit(graph, experiment.leader_gains)
-    return limit if math.isfinite(limit) else None
-
-
-def _predicted_system_error(experiment: Experiment) -> float | None:
-    try:
-        experiment.require_available("predict")
-        return predict(experiment).emulated.system_error
-    except InputError:  # experiments without a prediction are described, too
-        return None

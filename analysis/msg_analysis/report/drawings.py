@@ -42,10 +42,7 @@ def plus_minus(measured: float | None, interval: Sequence[float | None]) -> str:
 
 
 def interval_bars(estimates: Sequence[Mapping[str, Any]]) -> list[Markup]:
-    """A bar per estimate, relative to its prediction, which is in the middle; all have the same scale.
-
-    Empty where nothing is measured or predicted.
-    """
+    """A bar per estimate around its prediction, all on one scale; empty where nothing is measured or predicted."""
     ends = [_relative(estimate) for estimate in estimates]
     reach = max((abs(value) for found in ends if found for value in found), default=0.0)
     reach = 1.05 * max(reach, _LEAST_REACH)
@@ -80,10 +77,8 @@ def _bar(estimate: Mapping[str, Any], found: tuple[float, ...] | None, reach: fl
     )
 
 
-MOST_GRAPHS = 8
-"""Most graphs that are drawn."""
-MOST_MODES = 6
-"""Most graphs whose chain is drawn; with more, the report has a table of the rates."""
+MOST_GRAPHS = 8  # that are drawn
+MOST_MODES = 6  # graphs whose chain is drawn; with more, the report has a table of the rates
 MARK = ' class="candidate"'
 _SIDE = 200.0
 _WEIGHTS = 5  # different line widths
@@ -91,22 +86,17 @@ _WEIGHTS = 5  # different line widths
 
 def graph_drawings(experiment: Experiment, candidates: Candidates = NOBODY) -> list[Markup]:
     """The first ``MOST_GRAPHS`` graphs, each agent at the same place in all of them; leaders are squares."""
-    where = _scaled(places(experiment.graph_list), experiment.agents)
+    found = places(experiment.graph_list)
+    where = np.array([found[agent] for agent in range(experiment.agents)], dtype=float)
+    low, high = where.min(axis=0), where.max(axis=0)
+    where = (where - (low + high) / 2) * (_SIDE - 44.0) / max(float((high - low).max()), 1e-9)
+    where[:, 1] *= -1  # downwards
+    where = where + _SIDE / 2
     leaders = set(experiment.spec.leaders.agents) if experiment.spec.leaders else set()
     return [
         _graph(graph, where, graph_variable(mode), leaders, candidates, experiment.names)
         for mode, graph in enumerate(experiment.graph_list[:MOST_GRAPHS])
     ]
-
-
-def _scaled(where: Mapping[int, FloatArray], agents: int) -> FloatArray:
-    """(m, 2) positions within the square, y downwards."""
-    points = np.array([where[agent] for agent in range(agents)], dtype=float).reshape(agents, 2)
-    low, high = points.min(axis=0), points.max(axis=0)
-    room = _SIDE - 44.0
-    points = (points - (low + high) / 2) * room / max(float((high - low).max()), 1e-9)
-    points[:, 1] *= -1
-    return np.asarray(points + _SIDE / 2)
 
 
 def _graph(
@@ -122,27 +112,22 @@ def _graph(
     ]
     for agent, (x, y) in enumerate(where, start=1):
         name = agent_name(agent, names)
-        kind = "leader, agent" if agent in leaders else "agent"
-        shape = (
-            f'<rect x="{x - radius:.1f}" y="{y - radius:.1f}" width="{2 * radius:g}" height="{2 * radius:g}"'
-            if agent in leaders
-            else f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}"'
-        )
+        kind, shape = "agent", f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}"'
+        if agent in leaders:
+            kind, size = "leader, agent", f'width="{2 * radius:g}" height="{2 * radius:g}"'
+            shape = f'<rect x="{x - radius:.1f}" y="{y - radius:.1f}" {size}'
         senders: list[int] = (np.flatnonzero(graph.adjacency[agent - 1]) + 1).tolist()
-        named = (
-            ", ".join(agent_name(other, names) for other in senders[:20]) + (", …" if len(senders) > 20 else "")
-            if senders
-            else "no agent"
-        )
+        named = ", ".join(agent_name(other, names) for other in senders[:20]) or "no agent"
+        named += ", …" if len(senders) > 20 else ""
         parts.append(
             f'<g>{shape} fill="var(--page)" stroke="{colour}" stroke-width="1.5"'
             f"{MARK if agent in candidates.agents else ''}/>"
             f"<title>{escape(f'{kind} {name} receives from {named}')}</title>"
         )
         if graph.agents <= LABELLED:
-            size = radius * min(1.0, 2.4 / len(name)) if names else radius if agent < 100 else 0.8 * radius
+            font = radius * min(1.0, 2.4 / len(name)) if names else radius if agent < 100 else 0.8 * radius
             parts.append(
-                f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" text-anchor="middle" dominant-baseline="central" '
+                f'<text x="{x:.1f}" y="{y:.1f}" font-size="{font:g}" text-anchor="middle" dominant-baseline="central" '
                 f'fill="var(--ink)" pointer-events="none">{escape(shorten(name, 8))}</text>'
             )
         parts.append("</g>")
@@ -168,7 +153,7 @@ def _links(
     thin = 0.25 if len(links) > 400 else 0.5 if len(links) > 60 else 1.0
     drawn = [
         f'<path d="{"".join(paths)}" fill="none" stroke="{colour}" stroke-opacity=".8" '
-        f'stroke-width="{thin * _line_width(width / _WEIGHTS):.2f}"/>'
+        f'stroke-width="{thin * (0.6 + 2.6 * width / _WEIGHTS):.2f}"/>'
         for width, paths in sorted(lines.items())
     ]
     return drawn + ([f'<path d="{"".join(heads)}" fill="{colour}"/>'] if heads else [])
@@ -185,20 +170,12 @@ def _marked_links(marked: set[tuple[int, int]], links: list[tuple[int, int, floa
     ]
 
 
-def _line_width(share: float) -> float:
-    """Width of a link whose weight is this share of the heaviest one."""
-    return 0.6 + 2.6 * share
-
-
 def _at(point: FloatArray) -> str:
     return f"{point[0]:.1f} {point[1]:.1f}"
 
 
 def chain_drawing(experiment: Experiment, candidates: Candidates = NOBODY) -> Markup | None:
-    """The chain: a circle per graph, an arrow per rate (or probability) from one to another.
-
-    None for a single graph, and for more than ``MOST_MODES``.
-    """
+    """A circle per graph, an arrow per rate or probability; None for a single graph, and more than ``MOST_MODES``."""
     chain, modes = experiment.chain, len(experiment.graph_list)
     if not 1 < modes <= MOST_MODES:
         return None
@@ -271,10 +248,7 @@ def explain(experiment: Experiment) -> list[str]:
 
 
 def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
-    """Of every graph: ``name``, ``links``, ``directed``, ``connectivity``, ``share`` (predicted, of time), ``held``.
-
-    ``held`` is the mean holding time [units of simulated time]; None for a graph that is never left.
-    """
+    """Of every graph; ``share``: of time; ``held``: mean holding time [units of simulated time], None: never left."""
     rows = zip(experiment.graph_list, experiment.chain.stationary, experiment.chain.holding_times, strict=True)
     return [
         {
@@ -315,11 +289,8 @@ def _switching(experiment: Experiment) -> str:
     if modes == 1:
         return f"The graph is always {experiment.graph_list[0].name}."
     first = experiment.switching.initial
-    begin = (
-        "The first graph is drawn from the stationary distribution."
-        if first == "stationary"
-        else f"The first graph is {first}."
-    )
+    begin = "drawn from the stationary distribution" if first == "stationary" else first
+    begin = f"The first graph is {begin}."
     if chain.time == "discrete":
         return f"The graph switches between {modes} graphs: a Markov chain that may jump in every step. {begin}"
     times = [time for time in experiment.chain.holding_times if time is not None]
@@ -366,13 +337,10 @@ def _run(experiment: Experiment) -> str:
     replicas = "1 replica" if run.replicas == 1 else f"{run.replicas} independent replicas on the same graph path"
     start = {"stationary": "the steady state", "zero": "0"}
     begun = start[run.start] if isinstance(run.start, str) else "given values"
+    pace = "Lockstep: all agents use values of the same step."
     if run.pace == "realtime":
-        pace = (
-            f"Real time: the timer of each agent starts {run.speed / experiment.step_length:.3g} steps per second, "
-            "with the newest values received."
-        )
-    else:
-        pace = "Lockstep: all agents use values of the same step."
+        rate = f"{run.speed / experiment.step_length:.3g} steps per second"
+        pace = f"Real time: the timer of each agent starts {rate}, with the newest values received."
     return (
         f"The run has {experiment.steps} steps of {experiment.step_length:g} ({run.duration:g} units of simulated "
         f"time) and {replicas}, and starts from {begun}. {pace}"

@@ -15,7 +15,6 @@ from bokeh.models import (
     ColorBar,
     ColumnDataSource,
     FixedTicker,
-    HoverTool,
     Legend,
     LegendItem,
     LinearColorMapper,
@@ -42,12 +41,12 @@ from msg_analysis.report.plot_style import (
     SKY,
     VERMILLION,
     Candidates,
-    agent_ticker,
-    mark_agents,
+    agent_figure,
     name_agents,
     new_figure,
     place_legend,
     plain_legend,
+    show_values,
 )
 
 MOST_DECADES = 12  # of evidence, shown either way
@@ -72,7 +71,7 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
     if error.any():
         rows += [("95 % band", "@low{0.0000} … @high{0.0000}"), ("z", "@z{+0.00}")]
     line = plot.line("time", "mean", source=source, color=BLUE, line_width=2, legend_label="measured up to this time")
-    plot.add_tools(HoverTool(renderers=[line], mode="vline", tooltips=rows, line_policy="nearest"))
+    show_values(plot, [line], rows, mode="vline", line_policy="nearest")
     # The earliest values are mostly noise, and would flatten the rest.
     late = time >= time[-1] / 50
     bottom, top = min(mean[late].min(), low[late].min()), max(mean[late].max(), high[late].max())
@@ -85,30 +84,22 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
 def evidence(time: FloatArray, logarithms: FloatArray, threshold: float, crossed: float | None) -> UIElement:
     """The evidence against the prediction after some steps, (points,) each, its threshold, and when it was exceeded."""
     shown = np.clip(logarithms, -MOST_DECADES * np.log(10.0), MOST_DECADES * np.log(10.0))
-    plot = new_figure(
-        230,
-        x_axis_label="simulated time",
-        y_axis_label="evidence",
-        x_range=(0.0, float(time[-1])),
-        y_axis_type="log",
-    )
+    x_range = (0.0, float(time[-1]))
+    plot = new_figure(230, x_axis_label="simulated time", y_axis_label="evidence", x_range=x_range, y_axis_type="log")
     source = ColumnDataSource({"time": time, "evidence": np.exp(shown)})
     line = plot.line("time", "evidence", source=source, color=BLUE, line_width=2)
     plot.add_layout(Span(location=threshold, dimension="width", line_color=VERMILLION, line_dash="dashed"))
     if crossed is not None:
         plot.add_layout(Span(location=crossed, dimension="height", line_color=VERMILLION, line_dash="dotted"))
-    tooltips = [("time", "@time{0.[00]}"), ("evidence", "@evidence{0.000 a}")]
-    plot.add_tools(HoverTool(renderers=[line], mode="vline", tooltips=tooltips, line_policy="nearest"))
+    rows = [("time", "@time{0.[00]}"), ("evidence", "@evidence{0.000 a}")]
+    show_values(plot, [line], rows, mode="vline", line_policy="nearest")
     low, high = float(shown.min()), max(float(shown.max()), float(np.log(threshold)))
     plot.y_range = Range1d(float(np.exp(low - 0.7)), float(np.exp(high + 0.7)))
     return plot
 
 
 def node_errors(
-    nodes: Sequence[Mapping[str, Any]],
-    level: float,
-    candidates: Candidates = NOBODY,
-    names: Sequence[str] | None = None,
+    nodes: Sequence[Mapping[str, Any]], level: float, candidates: Candidates, names: Sequence[str] | None
 ) -> UIElement:
     """Node errors with 95 % intervals next to the predicted ones; marked if p < ``level``; agents can be chosen."""
     agents = np.arange(1, len(nodes) + 1)
@@ -130,17 +121,8 @@ def node_errors(
         "marker": np.where(apart, "square", "circle"),
     }
     source = ColumnDataSource(data, name="nodes")
-    plot = new_figure(
-        270,
-        "box_zoom,tap,box_select,pan,wheel_zoom,reset,save",
-        x_axis_label="agent",
-        y_axis_label="mean-square error",
-        x_range=(0.3, len(nodes) + 0.7),
-    )
-    plot.xaxis.ticker = agent_ticker()
-    plot.xgrid.grid_line_color = None
-    name_agents(plot.xaxis, names)
-    mark_agents(plot, candidates.involved)
+    tools = "box_zoom,tap,box_select,pan,wheel_zoom,reset,save"
+    plot = agent_figure(270, len(nodes), names, candidates.involved, tools, y_axis_label="mean-square error")
     rows = [("agent", "@name"), ("measured", "@measured{0.0000}")]
     size = float(np.clip(220 / len(nodes), 5, 11))
     if not np.isnan(predicted).all():
@@ -158,7 +140,7 @@ def node_errors(
     points = plot.scatter(
         "agent", "measured", source=source, marker="marker", size=size, color="colour", nonselection_alpha=0.25
     )
-    plot.add_tools(HoverTool(renderers=[points], tooltips=rows))
+    show_values(plot, [points], rows)
     ends = np.concatenate([measured, predicted, data["low"], data["high"]])
     if not np.isnan(ends).all():
         margin = 0.08 * float(np.nanmax(ends) - np.nanmin(ends)) or 1.0
@@ -177,14 +159,11 @@ def node_errors(
 
 def agent_convergence(
     states: FloatArray,  # (steps, m, replicas), without gaps
-    reference: float | None,
+    reference: float | None,  # None: the mean of the agents
     dt: float,  # [units of simulated time]
     nodes: Sequence[Mapping[str, Any]],
 ) -> UIElement | None:
-    """Measured node errors of the chosen agents over time, relative to the predicted ones.
-
-    None where nothing is predicted or measured. A reference of None stands for the mean of the agents.
-    """
+    """Measured node errors of the chosen agents over time, relative to the predicted ones; None: there are none."""
     predicted, error = _column(nodes, "predicted"), _column(nodes, "standard_error")
     if len(states) < 2 or not (np.nan_to_num(predicted) > 0).any():
         return None
@@ -219,7 +198,7 @@ def agent_convergence(
     )
     plain_legend(plot.legend[0])
     rows = [("", "@agent"), ("time", "$data_x{0.[00]}"), ("measured / predicted", "$data_y{0.000}")]
-    plot.add_tools(HoverTool(renderers=[drawn], tooltips=rows, line_policy="nearest"))
+    show_values(plot, [drawn], rows, line_policy="nearest")
     # Sources that no glyph uses reach the page as tags.
     plot.tags = [everything, times, widths]
     return plot
@@ -228,8 +207,8 @@ def agent_convergence(
 def innovation_sizes(
     ratios: FloatArray,  # (m,); NaN for an agent without noise
     samples: int,  # innovations per agent
-    candidates: Candidates = NOBODY,
-    names: Sequence[str] | None = None,
+    candidates: Candidates,
+    names: Sequence[str] | None,
 ) -> UIElement:
     """Variance of each agent's one-step residuals relative to the predicted one, and where 95 % of such ratios lie."""
     agents = np.arange(1, len(ratios) + 1)
@@ -242,44 +221,27 @@ def innovation_sizes(
         "colour": np.where(inside, BLUE, VERMILLION),
         "marker": np.where(inside, "circle", "square"),
     }
-    plot = new_figure(200, x_axis_label="agent", y_axis_label="variance / predicted", x_range=(0.3, len(ratios) + 0.7))
-    plot.xaxis.ticker = agent_ticker()
-    plot.xgrid.grid_line_color = None
-    name_agents(plot.xaxis, names)
-    mark_agents(plot, candidates.agents)
+    plot = agent_figure(200, len(ratios), names, candidates.agents, y_axis_label="variance / predicted")
     ends = np.array([0.3, len(ratios) + 0.7])
     plot.varea(ends, np.full(2, 1 - half), np.full(2, 1 + half), color=SKY, alpha=0.3, legend_label="95 % band")
     plot.line(ends, np.ones(2), color=BLACK, line_dash="dashed", legend_label="predicted")
     points = plot.scatter(
         "agent", "ratio", source=data, marker="marker", size=float(np.clip(220 / len(ratios), 5, 10)), color="colour"
     )
-    plot.add_tools(
-        HoverTool(renderers=[points], tooltips=[("agent", "@name"), ("variance / predicted", "@ratio{0.0000}")])
-    )
+    show_values(plot, [points], [("agent", "@name"), ("variance / predicted", "@ratio{0.0000}")])
     reach = 1.25 * max(float(np.nanmax(np.abs(ratios - 1.0), initial=0.0)), half)
     plot.y_range = Range1d(max(1 - reach, 0.0), 1 + reach)
     place_legend(plot)
     return plot
 
 
-def lateness(timing: Mapping[str, Any]) -> UIElement:
-    """Histogram of how late the steps of a run in real time were; ``timing`` of a comparison."""
-    histogram = timing["histogram"]
-    return _histogram(histogram["lateness_ms"], histogram["steps"], TIMES["lateness_ms"], "steps", timing["period_ms"])
-
-
-def staleness(timing: Mapping[str, Any]) -> UIElement:
-    """Histogram of the age of the neighbours' values that a run in real time used; ``timing`` of a comparison."""
-    histogram, label = timing["histogram"], TIMES["staleness_ms"]
-    return _histogram(histogram["staleness_ms"], histogram["uses"], label, "values used", timing["period_ms"])
-
-
-def _histogram(
-    edges: Sequence[float], counts: Sequence[int], label: str, what: Literal["steps", "values used"], period: float
-) -> Any:
-    left, right, count = np.array(edges[:-1]), np.array(edges[1:]), np.array(counts)
-    beyond = (left >= period) & (what == "steps")
-    plot = new_figure(250, x_axis_label=label, y_axis_label=what, min_border_right=12)
+def histogram(timing: Mapping[str, Any], key: Literal["lateness_ms", "staleness_ms"]) -> UIElement:
+    """How late the steps of a run in real time were, or how old the neighbours' values that they used."""
+    found, period, steps = timing["histogram"], timing["period_ms"], key == "lateness_ms"
+    left, right = np.array(found[key][:-1]), np.array(found[key][1:])
+    count, what = (np.array(found["steps"]), "steps") if steps else (np.array(found["uses"]), "values used")
+    beyond = (left >= period) & steps
+    plot = new_figure(250, x_axis_label=TIMES[key], y_axis_label=what, min_border_right=12)
     # log10(count + 1): an empty bar has height 0.
     data = {
         "left": left,
@@ -289,7 +251,7 @@ def _histogram(
         "colour": np.where(beyond, VERMILLION, BLUE),
     }
     bars = plot.quad("left", "right", "height", 0, source=data, color="colour", line_color=PAGE, line_width=0.5)
-    plot.add_tools(HoverTool(renderers=[bars], tooltips=[("ms", "@left{0.00} to @right{0.00}"), (what, "@count")]))
+    show_values(plot, [bars], [("ms", "@left{0.00} to @right{0.00}"), (what, "@count")])
     most = max(int(count.max(initial=0)), 1)
     ticks = [0, *(10**power for power in range(len(str(most))))]
     plot.yaxis.ticker = FixedTicker(ticks=[float(np.log10(tick + 1.0)) for tick in ticks])
@@ -299,7 +261,7 @@ def _histogram(
     plot.x_range = Range1d(left[0] - period / 100, 1.02 * max(right[-1], period if far else period / 20))
     plot.xgrid.grid_line_color = None
     if far:
-        name = "deadline" if what == "steps" else "one period"
+        name = "deadline" if steps else "one period"
         top = float(np.log10(most + 1.0))
         plot.line([period] * 2, [0.0, top], color=BLACK, line_width=1.5, line_dash="dashed", legend_label=name)
         place_legend(plot)
@@ -376,7 +338,7 @@ def _panel(
     panel.xaxis.axis_label = "agent"
     name_agents(panel.axis, names)
     image = panel.image(key, x=0.5, y=0.5, dw=agents, dh=agents, color_mapper=mapper, source=source)
-    panel.add_tools(HoverTool(renderers=[image], tooltips=rows))
+    show_values(panel, [image], rows)
     if agents <= _NUMBERED:
         _write_numbers(panel, matrix, mapper.high, 1 if key == "z" else None)
     _mark(panel, agents, candidates)
@@ -403,9 +365,8 @@ def _write_numbers(panel: Any, matrix: FloatArray, limit: float, decimals: int |
 
 def _mark(panel: Any, agents: int, candidates: Candidates) -> None:
     """Frames around rows and columns of the agents, and entries of the links, that the verdict names."""
-    frames = [(agent, agent, 1, agents) for agent in candidates.agents] + [
-        (1, agents, agent, agent) for agent in candidates.agents
-    ]
+    frames = [(agent, agent, 1, agents) for agent in candidates.agents]
+    frames += [(1, agents, agent, agent) for agent in candidates.agents]
     for first, second in candidates.entries:
         frames += [(first, first, second, second), (second, second, first, first)]
     for top, bottom, left, right in frames:

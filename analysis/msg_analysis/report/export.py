@@ -1,9 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Runs as tables, data frames and files for other programs.
-
-The tables of a run: states, graphs and errors, in pieces, so that a run may be longer than the memory.
+"""Runs as tables, data frames and files for other programs, in pieces: a run may be longer than the memory.
 
 Agents, graphs and replicas count from 1, as in all files. What is missing is null.
 """
@@ -14,6 +12,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -37,24 +36,27 @@ ROWS = 2**17  # of a piece, or those of one step
 
 @dataclass(frozen=True, slots=True)
 class RunTable:
-    """One table: its name, its columns, and how many steps it has; ``pieces`` makes its rows."""
+    """One table of a run, in pieces."""
 
     name: str
     trajectory: Run
     schema: pa.Schema
-    steps: int
 
-    def pieces(self) -> Iterator[tuple[pa.RecordBatch, int]]:
+    @property
+    def steps(self) -> int:
+        """How many it has: a graph belongs to a step k -> k+1, the others to a state x(k)."""
+        return len(self.trajectory.modes if self.name == "graphs" else self.trajectory.states)
+
+    def pieces(self, rows: int = ROWS) -> Iterator[tuple[pa.RecordBatch, int]]:
         """The rows, step after step, and the step behind the last one of each piece."""
         import pyarrow as pa
 
-        rows = {"states": _states, "graphs": _graphs, "errors": _errors}[self.name]
         trajectory = self.trajectory
         wide = trajectory.values[:1].size if self.name == "states" else trajectory.states[:1].size
-        length = max(1, ROWS // max(wide, 1))
+        length = max(1, rows // max(wide, 1))
         for first in range(0, self.steps, length):
             end = min(first + length, self.steps)
-            columns = rows(trajectory, first, end)
+            columns = _COLUMNS[self.name](trajectory, first, end)
             arrays = [_arrow(columns[field.name], field.type) for field in self.schema]
             yield pa.RecordBatch.from_arrays(arrays, schema=self.schema), end
             for array in (trajectory.states, trajectory.published, trajectory.made):
@@ -63,37 +65,20 @@ class RunTable:
 
 
 def run_tables(trajectory: Run) -> list[RunTable]:
-    """Tables ``states`` (a row per state and replica), ``graphs`` (per step k -> k+1) and ``errors`` (per x(k)).
-
-    All columns are described in docs/commands.md.
-    """
+    """``states`` (a row per state and replica), ``graphs`` and ``errors``; their columns are in docs/commands.md."""
     import pyarrow as pa
 
-    experiment = trajectory.record.experiment
-    name = [("name", pa.string())] if experiment.names else []
-    numbers = ["state", *(f"state_{row}" for row in range(2, experiment.width // experiment.run.replicas + 1))]
-    others = [*(["published"] if trajectory.published is not None else []), *(["made"] if _timed(trajectory) else [])]
-    columns = {
-        "states": [
-            *(("step", pa.int64()), ("time", pa.float64()), ("agent", pa.int32()), *name, ("replica", pa.int32())),
-            *((number, pa.float64()) for number in [*numbers, *others]),
-        ],
-        "graphs": [("step", pa.int64()), ("time", pa.float64()), ("graph", pa.int32()), ("graph_name", pa.string())],
-        "errors": [
-            *(("step", pa.int64()), ("time", pa.float64()), ("system_error", pa.float64())),
-            *((f"error_{agent}", pa.float64()) for agent in range(1, experiment.agents + 1)),
-        ],
-    }
     about = {b"msg_analysis.run_record": trajectory.record.to_json().encode()}
-    lengths = {"states": len(trajectory.states), "graphs": len(trajectory.modes), "errors": len(trajectory.states)}
+    kinds = {"step": pa.int64(), "agent": pa.int32(), "replica": pa.int32(), "graph": pa.int32()}
+    kinds |= {"name": pa.string(), "graph_name": pa.string()}
     return [
-        RunTable(table, trajectory, pa.schema(fields, metadata=about), lengths[table])
-        for table, fields in columns.items()
+        RunTable(
+            table,
+            trajectory,
+            pa.schema([(name, kinds.get(name, pa.float64())) for name in columns(trajectory, 0, 0)], metadata=about),
+        )
+        for table, columns in _COLUMNS.items()
     ]
-
-
-def _timed(trajectory: Run) -> bool:
-    return trajectory.made is not None and trajectory.record.experiment.run.pace == "realtime"
 
 
 def _states(trajectory: Run, first: int, end: int) -> dict[str, Any]:
@@ -102,19 +87,15 @@ def _states(trajectory: Run, first: int, end: int) -> dict[str, Any]:
     states = trajectory.states[first:end]
     step = np.repeat(np.arange(first, end), agents * replicas)
     agent = np.tile(np.repeat(np.arange(agents), replicas), end - first)
-    columns: dict[str, Any] = {
-        "step": step,
-        "time": step * experiment.step_length,
-        "agent": agent + 1,
-        "replica": np.tile(np.arange(1, replicas + 1), (end - first) * agents),
-    }
+    columns: dict[str, Any] = {"step": step, "time": step * experiment.step_length, "agent": agent + 1}
     if experiment.names:
         columns["name"] = _Names(experiment.names, agent)
+    columns["replica"] = np.tile(np.arange(1, replicas + 1), (end - first) * agents)
     for row in range(states.shape[2] // replicas):
         columns[f"state_{row + 1}" if row else "state"] = states[:, :, row * replicas : (row + 1) * replicas].ravel()
     if trajectory.published is not None:
         columns["published"] = trajectory.published[first:end].ravel()
-    if trajectory.made is not None:
+    if trajectory.made is not None and experiment.run.pace == "realtime":
         made = trajectory.made[first:end].ravel()
         columns["made"] = np.repeat(np.where(made < 0, np.nan, made / SECOND), replicas)
     return columns
@@ -129,18 +110,24 @@ def _graphs(trajectory: Run, first: int, end: int) -> dict[str, Any]:
 
 
 def _errors(trajectory: Run, first: int, end: int) -> dict[str, Any]:
-    step = np.arange(first, end)
-    errors = square_errors(trajectory, first, end)
-    columns: dict[str, Any] = {"step": step, "time": step * trajectory.record.experiment.step_length}
-    columns["system_error"] = errors.sum(axis=1)
+    step, errors = np.arange(first, end), square_errors(trajectory, first, end)
+    columns = {
+        "step": step,
+        "time": step * trajectory.record.experiment.step_length,
+        "system_error": errors.sum(axis=1),
+    }
     return columns | {f"error_{agent + 1}": errors[:, agent] for agent in range(errors.shape[1])}
 
 
-def square_errors(trajectory: Run, first: int, end: int) -> FloatArray:
-    """(end - first, m) mean over the replicas of the squares by which states are off the mean or the reference.
+_COLUMNS: dict[str, Callable[[Run, int, int], dict[str, Any]]] = {
+    "states": _states,  # of the steps from one to another
+    "graphs": _graphs,
+    "errors": _errors,
+}
 
-    NaN where a state that is needed for it is missing. Their means over time are the measured errors of a comparison.
-    """
+
+def square_errors(trajectory: Run, first: int, end: int) -> FloatArray:
+    """(end - first, m) mean square over the replicas of the distances from the mean or the reference; NaN: unknown."""
     experiment = trajectory.record.experiment
     values = trajectory.values[first:end]
     middle = values.mean(axis=1, keepdims=True) if experiment.problem == "consensus" else experiment.reference
@@ -230,17 +217,18 @@ def write_recording(trajectory: Run, file: Path, shown: str) -> None:
         end = min(first + length, len(trajectory.states))
         tell(f"writing {shown}", end, len(trajectory.states))
         values, errors = trajectory.values[first:end], square_errors(trajectory, first, end)
+        send = partial(_send, rerun, recording, experiment.step_length, first)
         for agent, name in enumerate(names):
-            _send(rerun, recording, experiment.step_length, ("states", name), first, values[:, agent])
-            _send(rerun, recording, experiment.step_length, ("errors", name), first, errors[:, agent, None])
-        _send(rerun, recording, experiment.step_length, ("system_error",), first, errors.sum(axis=1)[:, None])
+            send(("states", name), values[:, agent])
+            send(("errors", name), errors[:, agent, None])
+        send(("system_error",), errors.sum(axis=1)[:, None])
         release(trajectory.states)
     _send_graphs(rerun, recording, trajectory, names)
     recording.flush()
     recording.disconnect()
 
 
-def _send(rerun: Any, recording: Any, dt: float, path: tuple[str, ...], first: int, values: Any) -> None:
+def _send(rerun: Any, recording: Any, dt: float, first: int, path: tuple[str, ...], values: Any) -> None:
     """Numbers (steps, k) of the steps from ``first`` on, those without gaps."""
     there = ~np.isnan(values).any(axis=1)
     steps, values = first + np.flatnonzero(there), values[there]
@@ -271,26 +259,22 @@ def _send_graphs(rerun: Any, recording: Any, trajectory: Run, names: list[str]) 
 
 Form = Literal["csv", "parquet", "npz", "rrd"]
 FORMS: tuple[Form, ...] = get_args(Form)
-ARRAY_FILE, RECORDING_FILE = "run.npz", "run.rrd"
 _OLDEST = (1980, 1, 1, 0, 0, 0)  # of files in an archive: the same run gives the same bytes
 
 
-def export_run(trajectory: Run, directory: Path, forms: Sequence[Form]) -> list[Path]:
-    """Write the files of these forms into a directory, made if need be; files of the same names are replaced.
-
-    InputError: a file cannot be written; NotAvailableError: the library for it is not installed.
-    """
+def export_run(trajectory: Run, directory: Path, forms: Sequence[Form], rows: int = ROWS) -> list[Path]:
+    """Write the files into a directory. InputError: one cannot be written; NotAvailableError: no library for it."""
     writers = {
-        directory / f"{table.name}.{form}": _table_writer(table, form)
+        directory / f"{table.name}.{form}": _table_writer(table, form, rows)
         for form in forms
         if form in ("csv", "parquet")
         for table in run_tables(trajectory)
     }
     if "npz" in forms:
-        writers[directory / ARRAY_FILE] = lambda file, shown: _write_arrays(trajectory, file, shown)
+        writers[directory / "run.npz"] = lambda file, shown: _write_arrays(trajectory, file, shown, rows)
     if "rrd" in forms:
         require_rerun()
-        writers[directory / RECORDING_FILE] = lambda file, shown: write_recording(trajectory, file, shown)
+        writers[directory / "run.rrd"] = lambda file, shown: write_recording(trajectory, file, shown)
     with _readable(directory):
         directory.mkdir(parents=True, exist_ok=True)
     for path in writers:
@@ -311,7 +295,7 @@ def _readable(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be written ({reason}): choose another place with --out") from error
 
 
-def _table_writer(table: RunTable, form: Form) -> Callable[[Path, str], None]:
+def _table_writer(table: RunTable, form: Form, rows: int) -> Callable[[Path, str], None]:
     def write(file: Path, shown: str) -> None:
         import pyarrow.csv
         import pyarrow.parquet
@@ -322,14 +306,14 @@ def _table_writer(table: RunTable, form: Form) -> Callable[[Path, str], None]:
         else:
             writer = pyarrow.parquet.ParquetWriter(file, table.schema, compression="zstd")
         with writer:
-            for rows, done in table.pieces():
+            for piece, done in table.pieces(rows):
                 tell(f"writing {shown}", done, table.steps)
-                writer.write_batch(rows)
+                writer.write_batch(piece)
 
     return write
 
 
-def _write_arrays(trajectory: Run, file: Path, shown: str) -> None:
+def _write_arrays(trajectory: Run, file: Path, shown: str, rows: int) -> None:
     """What ``numpy.savez`` writes, but in pieces; agents and graphs count from 0, as in Python."""
     experiment = trajectory.record.experiment
     small = {
@@ -352,7 +336,7 @@ def _write_arrays(trajectory: Run, file: Path, shown: str) -> None:
                     write(array[piece])
         shape = trajectory.states.shape[:2]
         with _entry(archive, "errors", shape, np.dtype(np.float64)) as write:
-            length = max(1, BLOCK_NUMBERS // max(1, trajectory.states[:1].size))
+            length = max(1, rows // max(1, trajectory.states[:1].size))
             for first in range(0, shape[0], length):
                 write(square_errors(trajectory, first, min(first + length, shape[0])))
                 release(trajectory.states)

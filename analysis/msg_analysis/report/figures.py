@@ -34,11 +34,10 @@ from msg_analysis.report.look import (
     LABELLED,
     LIGHT_GREY,
     LINE_COLOURS,
+    MODE_COLOURS,
     PALE,
     SKY,
     VERMILLION,
-    line_width,
-    mode_colour,
     shorten,
 )
 from msg_analysis.theory.prediction import Prediction
@@ -94,7 +93,7 @@ def draw_graph(
     arcs = graph.edges if graph.symmetric else graph.arcs
     network.add_weighted_edges_from((source - 1, target - 1, weight) for source, target, weight in arcs)
     heaviest = max((weight for _, _, weight in arcs), default=1.0)
-    widths = [line_width(weight / heaviest) for _, _, weight in arcs]
+    widths = [0.4 + 1.3 * weight / heaviest for _, _, weight in arcs]
     for shape, members in (("o", [i for i in range(agents) if i not in leaders]), ("s", sorted(leaders))):
         nx.draw_networkx_nodes(
             network, places, nodelist=members, ax=axes, node_size=size, node_color="white",
@@ -133,10 +132,7 @@ def stacked_panels(*sizes: float) -> tuple[NotebookFigure, Sequence[Axes]]:
 
 
 def run_figure(trajectory: Run, agents: Sequence[int] | None, replica: int) -> NotebookFigure:
-    """States of agents (from 0; None: the first ones) over time, and the graph of every step.
-
-    Of long runs, ``MOST_POINTS`` states at equal distances. InputError: no agent.
-    """
+    """States of agents (from 0; None: the first ones) over time, and the graph of every step. InputError: no agent."""
     experiment = trajectory.record.experiment
     chosen = list(range(min(experiment.agents, MOST_LINES)) if agents is None else agents)
     if not chosen:
@@ -170,7 +166,7 @@ def _draw_graphs(axes: Axes, trajectory: Run) -> None:
     for mode in range(len(names)):
         own = modes[starts] == mode
         stretches = np.stack([starts[own], ends[own] - starts[own]], axis=1) * experiment.step_length
-        axes.broken_barh(stretches.tolist(), (mode - 0.4, 0.8), color=mode_colour(mode))
+        axes.broken_barh(stretches.tolist(), (mode - 0.4, 0.8), color=MODE_COLOURS[mode % len(MODE_COLOURS)])
     axes.set(xlabel="simulated time", ylim=(len(names) - 0.4, -0.6))
     few = len(names) <= 6
     axes.set_yticks(range(len(names)) if few else [], [plain(shorten(name)) for name in names] if few else [])
@@ -239,11 +235,10 @@ def prediction_figure(prediction: Prediction) -> NotebookFigure:
 def _name_agents(axes: Axes, experiment: Experiment) -> None:
     axes.set(xlabel="agent", xlim=(0.4, experiment.agents + 0.6))
     if experiment.agents <= _NAMED:
-        names = [plain(shorten(agent_name(agent, experiment.names))) for agent in range(1, experiment.agents + 1)]
-        long = sum(map(len, names)) > 70
-        axes.set_xticks(
-            range(1, experiment.agents + 1), names, rotation=45 if long else 0, ha="right" if long else "center"
-        )
+        numbers = range(1, experiment.agents + 1)
+        names = [plain(shorten(agent_name(agent, experiment.names))) for agent in numbers]
+        turned: dict[str, Any] = {"rotation": 45, "ha": "right"} if sum(map(len, names)) > 70 else {}
+        axes.set_xticks(numbers, names, **turned)
     axes.grid(visible=False, axis="x")
 
 
@@ -291,15 +286,11 @@ def spectrum_figure(
             above.errorbar(
                 log.times, log.corrected, half, fmt="o", color=VERMILLION, ms=3.5, lw=1.2, label="measured, 95 %"
             )
-        _finish(above, below, plain(experiment.name))
+        above.axhline(0.0, color=BLACK, lw=0.5)
+        above.set(xlabel="lag [simulated time]", ylabel="autocovariance")
+        above.set_title(plain(experiment.name), loc="left")
+        below.set(xlabel="frequency [cycles per unit of simulated time]", ylabel="spectral density", xscale="log")
+        if any((np.asarray(line.get_ydata()) > 0.0).any() for line in below.get_lines()):
+            below.set_yscale("log")
         figure.legend(*above.get_legend_handles_labels(), loc="outside right upper", fontsize=8)
     return figure
-
-
-def _finish(above: Axes, below: Axes, title: str) -> None:
-    above.axhline(0.0, color=BLACK, lw=0.5)
-    above.set(xlabel="lag [simulated time]", ylabel="autocovariance")
-    above.set_title(title, loc="left")
-    below.set(xlabel="frequency [cycles per unit of simulated time]", ylabel="spectral density", xscale="log")
-    if any((np.asarray(line.get_ydata()) > 0.0).any() for line in below.get_lines()):
-        below.set_yscale("log")

@@ -23,7 +23,7 @@ from msg_analysis.common.text import HALF_WIDTH_95, half_width_text, number_text
 from msg_analysis.errors import InputError
 from msg_analysis.inference.comparison import flat
 from msg_analysis.report import plot_style, sweep_plots
-from msg_analysis.report.page import pack, page_template
+from msg_analysis.report.page import SYMBOLS, minus_sign, pack, page_template
 from msg_analysis.runs import RunEntry
 from msg_analysis.sweeps.grid import Sweep
 from msg_analysis.sweeps.results import (
@@ -38,13 +38,6 @@ from msg_analysis.sweeps.results import (
 )
 
 _OPEN_TABLE = 30  # most rows with which the table is open at first
-
-
-def write_sweep_page(
-    sweep: Sweep, rows: Sequence[Row], column: str | None, summary: str, verdict: str | None, directory: Path
-) -> Path:
-    """Write ``sweep.html``, whole or not at all. Arguments as in ``render_sweep``."""
-    return write_whole(directory / "sweep.html", render_sweep(sweep, rows, column, summary, verdict).encode())
 
 
 def render_sweep(
@@ -62,38 +55,47 @@ def render_sweep(
     lines = {key: _figures(models, shown, "lines", number) for number, (key, shown) in enumerate(pictures.items())}
     maps = _figures(models, first, "map", 0) if first.series[0].values else []
     plots, packed = pack(models)
-    places = [(series, place) for series in first.series for place in series.places]
+    values = []
+    for key in sweep.keys:
+        words = [value_text(value) for value in sweep.spec.over[key]]
+        several = f"{len(words)} values, {words[0]} to {words[-1]}" if len(words) > 8 else ", ".join(words)
+        values.append((axis_name(key, sweep.names), several))
+    table = [
+        {
+            "keys": [value_text(place.x), *(value_text(value) for _, value in series.values)],
+            "value": number_text(place.value),
+            "half": half_width_text((place.low, place.high)),
+            "expected": number_text(place.predicted if first.measured else place.reference),
+            "lost": place.value is None,
+        }
+        for series in first.series
+        for place in series.places
+    ]
     return page_template("sweep.html.j2").render(
         sweep=sweep,
         column=column_words(first.y, sweep.names),
-        measured=first.measured,
-        referred=any(place.reference is not None for _, place in places),
+        referred=any(place.reference is not None for place in first.places),
         dashed=any(sweep_plots.dashed(shown) for shown in pictures.values()),
         summary=summary,
         verdict=verdict,
         lines=lines,
         keys={key: sweep_plots.key_of_lines(shown) for key, shown in pictures.items()},
         markers=list(sweep_plots.MARKERS.values()),
-        line_colours=plot_style.LINES,
+        style=plot_style,
         by_factors=sweep_plots.by_factors(first),
         maps=maps,
         axis_names={key: axis_name(key, sweep.names) for key in keys},
-        values=[(axis_name(key, sweep.names), _values(sweep.spec.over[key])) for key in sweep.keys],
+        values=values,
         first=first,
         second=first.series[0].values[0][0] if first.series[0].values else None,
-        hidden_panels=max(0, len(sweep_plots.panels(first)) - sweep_plots.MOST_PANELS),
-        hidden_lines=any(
-            len(panel.series) > sweep_plots.MOST_LINES
-            for shown in pictures.values()
-            for panel in sweep_plots.panels(shown)
-        ),
+        panels=len(sweep_plots.panels(first)),
+        longest=max(len(panel.series) for shown in pictures.values() for panel in sweep_plots.panels(shown)),
         most_lines=sweep_plots.MOST_LINES,
         most_panels=sweep_plots.MOST_PANELS,
         heads=[key_words(key, sweep.names) for key in (first.x, *(key for key, _ in first.series[0].values))],
-        table=[_point_row(first, series.values, place) for series, place in places],
-        table_open=len(places) <= _OPEN_TABLE,
+        table=table,
+        table_open=len(table) <= _OPEN_TABLE,
         failures=list(dict.fromkeys(f"point {row['point']}: {row['reason']}" for row in rows if row.get("reason"))),
-        dark=plot_style.DARK,
         plots=plots,
         packed=packed,
     )
@@ -110,24 +112,8 @@ def _figures(models: dict[str, UIElement], shown: Picture, kind: str, number: in
     return found
 
 
-def _values(values: Sequence[Any]) -> str:
-    """The values of a key, in words."""
-    words = [value_text(value) for value in values]
-    return f"{len(words)} values, {words[0]} to {words[-1]}" if len(words) > 8 else ", ".join(words)
-
-
-def _point_row(shown: Picture, values: Sequence[tuple[str, Any]], place: Any) -> Mapping[str, Any]:
-    return {
-        "keys": [value_text(place.x), *(value_text(value) for _, value in values)],
-        "value": number_text(place.value),
-        "half": half_width_text((place.low, place.high)),
-        "expected": number_text(place.predicted if shown.measured else place.reference),
-        "lost": place.value is None,
-    }
-
-
+_Documents = dict[str, tuple[int, dict[str, str]]]  # each once, although many runs have it: place and texts, by JSON
 _LONGEST = 200  # characters of a value; of a longer one also a digest, so that it is seen to differ
-_SIGNS = {"agrees": "✓", "disagrees": "✗", "incomplete": "?", "unpredicted": "–"}
 
 
 def write_runs_page(runs: Sequence[RunEntry], folder: Path, path: Path) -> None:
@@ -142,35 +128,18 @@ def write_runs_page(runs: Sequence[RunEntry], folder: Path, path: Path) -> None:
 def render_runs(runs: Sequence[RunEntry], folder: Path, place: Path) -> str:
     """The page as HTML text; ``place``: the folder it will be in, to which its links are relative."""
     newest_first = sorted(runs, key=lambda run: run.date, reverse=True)
-    shared = _Shared()
-    rows = [_run_row(run, place, shared) for run in newest_first]
+    documents: _Documents = {}
+    rows = [_run_row(run, place, documents) for run in newest_first]
     words = Counter(run.verdict or run.status for run in runs)
     return page_template("runs.html.j2").render(
         folder=folder.absolute().name or str(folder),
         rows=rows,
         counts=words.most_common(),
-        signs=_SIGNS,
+        signs=SYMBOLS,
         names=[name for name, _ in Counter(run.name for run in runs if run.name is not None).most_common()],
-        data={"runs": rows, "documents": shared.values, "half": HALF_WIDTH_95},
+        data={"runs": rows, "documents": [texts for _, texts in documents.values()], "half": HALF_WIDTH_95},
         written=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M"),
     )
-
-
-class _Shared:
-    """Documents that many runs have in common, each once."""
-
-    def __init__(self) -> None:
-        self.values: list[dict[str, str]] = []
-        self._places: dict[str, int] = {}
-
-    def place(self, document: Mapping[str, Any]) -> int:
-        """Where in ``values`` the keys and values of a document are, as texts."""
-        texts = {key: _value(value) for key, value in flat(document).items()}
-        key = json.dumps(texts)
-        if key not in self._places:
-            self._places[key] = len(self.values)
-            self.values.append(texts)
-        return self._places[key]
 
 
 def _value(value: Any) -> str:
@@ -181,9 +150,9 @@ def _value(value: Any) -> str:
     return f"{text[:_LONGEST]}… ({len(text)} characters, sha256 {digest})"
 
 
-def _run_row(run: RunEntry, place: Path, shared: _Shared) -> dict[str, Any]:
+def _run_row(run: RunEntry, place: Path, documents: _Documents) -> dict[str, Any]:
     """What the page has of a run: numbers for the plot, texts for the table."""
-    experiment, versions = _record(run, shared)
+    experiment, versions = _record(run, documents)
     return run.to_json() | {
         "id": Path(run.folder).name,
         "word": run.verdict or run.status,
@@ -194,23 +163,27 @@ def _run_row(run: RunEntry, place: Path, shared: _Shared) -> dict[str, Any]:
         "versions": versions,
         "texts": {
             "seed": "–" if run.seed is None else str(run.seed),
-            "measured": _number(run.measured),
-            "half": _dash(half_width_text((run.low, run.high))),
-            "predicted": _number(run.predicted),
-            "z": _dash(z_text(run.z)),
+            "measured": minus_sign(number_text(run.measured, 5)),
+            "half": minus_sign(half_width_text((run.low, run.high))),
+            "predicted": minus_sign(number_text(run.predicted, 5)),
+            "z": minus_sign(z_text(run.z)),
         },
     }
 
 
-def _record(run: RunEntry, shared: _Shared) -> tuple[int | None, int | None]:
-    """Places of the experiment and the versions; None where they are not known."""
+def _record(run: RunEntry, documents: _Documents) -> list[int | None]:
+    """Places of the experiment and the versions among the documents; None where they are not known."""
     try:
-        document = record_document(Path(run.folder))
+        record = record_document(Path(run.folder))
     except (InputError, OSError):  # no bag, or none of a run
-        return None, None
-    parts = (document.get("experiment"), document.get("versions"))
-    experiment, versions = (shared.place(part) if isinstance(part, Mapping) else None for part in parts)
-    return experiment, versions
+        return [None, None]
+    parts = (record.get("experiment"), record.get("versions"))
+    return [_place(part, documents) if isinstance(part, Mapping) else None for part in parts]
+
+
+def _place(document: Mapping[str, Any], documents: _Documents) -> int:
+    texts = {key: _value(value) for key, value in flat(document).items()}
+    return documents.setdefault(json.dumps(texts), (len(documents), texts))[0]
 
 
 def _link(target: Path, place: Path) -> str:
@@ -218,12 +191,3 @@ def _link(target: Path, place: Path) -> str:
         return quote(os.path.relpath(target, place).encode(errors="surrogateescape"))
     except ValueError:  # on another drive
         return target.absolute().as_uri()
-
-
-def _number(value: float | None) -> str:
-    return _dash(number_text(value, 5))
-
-
-def _dash(number: str) -> str:
-    """With a dash where there is no number, and a minus sign."""
-    return "–" if number == "-" else number.replace("-", "−")

@@ -21,9 +21,7 @@ LINE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK, "#8a7d00") 
 INK, DARK_GREY, GREY, LIGHT_GREY, PALE = "#374151", "#4b5563", "#6b7280", "#9ca3af", "#e5e7eb"
 
 
-def mode_colour(mode: int) -> str:
-    """Colour of a graph, from 0; repeats after eight."""
-    return MODE_COLOURS[mode % len(MODE_COLOURS)]
+LABELLED = 40  # most agents whose numbers are shown
 
 
 def shorten(name: str, length: int = 18) -> str:
@@ -46,15 +44,6 @@ def shifted(places: FloatArray, values: FloatArray, series: int, count: int, *, 
     step = min((1 - _FREE) * nearest / count, _MOST * length)
     way = (series - (count - 1) / 2) * step
     return places * np.exp(way) if logarithmic else places + way
-
-
-LABELLED = 40
-"""Most agents whose numbers are shown."""
-
-
-def line_width(share: float) -> float:
-    """Width of a link whose weight is this share of the heaviest one."""
-    return 0.4 + 1.3 * share
 
 
 def places(graph_list: Sequence[Graph]) -> Mapping[int, FloatArray]:

@@ -11,8 +11,7 @@ import gzip
 import platform
 import shlex
 import sys
-import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,17 +23,14 @@ from bokeh.core.json_encoder import serialize_json
 from bokeh.document import Document
 from bokeh.models import ColumnDataSource, UIElement
 from bokeh.resources import Resources
-from jinja2.bccache import Bucket
 from markupsafe import Markup
 
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import counted, p_text, percent, with_names
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.observation import bounded
 from msg_analysis.inference.realtime_laws import SUPPORT
-from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.report import drawings, error_plots, plot_style, run_plots
 from msg_analysis.report.comparison_text import (
@@ -58,24 +54,8 @@ from msg_analysis.report.run_plots import Event, run_events
 from msg_analysis.theory.prediction import LAW_NAMES
 
 
-class _Compiled(jinja2.BytecodeCache):
-    """Templates that are compiled once in a process."""
-
-    def __init__(self) -> None:
-        self._code: dict[str, types.CodeType] = {}
-
-    def load_bytecode(self, bucket: Bucket) -> None:
-        bucket.code = self._code.get(bucket.checksum)
-
-    def dump_bytecode(self, bucket: Bucket) -> None:
-        if bucket.code is not None:
-            self._code[bucket.checksum] = bucket.code
-
-
-_COMPILED = _Compiled()
-
-
-def page_template(name: str, filters: Mapping[str, Callable[..., Any]] | None = None) -> jinja2.Template:
+@cache
+def page_template(name: str) -> jinja2.Template:
     """A template of this folder, which escapes what is put into it, and fails where something is missing."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("msg_analysis.report"),
@@ -83,10 +63,18 @@ def page_template(name: str, filters: Mapping[str, Callable[..., Any]] | None = 
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        bytecode_cache=_COMPILED,
     )
-    environment.filters |= filters or {}
+    environment.filters |= {"number": _number, "p": lambda p: minus_sign(p_text(p))}
     return environment.get_template(name)
+
+
+def minus_sign(number: str) -> str:
+    """With a minus sign, and a dash where there is no number."""
+    return "–" if number == "-" else number.replace("-", "−")
+
+
+def _number(value: float | None, digits: int = 4) -> str:
+    return "–" if value is None else minus_sign(f"{value:#.{digits}g}".rstrip("."))
 
 
 def pack(models: Mapping[str, UIElement]) -> tuple[dict[str, Markup], Markup]:
@@ -121,27 +109,26 @@ _SHOWN_SEEDS = 8
 def page_title(comparison: Comparison) -> str:
     """The title of the tab, what differs between runs first: verdict, name, seed, date."""
     records = _records(comparison)
-    parts = [records[0].experiment.name]
-    if len(records) > 1:
-        parts.append(counted(len(records), "run"))
-    parts += [_seeds(records), _dates(records)[0]]
+    runs = [counted(len(records), "run")] if len(records) > 1 else []
+    parts = [records[0].experiment.name, *runs, _seeds(records), _dates(records)[0]]
     return f"{SYMBOLS[comparison.verdict]} {', '.join(parts)}: {comparison.verdict}"
 
 
 def run_facts(comparison: Comparison, wall_time: float | None) -> list[tuple[str, str]]:
     """Seed, date, duration and pace of the run or the runs; ``wall_time`` [s] if it is known."""
     records = _records(comparison)
-    experiment = records[0].experiment
-    facts = [("seed" if len(records) == 1 else "seeds", _seeds(records).partition(" ")[2])]
-    dates = _dates(records)
-    facts.append(("date", " to ".join(dict.fromkeys((dates[0], dates[-1]))) + " UTC"))
+    experiment, run, dates = records[0].experiment, records[0].experiment.run, _dates(records)
+    seeds, _, numbers = _seeds(records).partition(" ")
     durations = sorted({record.experiment.run.duration for record in records})
     time = " to ".join(f"{each:g}" for each in dict.fromkeys((durations[0], durations[-1])))
     steps = f", {counted(experiment.steps, 'step')} of {experiment.step_length:g}" if len(durations) == 1 else ""
     each = " each" if len(records) > 1 else ""
-    facts.append(("duration", f"{time} units of time{steps}{each}" + (f", in {wall_time:.3g} s" if wall_time else "")))
-    facts.append(("pace", _pace(experiment)))
-    return facts
+    return [
+        (seeds, numbers),
+        ("date", " to ".join(dict.fromkeys((dates[0], dates[-1]))) + " UTC"),
+        ("duration", f"{time} units of time{steps}{each}" + (f", in {wall_time:.3g} s" if wall_time else "")),
+        ("pace", "lockstep" if run.pace == "lockstep" else f"real time, {run.speed:g} units of time per second"),
+    ]
 
 
 def _records(comparison: Comparison) -> list[RunRecord]:
@@ -159,13 +146,6 @@ def _dates(records: Sequence[RunRecord]) -> list[str]:
     """Ascending, to the minute."""
     dates = sorted(record.started for record in records)
     return [date.astimezone(datetime.UTC).strftime("%Y-%m-%d %H:%M") for date in dates]
-
-
-def _pace(experiment: Experiment) -> str:
-    run = experiment.run
-    if run.pace == "lockstep":
-        return "lockstep"
-    return f"real time, {run.speed:g} units of time per second"
 
 
 _OPEN_TABLE = 12  # most agents with which the table of the nodes is open at first
@@ -214,15 +194,8 @@ def write_report(
         the file cannot be written
     """
     path = Path(file)
-    html = render(
-        comparison,
-        comparison.trajectory,
-        restarts=restarts,
-        strangers=strangers,
-        events=events,
-        wall_time=wall_time,
-        channel=channel,
-    )
+    network: dict[str, Any] = {"restarts": restarts, "strangers": strangers, "events": events, "channel": channel}
+    html = render(comparison, wall_time=wall_time, **network)
     try:
         write_whole(path, html.encode())
     except OSError as error:
@@ -232,27 +205,28 @@ def write_report(
 
 def render(
     comparison: Comparison,
-    trajectory: Run,
     *,
-    restarts: Sequence[str] = (),  # one line per process that was restarted
-    strangers: Sequence[Mapping[str, Any]] = (),  # refused messages: node, topic, reason, count
-    events: Sequence[Mapping[str, Any]] = (),  # of processes and refused messages: kind, step, node, words
-    wall_time: float | None = None,  # [s] that the run took, if known
-    channel: Mapping[str, Any] | None = None,  # hosts, and packets of each pair of them, as in result.json
+    restarts: Sequence[str] = (),
+    strangers: Sequence[Mapping[str, Any]] = (),
+    events: Sequence[Mapping[str, Any]] = (),
+    wall_time: float | None = None,
+    channel: Mapping[str, Any] | None = None,
     host: str | None = None,  # where the report is written and by which command; None: here, and by this one
     command: str | None = None,
 ) -> str:
-    """The report as HTML text."""
-    document = comparison.to_json()
+    """The report as HTML text; arguments as of ``write_report``."""
+    document, trajectory = comparison.to_json(), comparison.trajectory
     experiment = trajectory.record.experiment
-    filters: dict[str, Callable[..., Any]] = {"number": _number, "p": _p, "named": _namer(experiment)}
     names = [graph.name for graph in experiment.graph_list]
     candidates = Candidates.of(document["blame"])
     happened, more_events = run_events(trajectory, events)
-    models, drawn = _models(document, comparison, trajectory, candidates, happened)
+    models, drawn = _models(document, comparison, candidates, happened)
     places, packed = pack(models)
     timing = document["timing"]
-    return page_template("report.html.j2", filters).render(
+    apart = [place + 1 for place in furthest([node["z"] for node in agent_errors(document)[0]], _FIRST_LINES)]
+    template = page_template("report.html.j2")
+    return template.render(
+        named=lambda text: with_names(text, experiment.names),
         document=document,
         title=page_title(comparison),
         run_facts=run_facts(comparison, wall_time),
@@ -283,13 +257,11 @@ def render(
         versions=trajectory.record.versions,
         plots=places,
         packed=packed,
-        first_agents=_first_agents(document, candidates.involved),
-        line_colours=plot_style.LINES,
-        graph_colours=plot_style.GRAPHS,
-        dark=plot_style.DARK,
+        first_agents=_first(_FIRST_LINES, *candidates.involved, *apart),  # whose convergence is drawn at first
+        style=plot_style,
         most_lines=error_plots.MOST_LINES,
         drawn=drawn,
-        shown=_shown_agents(experiment.agents, candidates.involved),
+        shown=_first(_FIRST_TRAJECTORIES, *candidates.involved, *range(1, experiment.agents + 1)),
         candidates=candidates,
         events=happened,
         more_events=more_events,
@@ -317,25 +289,20 @@ def render(
 
 
 def _models(
-    document: dict[str, Any],
-    comparison: Comparison,
-    trajectory: Run,
-    candidates: Candidates,
-    events: Sequence[Event],
-) -> tuple[dict[str, UIElement], run_plots.Drawn]:
+    document: dict[str, Any], comparison: Comparison, candidates: Candidates, events: Sequence[Event]
+) -> tuple[dict[str, UIElement], dict[str, int]]:
     """The figures that exist, by name, and what of the run is in those of the trajectories."""
+    trajectory = comparison.trajectory
     experiment, steps = trajectory.record.experiment, max(document["steps"], 0)
     covariance, ratios = document["covariance"], document["innovations"]["ratios"]
-    predicted = document["system_error"]["predicted"]
+    predicted, nodes, names = document["system_error"]["predicted"], agent_errors(document)[0], experiment.names
+    measured, expected, z = (
+        None if covariance[key] is None else np.array(covariance[key], dtype=float)
+        for key in ("measured", "predicted", "z")
+    )
     models: dict[str, UIElement | None] = {
-        "nodes": error_plots.node_errors(agent_errors(document)[0], document["level"], candidates, experiment.names),
-        **covariances(
-            _matrix(covariance["measured"]),
-            _matrix(covariance["predicted"]),
-            _matrix(covariance["z"]),
-            candidates,
-            experiment.names,
-        ),
+        "nodes": error_plots.node_errors(nodes, document["level"], candidates, names),
+        **covariances(measured, expected, z, candidates, names),
     }
     if len(comparison.running["time"]) > 1:
         models["running"] = error_plots.convergence(comparison.running, predicted)
@@ -346,50 +313,35 @@ def _models(
     models |= figures
     known = trajectory.modes[:steps]
     if len(known):
-        names = [graph.name for graph in experiment.graph_list]
-        models["occupancy"] = run_plots.occupancy(known, names, experiment.chain.stationary)
+        graphs = [graph.name for graph in experiment.graph_list]
+        models["occupancy"] = run_plots.occupancy(known, graphs, experiment.chain.stationary)
         if not document["unpredicted"]:
             reference = None if experiment.problem == "consensus" else experiment.reference
             states = bounded(trajectory.values[:steps])
-            models["agents"] = error_plots.agent_convergence(
-                states, reference, experiment.step_length, agent_errors(document)[0]
-            )
+            models["agents"] = error_plots.agent_convergence(states, reference, experiment.step_length, nodes)
     if ratios is not None and any(ratio is not None for ratio in ratios):
-        sizes = np.array(ratios, dtype=float)  # None: nan
-        models["innovations"] = error_plots.innovation_sizes(
-            sizes, document["innovations"]["samples"], candidates, experiment.names
-        )
+        sizes, samples = np.array(ratios, dtype=float), document["innovations"]["samples"]  # None: nan
+        models["innovations"] = error_plots.innovation_sizes(sizes, samples, candidates, names)
     if document["timing"]:
-        models["lateness"] = error_plots.lateness(document["timing"])
-        models["staleness"] = error_plots.staleness(document["timing"])
+        models["lateness"] = error_plots.histogram(document["timing"], "lateness_ms")
+        models["staleness"] = error_plots.histogram(document["timing"], "staleness_ms")
     return {name: model for name, model in models.items() if model is not None}, drawn
 
 
-def _shown_agents(agents: int, candidates: Sequence[int]) -> list[int]:
-    """The agents (from 1) whose trajectories are drawn at first: the candidates, and the first ones."""
-    others = [agent for agent in range(1, agents + 1) if agent not in candidates]
-    return sorted([*candidates[:_FIRST_TRAJECTORIES], *others[: max(_FIRST_TRAJECTORIES - len(candidates), 0)]])
-
-
-def _first_agents(document: dict[str, Any], candidates: Sequence[int]) -> list[int]:
-    """The agents (from 1) whose convergence is drawn at first: the candidates, then those with the largest abs(z)."""
-    known = [agent + 1 for agent in furthest([node["z"] for node in agent_errors(document)[0]], _FIRST_LINES)]
-    return sorted(list(dict.fromkeys([*candidates, *known]))[:_FIRST_LINES])
+def _first(most: int, *agents: int) -> list[int]:
+    return sorted(list(dict.fromkeys(agents))[:most])
 
 
 def _explanation(document: dict[str, Any]) -> str:
-    """The verdict in a few sentences."""
     tests, completeness, level = document["tests"], document["completeness"], document["level"]
     if document["verdict"] == "incomplete":
         lost = [
             f"{completeness['missing']} of {completeness['expected']} states" if completeness["missing"] else "",
             f"the graph of {completeness['missing_modes']} steps" if completeness["missing_modes"] else "",
         ]
-        numbers = (
-            f"The numbers below are those of the first {document['steps']} steps, up to the first gap."
-            if document["system_error"]["measured"] is not None
-            else "The first gap is too early to compute errors."
-        )
+        numbers = f"The numbers below are those of the first {document['steps']} steps, up to the first gap."
+        if document["system_error"]["measured"] is None:
+            numbers = "The first gap is too early to compute errors."
         return f"Missing: {' and '.join(filter(None, lost))}. {numbers}"
     if document["unpredicted"]:
         results = [f"{test['name']}: {'rejected' if test['rejected'] else 'ok'}" for test in tests]
@@ -399,8 +351,8 @@ def _explanation(document: dict[str, Any]) -> str:
     rejected = [test for test in tests if test["rejected"]]
     if not rejected:
         return f"All {len(tests)} tests are ok. {chance}"
-    names = document["names"]
-    named = ", ".join(f"{with_names(test['name'], names)} (p = {_p(test['p_adjusted'])})" for test in rejected[:6])
+    shown = [f"{test['name']} (p = {minus_sign(p_text(test['p_adjusted']))})" for test in rejected[:6]]
+    named = with_names(", ".join(shown), document["names"])
     more = f" and {len(rejected) - 6} more" if len(rejected) > 6 else ""
     return f"Rejected: {len(rejected)} of {len(tests)} tests: {named}{more}. {chance}"
 
@@ -412,24 +364,3 @@ def _node_tests(document: dict[str, Any]) -> dict[str, Any] | None:
         return None
     smallest = min(tests, key=lambda test: float(test["p"]))
     return {"count": len(tests), "rejected": sum(test["rejected"] for test in tests), "smallest": smallest}
-
-
-def _number(value: float | None, digits: int = 4) -> str:
-    return "–" if value is None else _typeset(f"{value:#.{digits}g}".rstrip("."))
-
-
-def _namer(experiment: Experiment) -> Callable[[str], str]:
-    return lambda text: with_names(text, experiment.names)
-
-
-def _p(p: float | None) -> str:
-    return _typeset(p_text(p))
-
-
-def _typeset(number: str) -> str:
-    """With a dash where there is no number, and a minus sign."""
-    return "–" if number == "-" else number.replace("-", "−")
-
-
-def _matrix(rows: list[list[float]] | None) -> Any:
-    return None if rows is None else np.array(rows, dtype=float)

@@ -1,13 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""What all interactive plots share.
-
-Colours of the report, for white pages and for dark ones.
-
-Those of lines and graphs are the Okabe-Ito colours, which colour-blind readers can tell apart, darker where their
-contrast to white is below 3; shapes and line styles differ as well. The page's script exchanges them in the plots.
-"""
+"""What all interactive plots share: colours, axes, legends, thinned series; and what the verdict names."""
 
 from __future__ import annotations
 
@@ -17,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from bokeh.models import BasicTicker, BoxAnnotation, PlainText
+from bokeh.models import BasicTicker, BoxAnnotation, HoverTool, PlainText
 from bokeh.plotting import figure
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray, release
@@ -51,8 +45,7 @@ class Candidates:
     @property
     def involved(self) -> list[int]:
         """The agents, and those at the ends of the links."""
-        ends = [end for ends in self.entries for end in ends]
-        return list(dict.fromkeys([*self.agents, *ends]))
+        return list(dict.fromkeys([*self.agents, *(end for ends in self.entries for end in ends)]))
 
     @property
     def entries(self) -> list[tuple[int, int]]:
@@ -71,6 +64,8 @@ class Candidates:
 NOBODY = Candidates()
 
 
+# Those of lines and graphs are the Okabe-Ito colours, which colour-blind readers can tell apart, darker where their
+# contrast to white is below 3; shapes and line styles differ as well. The page's script exchanges them in the plots.
 BLUE, ORANGE, GREEN, PURPLE = "#0072b2", "#b97a00", "#00875f", "#b4598c"
 SKY, VERMILLION, OLIVE, BLACK = "#2a8fcb", "#c85000", "#8a7d00", "#000000"
 GRAPHS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION, OLIVE, BLACK)
@@ -138,17 +133,25 @@ def name_agents(axes: Any, names: Sequence[str] | None) -> None:
         axes.major_label_overrides = {i: PlainText(text=shorten(name, 10)) for i, name in enumerate(names, start=1)}
 
 
-def agent_ticker() -> BasicTicker:
-    """Whole numbers; fewer on narrow screens, by the page's script."""
-    return BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0, tags=["agents"])
-
-
-def mark_agents(plot: Any, agents: Iterable[int]) -> None:
-    """Shade the agents, along the horizontal axis, that the verdict names."""
-    for agent in agents:
+def agent_figure(
+    height: int, count: int, names: Sequence[str] | None, marked: Iterable[int], *tools: str, **options: Any
+) -> Any:
+    """A ``new_figure`` with the agents along its horizontal axis; those that the verdict names are shaded."""
+    plot = new_figure(height, *tools, x_axis_label="agent", x_range=(0.3, count + 0.7), **options)
+    # Whole numbers; fewer on narrow screens, by the page's script.
+    plot.xaxis.ticker = BasicTicker(desired_num_ticks=20, min_interval=1, num_minor_ticks=0, tags=["agents"])
+    plot.xgrid.grid_line_color = None
+    name_agents(plot.xaxis, names)
+    for agent in marked:
         mark = BoxAnnotation(left=agent - 0.5, right=agent + 0.5, level="underlay", name=f"candidates {agent}")
         mark.fill_color, mark.fill_alpha, mark.line_color = VERMILLION, 0.18, None
         plot.add_layout(mark)
+    return plot
+
+
+def show_values(plot: Any, drawn: Sequence[Any], rows: Sequence[tuple[str, str]], **how: Any) -> None:
+    """Show these rows while the pointer is on what is drawn."""
+    plot.add_tools(HoverTool(renderers=[*drawn], tooltips=[*rows], **how))
 
 
 def place_legend(plot: Any) -> None:
@@ -174,12 +177,9 @@ _LARGEST = 1e30  # of single precision: 3e38
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thinned:
-    """Arrays (bins, series) of single precision: lowest and highest value in each bin of ``width`` steps.
+    """Arrays (bins, series) of single precision: lowest and highest known value in each bin; NaN where none is."""
 
-    NaN where no value of the bin is known. With a width of 1, lowest and highest are the same array.
-    """
-
-    width: int
+    width: int  # steps in a bin; with one, lowest and highest are the same array
     values: tuple[FloatArray, FloatArray]  # (bins, m) states of the agents
     deviations: tuple[FloatArray, FloatArray]  # (bins, m) the same without the centre
     centre: tuple[FloatArray, FloatArray]  # (bins, 1) mean of the agents, or the reference

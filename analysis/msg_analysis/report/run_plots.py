@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from bokeh.models import ColumnDataSource, FixedTicker, HoverTool, PlainText, Range1d, RangeTool, UIElement
+from bokeh.models import ColumnDataSource, FixedTicker, PlainText, Range1d, RangeTool, UIElement
 
 from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray, pieces
@@ -32,6 +32,7 @@ from msg_analysis.report.plot_style import (
     envelope,
     graph_colour,
     new_figure,
+    show_values,
     thin,
     thin_together,
 )
@@ -54,28 +55,17 @@ class Event:
 def run_events(
     trajectory: Run, reported: Sequence[Mapping[str, Any]] = (), most: int = MOST_EVENTS
 ) -> tuple[list[Event], int]:
-    """The events in order of time, of each kind at most so many, and how many more there are.
-
-    ``reported``: by the network.
-    """
-    events = [
-        Event(str(one["kind"]), int(one["step"]), int(one["step"]), str(one["words"]))
-        for one in reported
-        if one["kind"] in KINDS
-    ]
-    names = trajectory.record.experiment.names
-    late = [
-        Event(
-            "late", first, last, f"{agent_text(agent, names)}: late by more than a period in {counted(number, 'step')}"
-        )
-        for agent, first, last, number in _stretches(_late(trajectory), _NEAR)
-    ]
-    missing = [
-        Event("missing", first, last, f"{agent_text(agent, names)}: {counted(number, 'state')} missing")
-        for agent, first, last, number in _stretches(_missing(trajectory), 1)
-    ]
+    """The events, also those that the network reported, of each kind at most so many, and how many more there are."""
+    names, late, missing = trajectory.record.experiment.names, [], []
+    for agent, first, last, number in _stretches(_late(trajectory), _NEAR):
+        words = f"{agent_text(agent, names)}: late by more than a period in {counted(number, 'step')}"
+        late.append(Event("late", first, last, words))
+    for agent, first, last, number in _stretches(_missing(trajectory), 1):
+        words = f"{agent_text(agent, names)}: {counted(number, 'state')} missing"
+        missing.append(Event("missing", first, last, words))
+    others = [Event(one["kind"], one["step"], one["step"], one["words"]) for one in reported if one["kind"] in KINDS]
     kept, more = [], 0
-    for kind in (events, late, missing):
+    for kind in (others, late, missing):
         longest = sorted(kind, key=lambda event: event.first - event.last)[:most]
         kept += longest
         more += len(kind) - len(longest)
@@ -127,13 +117,9 @@ def occupancy(modes: IntArray, names: Sequence[str], stationary: FloatArray) -> 
     share = np.bincount(present, minlength=len(names)) / max(len(present), 1)
     places = np.arange(len(names))
     shares = new_figure(
-        _height(names),
-        "save",
-        title="share of time",
-        y_range=Range1d(len(names) - 0.4, -0.6),
-        toolbar_location=None,
-        x_axis_label="bar: measured; mark: predicted",
-    )
+        min(110 + 30 * len(names), 520), "save", title="share of time", y_range=Range1d(len(names) - 0.4, -0.6),
+        toolbar_location=None, x_axis_label="bar: measured; mark: predicted",
+    )  # fmt: skip
     most = 1.12 * max(share.max(), stationary.max())
     shares.x_range = Range1d(0.0, float(most))
     table = {
@@ -150,25 +136,17 @@ def occupancy(modes: IntArray, names: Sequence[str], stationary: FloatArray) -> 
         "mode", left=0, right="share", height=0.72, fill_color="colour", line_alpha=0, alpha=0.85, source=source
     )
     shares.segment("predicted", "low", "predicted", "high", source=source, color=BLACK, line_width=2.5)
-    shares.add_tools(
-        HoverTool(
-            renderers=[drawn],
-            tooltips=[("graph", "@name"), ("measured", "@share{0.0 %}"), ("predicted", "@predicted{0.0 %}")],
-        )
-    )
-    _name_graphs(shares, names)
-    # As plain text: for mathematics, the page would load a library from the network.
-    shares.yaxis.major_label_overrides = {g: PlainText(text=shorten(name)) for g, name in enumerate(names)}
+    rows = [("graph", "@name"), ("measured", "@share{0.0 %}"), ("predicted", "@predicted{0.0 %}")]
+    show_values(shares, [drawn], rows)
+    _name_lanes(shares, [PlainText(text=shorten(name)) for name in names])
     return shares
 
 
-def _height(names: Sequence[str]) -> int:
-    return int(min(110 + 30 * len(names), 520))
-
-
-def _name_graphs(plot: Any, names: Sequence[str]) -> None:
+def _name_lanes(plot: Any, names: Sequence[str | PlainText]) -> None:
+    """Names that may hold mathematics are plain texts: for those, the page would load a library from the network."""
     plot.ygrid.grid_line_color = None
     plot.yaxis.ticker = FixedTicker(ticks=list(range(len(names))))
+    plot.yaxis.major_label_overrides = dict(enumerate(names))
 
 
 OTHER_REPLICAS = 1_000_000  # bytes of the page for the replicas after the first
@@ -176,8 +154,7 @@ MOST_INTERVALS = 20_000  # of a run, that are drawn
 _WHOLE, _FIRST_INTERVALS = 1500, 30  # steps of a run that is seen whole at first; intervals visible at first of others
 _LEAST_BINS = 250  # of a replica after the first, if the run has as many steps
 _UNKNOWN = 65_535  # stands for NaN among whole numbers of 16 bits
-_LEFT, _RIGHT = 76, 14  # pixels beside every figure: equal, so that they have one time axis
-_SIDES = {"min_border_left": _LEFT, "min_border_right": _RIGHT}
+_SIDES = {"min_border_left": 76, "min_border_right": 14}  # pixels: equal, so that the figures have one time axis
 _EVENT_STYLE = {
     "killed": (VERMILLION, "x"),
     "back": (GREEN, "triangle"),
@@ -188,23 +165,14 @@ _EVENT_STYLE = {
 _TOOLS = "xpan,xbox_zoom,xwheel_zoom,reset,save"
 
 
-@dataclass(frozen=True, slots=True)
-class Drawn:
-    """What of a run is in the figures."""
-
-    intervals: int = 0
-    all_intervals: int = 0  # of the run
-    replicas: int = 0
-
-
 def trajectory_plots(
     trajectory: Run, predicted: float | None, events: Sequence[Event] = ()
-) -> tuple[dict[str, UIElement], Drawn]:
-    """The figures by name, empty for a run without states, and what is in them."""
+) -> tuple[dict[str, UIElement], dict[str, int]]:
+    """The figures by name, none for a run without states; how many replicas and intervals of ``all_intervals``."""
     experiment = trajectory.record.experiment
     states, modes, dt = trajectory.values, trajectory.modes, experiment.step_length
     if len(states) < 2 or not len(modes):
-        return {}, Drawn()
+        return {}, {"intervals": 0, "all_intervals": 0, "replicas": 0}
     reference = None if experiment.problem == "consensus" else experiment.reference
     first = thin(states, 0, reference)
     replicas, numbers = _room(*states.shape)
@@ -214,7 +182,12 @@ def trajectory_plots(
     time = Range1d(*_first_view(starts, len(modes), events, dt), bounds=(0.0, float(len(modes) * dt)), name="time")
     shown = min(len(starts), MOST_INTERVALS)
     end = int(starts[shown]) if shown < len(starts) else len(modes)
-    data = _data(first, experiment.agents, dt)
+    by_agent, by_bin = _columns(first)
+    data = [
+        _source("thinned_agents_1", **by_agent),
+        _source("thinned_bins_1", **by_bin),
+        _source("thinned_scale_1", width=[first.width], dt=[dt], agents=[experiment.agents]),
+    ]
     for number, thinned in enumerate(others, start=2):
         data += _coded(thinned, experiment.agents, dt, number)
     data.append(
@@ -228,7 +201,7 @@ def trajectory_plots(
         "errors": _error(time, predicted),
         "overview": _overview(time, float(len(modes) * dt)),
     }
-    return figures, Drawn(shown, len(starts), replicas)
+    return figures, {"intervals": shown, "all_intervals": len(starts), "replicas": replicas}
 
 
 def _room(count: int, agents: int, replicas: int) -> tuple[int, int]:
@@ -254,17 +227,8 @@ def _source(label: str, **columns: object) -> ColumnDataSource:
     return ColumnDataSource(dict(columns), name=label)
 
 
-def _data(thinned: Thinned, agents: int, dt: float) -> list[ColumnDataSource]:
-    """What the script draws from: agent by agent, and bin by bin."""
-    by_agent, by_bin = _columns(thinned)
-    return [
-        _source("thinned_agents_1", **by_agent),
-        _source("thinned_bins_1", **by_bin),
-        _source("thinned_scale_1", width=[thinned.width], dt=[dt], agents=[agents]),
-    ]
-
-
 def _columns(thinned: Thinned) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """What the script draws from: agent by agent, and bin by bin."""
     (low, high), (below, above) = thinned.values, thinned.deviations
     by_agent = {"low": low, "deviation_low": below}
     if thinned.width > 1:
@@ -295,11 +259,13 @@ def _coded(thinned: Thinned, agents: int, dt: float, number: int) -> list[Column
     return [*coded, _source(f"thinned_scale_{number}", **scale)]
 
 
+def _over_time(height: float, time: Range1d, **options: Any) -> Any:
+    return new_figure(int(height), _TOOLS, x_range=time, **({"toolbar_location": None} | _SIDES | options))
+
+
 def _states(time: Range1d, data: list[ColumnDataSource]) -> UIElement:
-    plot = new_figure(
-        330, _TOOLS, x_range=time, y_range=Range1d(-1.0, 1.0, name="states_range"), y_axis_label="state",
-        toolbar_location="above", **_SIDES,
-    )  # fmt: skip
+    y_range = Range1d(-1.0, 1.0, name="states_range")
+    plot = _over_time(330, time, y_range=y_range, y_axis_label="state", toolbar_location="above")
     plot.xaxis.visible = False
     plot.vstrip("left", "right", source=_source("strips", left=[], right=[], colour=[]), color="colour", alpha=0.16)
     plot.varea("x", "low", "high", source=_source("band", x=[], low=[], high=[]), color=GREY, alpha=0.25)
@@ -309,72 +275,55 @@ def _states(time: Range1d, data: list[ColumnDataSource]) -> UIElement:
     )  # fmt: skip
     plot.line("x", "y", source=_source("centre", x=[], y=[]), color=BLACK, line_width=1.5, line_dash="dashed")
     rows = [("", "@agent"), ("time", "$data_x{0.[000]}"), ("state", "$data_y{0.000}")]
-    plot.add_tools(HoverTool(renderers=[lines], tooltips=rows, line_policy="nearest"))
+    show_values(plot, [lines], rows, line_policy="nearest")
     plot.tags = data  # sources that no glyph uses
     return plot
 
 
 def _active_graph(time: Range1d, names: Sequence[str]) -> UIElement:
-    plot = new_figure(
-        int(min(26 + 22 * len(names), 420)), _TOOLS, x_range=time, y_range=Range1d(len(names) - 0.4, -0.6),
-        y_axis_label="graph", toolbar_location=None, **_SIDES,
-    )  # fmt: skip
+    lane = Range1d(len(names) - 0.4, -0.6)
+    plot = _over_time(min(26 + 22 * len(names), 420), time, y_range=lane, y_axis_label="graph")
     plot.xaxis.visible = False
     lanes = _source("lanes", graph=[], left=[], right=[], colour=[], name=[])
     bars = plot.hbar("graph", left="left", right="right", height=0.76, color="colour", line_alpha=0, source=lanes)
     rows = [("graph", "@name"), ("from", "@left{0.[00]} to @right{0.[00]}")]
-    plot.add_tools(HoverTool(renderers=[bars], tooltips=rows))
-    plot.ygrid.grid_line_color = None
-    plot.yaxis.ticker = FixedTicker(ticks=list(range(len(names))))
-    # As plain text: for mathematics, the page would load a library from the network.
-    plot.yaxis.major_label_overrides = {g: PlainText(text=shorten(name, 7)) for g, name in enumerate(names)}
+    show_values(plot, [bars], rows)
+    _name_lanes(plot, [PlainText(text=shorten(name, 7)) for name in names])
     return plot
 
 
 def _events(time: Range1d, events: Sequence[Event], dt: float) -> UIElement:
     """A lane for each kind that there is."""
     kinds = [kind for kind in KINDS if any(event.kind == kind for event in events)]
-    plot = new_figure(
-        int(26 + 20 * len(kinds)), _TOOLS, x_range=time, y_range=Range1d(len(kinds) - 0.4, -0.6),
-        y_axis_label="events", toolbar_location=None, **_SIDES,
-    )  # fmt: skip
+    lane = Range1d(len(kinds) - 0.4, -0.6)
+    plot = _over_time(26 + 20 * len(kinds), time, y_range=lane, y_axis_label="events")
     plot.xaxis.visible = False
-    plot.ygrid.grid_line_color = None
-    plot.yaxis.ticker = FixedTicker(ticks=list(range(len(kinds))))
-    plot.yaxis.major_label_overrides = dict(enumerate(kinds))
-    source = ColumnDataSource(
-        {
-            "lane": [kinds.index(event.kind) for event in events],
-            "left": [event.first * dt for event in events],
-            "right": [event.last * dt for event in events],
-            "colour": [_EVENT_STYLE[event.kind][0] for event in events],
-            "marker": [_EVENT_STYLE[event.kind][1] for event in events],
-            "words": [event.words for event in events],
-        },
-        name="events",
+    _name_lanes(plot, kinds)
+    source = _source(
+        "events",
+        lane=[kinds.index(event.kind) for event in events],
+        left=[event.first * dt for event in events],
+        right=[event.last * dt for event in events],
+        colour=[_EVENT_STYLE[event.kind][0] for event in events],
+        marker=[_EVENT_STYLE[event.kind][1] for event in events],
+        words=[event.words for event in events],
     )
     bars = plot.hbar("lane", left="left", right="right", height=0.5, color="colour", line_alpha=0, source=source)
     marks = plot.scatter("left", "lane", marker="marker", size=9, color="colour", line_width=2, source=source)
     rows = [("", "@words"), ("from", "@left{0.[00]} to @right{0.[00]}")]
-    plot.add_tools(HoverTool(renderers=[bars, marks], tooltips=rows))
+    show_values(plot, [bars, marks], rows)
     return plot
 
 
 def _error(time: Range1d, predicted: float | None) -> UIElement:
-    plot = new_figure(
-        170, _TOOLS, x_range=time, y_range=Range1d(0.0, 1.0, name="error_range"),
-        x_axis_label="simulated time", y_axis_label="error", toolbar_location=None, **_SIDES,
-    )  # fmt: skip
-    plot.vstrip(
-        "left", "right", source=_source("error_strips", left=[], right=[], colour=[]), color="colour", alpha=0.16
-    )
+    y_range = Range1d(0.0, 1.0, name="error_range")
+    plot = _over_time(170, time, y_range=y_range, x_axis_label="simulated time", y_axis_label="error")
+    strips = _source("error_strips", left=[], right=[], colour=[])
+    plot.vstrip("left", "right", source=strips, color="colour", alpha=0.16)
     line = plot.line("x", "y", source=_source("error", x=[], y=[]), color=BLUE, line_width=1.3)
-    plot.add_tools(
-        HoverTool(renderers=[line], tooltips=[("time", "@x{0.[000]}"), ("error", "@y{0.0000}")], mode="vline")
-    )
+    show_values(plot, [line], [("time", "@x{0.[000]}"), ("error", "@y{0.0000}")], mode="vline")
     if predicted is not None:
-        ends = [time.bounds[0], time.bounds[1]]
-        plot.line(ends, [predicted] * 2, color=BLACK, line_width=1.5, line_dash="dashed", name="predicted")
+        plot.line([*time.bounds], [predicted] * 2, color=BLACK, line_width=1.5, line_dash="dashed", name="predicted")
     return plot
 
 

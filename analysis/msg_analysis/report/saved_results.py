@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -25,24 +25,10 @@ from msg_analysis.report.tables import number_table, print_table, that_fit
 from msg_analysis.runs import Result
 
 
-@dataclass(frozen=True, slots=True)
-class Merged:
-    """Results of one experiment, apart from the seeds, as one; every unit of simulated time has the same weight."""
+def merge_results(rows: Sequence[Result]) -> list[dict[str, Any]]:
+    """Several results of one experiment as one, every unit of simulated time with the same weight.
 
-    experiment: str  # name in the first
-    files: tuple[str, ...]
-    simulated_time: float  # of all [units of simulated time]
-    measured: float  # system error, like the next four
-    standard_error: float
-    predicted: float
-    z: float
-    p: float
-
-
-def merge_results(rows: Sequence[Result]) -> list[Merged]:
-    """Results of one experiment as one, where there are two or more.
-
-    Left out: those without a number, and those with the seed of an earlier row.
+    Without those that have no number, or the seed of an earlier one.
     """
     groups: dict[str, list[Result]] = {}
     for row in rows:
@@ -61,27 +47,33 @@ def merge_results(rows: Sequence[Result]) -> list[Merged]:
         predicted = float(share @ [row.predicted for row in group])
         error = float(np.linalg.norm(share * [row.standard_error for row in group]))
         z = (measured - predicted) / error
-        files = tuple(row.file for row in group)
-        p = float(two_sided(z))
-        found.append(Merged(group[0].experiment, files, float(time.sum()), measured, error, predicted, z, p))
+        found.append(
+            {
+                "experiment": group[0].experiment,
+                "files": [row.file for row in group],
+                "simulated_time": float(time.sum()),
+                "measured": measured,
+                "standard_error": error,
+                "predicted": predicted,
+                "z": z,
+                "p": float(two_sided(z)),
+            }
+        )
     return found
 
 
 def order_of_results(rows: Sequence[Result], level: float) -> Ranking | None:
-    """Which system errors of independent runs are smaller than which; numbers are places in ``rows``, from 1.
+    """Which system errors of independent runs (from 1) are smaller than which; None: some have no standard error.
 
-    With leaders of infinite gain in every row, that is the order of their joint robustness centrality. None unless
-    every row has a measured error with a standard error, and where ``rank_estimates`` gives none.
+    With leaders of infinite gain in every row, that is the order of their joint robustness centrality.
     """
-    errors = [(row.measured, row.standard_error) for row in rows]
-    known = [(measured, error) for measured, error in errors if measured is not None and error is not None]
-    if len(known) < len(rows):
-        return None
-    measured, deviations = np.array(known).T
-    predicted = [row.predicted for row in rows if row.predicted is not None]
-    return rank_estimates(
-        measured, np.diag(deviations**2), np.array(predicted) if len(predicted) == len(rows) else None, level
+    measured, deviations, predicted = (
+        np.array([getattr(row, key) for row in rows], dtype=float)  # None: nan
+        for key in ("measured", "standard_error", "predicted")
     )
+    if np.isnan(measured + deviations).any():
+        return None
+    return rank_estimates(measured, np.diag(deviations**2), None if np.isnan(predicted).any() else predicted, level)
 
 
 def to_json(rows: Sequence[Result], level: float) -> dict[str, Any]:
@@ -89,7 +81,7 @@ def to_json(rows: Sequence[Result], level: float) -> dict[str, Any]:
     order = order_of_results(rows, level)
     return {
         "results": [asdict(row) for row in rows],
-        "merged": [asdict(one) for one in merge_results(rows)],
+        "merged": merge_results(rows),
         "order": order.to_json() if order else None,
     }
 
@@ -129,16 +121,12 @@ def print_results(rows: Sequence[Result], level: float, console: Console) -> Non
         if row.blame:
             console.print(Text(f"{row.file}: {row.blame}."))
     for one in merge_results(rows):
-        interval = Estimate(one.measured, standard_error=one.standard_error).interval
-        console.print(
-            Text(
-                f"{one.experiment}, {len(one.files)} results merged ({number_text(one.simulated_time)} units of time): "
-                f"{measured_text(one.measured, interval)}, predicted {number_text(one.predicted)}, "
-                f"z = {z_text(one.z)}, p = {p_text(one.p)}."
-            )
-        )
-    order = order_of_results(rows, level)
-    if order:
+        error = Estimate(one["measured"], standard_error=one["standard_error"])
+        merged = f"{len(one['files'])} results merged ({number_text(one['simulated_time'])} units of time)"
+        numbers = f"predicted {number_text(one['predicted'])}, z = {z_text(one['z'])}, p = {p_text(one['p'])}."
+        text = f"{one['experiment']}, {merged}: {measured_text(error.measured, error.interval)}, {numbers}"
+        console.print(Text(text))
+    if order := order_of_results(rows, level):
         for sentence in order_statements(
             order.to_json(), [row.file for row in rows], "has a smaller system error than"
         ):

@@ -17,7 +17,6 @@ from bokeh.models import (
     ColorBar,
     ColumnDataSource,
     FixedTicker,
-    HoverTool,
     LinearColorMapper,
     LogColorMapper,
     PlainText,
@@ -36,7 +35,7 @@ from msg_analysis.common.text import measured_text, number_text
 from msg_analysis.experiment.problems import show
 from msg_analysis.report.figures import STYLE, NotebookFigure, plain, rendered
 from msg_analysis.report.look import DARK_GREY, MODE_COLOURS, shifted, shorten
-from msg_analysis.report.plot_style import BLACK, DARK_SCALE, GREY, INK, LINES, SANS, SCALE, new_figure
+from msg_analysis.report.plot_style import BLACK, DARK_SCALE, GREY, INK, LINES, SANS, SCALE, new_figure, show_values
 from msg_analysis.sweeps.results import Picture, Place, Series, axis_name, column_words, key_words, value_text
 from msg_analysis.theory.prediction import LAW_NAMES
 
@@ -85,8 +84,7 @@ def panels(picture: Picture) -> list[Panel]:
 def lines(picture: Picture, panel: Panel, name: str) -> UIElement:
     """Lines over the key along the axis; measured values with intervals, beside each other; ``name`` for the page."""
     chosen = _some(panel.series)
-    labels = list(dict.fromkeys(show(place.x) for series in picture.series for place in series.places))
-    logarithmic = picture.numeric and picture.logarithmic
+    labels, logarithmic = picture.labels, picture.numeric and picture.logarithmic
     along = [_along(picture, series, labels) for series in chosen]
     every = np.concatenate(along)
     drawn = [shifted(x, every, i, len(chosen), logarithmic=logarithmic) for i, x in enumerate(along)]
@@ -114,16 +112,11 @@ def lines(picture: Picture, panel: Panel, name: str) -> UIElement:
         }
         hovered.append(_series(plot, picture, ColumnDataSource(data), number))
         there = ~np.isnan(data["value"])
-        lost = ColumnDataSource(
-            {
-                "x": data["x"][~there],
-                "y": np.full((~there).sum(), low),
-                "words": [words[i] for i in np.flatnonzero(~there)],
-            }
-        )
-        if len(lost.data["words"]):
+        if not there.all():
+            lost = {"x": data["x"][~there], "y": np.full((~there).sum(), low)}
+            lost["words"] = [words[i] for i in np.flatnonzero(~there)]
             crosses = plot.scatter("x", "y", source=lost, marker="x", size=9, color=BLACK, line_width=2)
-            plot.add_tools(HoverTool(renderers=[crosses], tooltips=[("", "@words")]))
+            show_values(plot, [crosses], [("", "@words")])
         points["x"] += data["beside"].tolist()
         points["value"] += [value if known else low for value, known in zip(data["value"].tolist(), there, strict=True)]
         points["words"] += words
@@ -134,7 +127,7 @@ def lines(picture: Picture, panel: Panel, name: str) -> UIElement:
         rows.append((LAW_NAMES["continuous"], "@expected"))
     if chosen[0].values:
         rows.insert(0, (key_words(chosen[0].values[0][0], picture.names), "@second"))
-    plot.add_tools(HoverTool(renderers=hovered, tooltips=rows))
+    show_values(plot, hovered, rows)
     plot.y_range = Range1d(low, high)
     _add_focus(plot, points, name)
     return plot
@@ -168,17 +161,17 @@ def dashed(picture: Picture) -> bool:
 
 def by_factors(picture: Picture) -> bool:
     """Whether the colours of its heat maps are on a logarithmic scale: results > 0 that differ much."""
-    known = [place.value for series in picture.series for place in series.places if place.value is not None]
+    known = [place.value for place in picture.places if place.value is not None]
     return bool(known) and min(known) > 0 and max(known) / min(known) >= _WIDE
 
 
 def heat_map(picture: Picture, panel: Panel, name: str) -> UIElement:
     """Values over two keys; cells without a result have a cross; ``name`` for the page."""
     second = panel.series[0].values[0][0]
-    columns = list(dict.fromkeys(show(place.x) for series in picture.series for place in series.places))
-    across = {show(place.x): _short(place.x) for series in picture.series for place in series.places}
+    columns = picture.labels
+    across = {show(place.x): _short(place.x) for place in picture.places}
     down = [value_text(series.values[0][1]) for series in panel.series]
-    known = [place.value for series in picture.series for place in series.places if place.value is not None]
+    known = [place.value for place in picture.places if place.value is not None]
     low, high = (min(known), max(known)) if known else (0.0, 1.0)
     mapper = (LogColorMapper if by_factors(picture) else LinearColorMapper)(
         palette=interp_palette(SCALE, 255), low=low, high=high if high > low else low + 1.0,
@@ -210,17 +203,8 @@ def heat_map(picture: Picture, panel: Panel, name: str) -> UIElement:
     _name_axes(plot, axis_name(picture.x, picture.names), axis_name(second, picture.names).replace(" [", "\n["))
     _name_values(plot.xaxis, [across[column] for column in columns])
     _name_values(plot.yaxis, [_short(series.values[0][1]) for series in panel.series])
-    source = ColumnDataSource(cells)
-    drawn = plot.rect(
-        "x",
-        "y",
-        1,
-        1,
-        source=source,
-        fill_color={"field": "value", "transform": mapper},
-        line_color=GREY,
-        line_width=0.5,
-    )
+    source, fill = ColumnDataSource(cells), {"field": "value", "transform": mapper}
+    drawn = plot.rect("x", "y", 1, 1, source=source, fill_color=fill, line_color=GREY, line_width=0.5)
     if any(cells["text"]):
         plot.text(
             "x", "y", "text", source=source, text_color=BLACK, text_align="center", text_baseline="middle",
@@ -230,7 +214,7 @@ def heat_map(picture: Picture, panel: Panel, name: str) -> UIElement:
     rows.append((_result_words(picture), "@shown"))
     if picture.measured:
         rows.append(("predicted", "@expected"))
-    plot.add_tools(HoverTool(renderers=[drawn], tooltips=rows))
+    show_values(plot, [drawn], rows)
     bar = ColorBar(color_mapper=mapper, height=8, label_standoff=5, border_line_color=None, padding=3)
     bar.major_label_text_font, bar.major_label_text_color, bar.background_fill_color = SANS, INK, None
     plot.add_layout(bar, "above")
@@ -246,9 +230,8 @@ def _some(series: Sequence[Series]) -> list[Series]:
 
 def _along(picture: Picture, series: Series, labels: Sequence[str]) -> FloatArray:
     """Places of a series along the axis: numbers, or the numbers of the values, from 0."""
-    return np.array(
-        [float(place.x) if picture.numeric else labels.index(show(place.x)) for place in series.places], dtype=float
-    )
+    found = [float(place.x) if picture.numeric else labels.index(show(place.x)) for place in series.places]
+    return np.array(found, dtype=float)
 
 
 def _reach(every: FloatArray, drawn: Sequence[FloatArray], logarithmic: bool) -> Range1d:
@@ -264,13 +247,8 @@ def _reach(every: FloatArray, drawn: Sequence[FloatArray], logarithmic: bool) ->
 
 def _span(picture: Picture) -> tuple[float, float]:
     """Ends of the vertical axis: all panels have the same."""
-    numbers = [
-        number
-        for series in picture.series
-        for place in series.places
-        for number in (place.value, place.low, place.high, place.predicted, place.reference)
-        if number is not None
-    ]
+    every = ((place.value, place.low, place.high, place.predicted, place.reference) for place in picture.places)
+    numbers = [number for group in every for number in group if number is not None]
     low, high = (min(numbers), max(numbers)) if numbers else (0.0, 1.0)
     margin = 0.08 * (high - low) or 0.5
     return low - margin, high + margin
@@ -343,10 +321,10 @@ def draw(picture: Picture, title: str) -> NotebookFigure:
     """The figure; the caller sets the style."""
     figure = NotebookFigure(figsize=_SIZE, layout="constrained")
     axes = figure.subplots()
-    labels = list(dict.fromkeys(show(place.x) for series in picture.series for place in series.places))
-    numbers = picture.numeric
-    count = len(picture.series)
-    colours = _series_colours(count)
+    labels, count, numbers = picture.labels, len(picture.series), picture.numeric
+    colours = list(MODE_COLOURS[:count])
+    if count > _IN_LEGEND:
+        colours = list(mpl.colormaps["viridis"](np.linspace(0, 0.92, count)))
     along = [_along(picture, series, labels) for series in picture.series]
     every, logarithmic = np.concatenate(along), numbers and picture.logarithmic
     for number, (series, x, colour) in enumerate(zip(picture.series, along, colours, strict=True)):
@@ -357,7 +335,10 @@ def draw(picture: Picture, title: str) -> NotebookFigure:
         axes.set_xlim(-0.5, len(labels) - 0.5)
     elif picture.logarithmic:
         axes.set_xscale("log")
-    _mark_failures(axes, picture, labels, numbers)
+    if lost := [place.x for place in picture.places if place.value is None]:  # a cross at the foot of the axes
+        at = [float(place) if numbers else labels.index(show(place)) for place in lost]
+        foot = axes.get_xaxis_transform()
+        axes.plot(at, [0.015] * len(at), "x", color=BLACK, ms=5, transform=foot, clip_on=False, zorder=5)
     axes.set(xlabel=plain(axis_name(picture.x, picture.names)), ylabel=plain(column_words(picture.y, picture.names)))
     axes.set_title(plain(title), loc="left")
     axes.margins(y=0.08)
@@ -366,14 +347,9 @@ def draw(picture: Picture, title: str) -> NotebookFigure:
 
 
 def _draw_series(
-    axes: Axes,
-    picture: Picture,
-    series: Series,
-    x: FloatArray,
-    beside: FloatArray,  # the same, shifted sideways for intervals
-    colour: Any,
-    marker: str,
+    axes: Axes, picture: Picture, series: Series, x: FloatArray, beside: FloatArray, colour: Any, marker: str
 ) -> None:
+    """``beside``: x, shifted sideways for intervals."""
     order = np.argsort(x, kind="stable")
     values, predicted, reference = (_column(series.places, key)[order] for key in ("value", "predicted", "reference"))
     x, beside = x[order], beside[order]
@@ -390,27 +366,21 @@ def _draw_series(
     axes.plot(x, reference, color=colour, lw=1.0, ls=(0, (4, 2)))
 
 
-def _mark_failures(axes: Axes, picture: Picture, labels: Sequence[str], numbers: bool) -> None:
-    """A cross at the foot of the axes for every place without a result."""
-    lost = [place.x for series in picture.series for place in series.places if place.value is None]
-    if lost:
-        x = [float(place) if numbers else labels.index(show(place)) for place in lost]
-        axes.plot(
-            x, [0.015] * len(x), "x", color=BLACK, ms=5, transform=axes.get_xaxis_transform(), clip_on=False, zorder=5
-        )
-
-
 def _add_legend(figure: Figure, axes: Axes, picture: Picture, colours: Sequence[Any]) -> None:
     """Above the axes: what lines and points mean; next to them: the colours of the series."""
     entries: list[tuple[Line2D, str]] = []
+
+    def enter(label: str, colour: str = DARK_GREY, **look: Any) -> None:
+        entries.append((Line2D([], [], color=colour, **look), label))
+
     if picture.measured:
-        entries.append((Line2D([], [], color=DARK_GREY, marker="o", ls="", ms=4.5), "measured, 95 % interval"))
-        entries.append((Line2D([], [], color=DARK_GREY, lw=1.2), "predicted"))
-    elif any(place.reference is not None for series in picture.series for place in series.places):
-        entries.append((Line2D([], [], color=DARK_GREY, marker="o", lw=1.5, ms=4), LAW_NAMES["emulated"]))
-        entries.append((Line2D([], [], color=DARK_GREY, lw=1.0, ls=(0, (4, 2))), LAW_NAMES["continuous"]))
-    if any(place.value is None for series in picture.series for place in series.places):
-        entries.append((Line2D([], [], color=BLACK, marker="x", ls="", ms=5), "no result"))
+        enter("measured, 95 % interval", marker="o", ls="", ms=4.5)
+        enter("predicted", lw=1.2)
+    elif any(place.reference is not None for place in picture.places):
+        enter(LAW_NAMES["emulated"], marker="o", lw=1.5, ms=4)
+        enter(LAW_NAMES["continuous"], lw=1.0, ls=(0, (4, 2)))
+    if any(place.value is None for place in picture.places):
+        enter("no result", BLACK, marker="x", ls="", ms=5)
     if entries:
         figure.legend(*zip(*entries, strict=True), loc="outside upper right", ncols=3)
     if len(picture.series) > 1:
@@ -418,9 +388,3 @@ def _add_legend(figure: Figure, axes: Axes, picture: Picture, colours: Sequence[
         handles = [Line2D([], [], color=colours[i], marker=_SHAPES[i % len(_SHAPES)], ms=4.5, lw=1.2) for i in chosen]
         names = [plain(picture.words(picture.series[i].values)) for i in chosen]
         axes.legend(handles, names, loc="upper left", bbox_to_anchor=(1.0, 1.02), borderaxespad=0.4)
-
-
-def _series_colours(count: int) -> list[Any]:
-    if count <= _IN_LEGEND:
-        return list(MODE_COLOURS[:count])
-    return list(mpl.colormaps["viridis"](np.linspace(0, 0.92, count)))

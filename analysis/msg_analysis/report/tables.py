@@ -17,7 +17,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from msg_analysis.common.text import agent_name, counted, half_width_text, listed, number_text, p_text, z_text
+from msg_analysis.common.text import (
+    agent_name,
+    agent_text,
+    counted,
+    half_width_text,
+    listed,
+    number_text,
+    p_text,
+    z_text,
+)
 from msg_analysis.experiment.loading import amount
 from msg_analysis.runs import RunEntry
 from msg_analysis.sweeps.grid import Sweep
@@ -45,27 +54,63 @@ def number_table(console: Console, title: str, first: str, *numbers: str) -> Tab
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Print a table of ``number_table``: a narrow terminal folds words and headings, but never cuts a number.
-
-    Where there is no terminal, nothing is folded.
-    """
-    heads = [str(column.header) for column in table.columns]
-    cells = [[str(cell) for cell in column.cells] for column in table.columns]
-    widest = 1 + sum(MARGIN + max(map(cell_len, [head, *column])) for head, column in zip(heads, cells, strict=True))
+    """Print a ``number_table``: a narrow terminal folds words and headings, but never numbers; a pipe nothing."""
+    cells = [[str(column.header), *map(str, column.cells)] for column in table.columns]
+    widest = _width(cells)
     if widest <= console.width or not console.is_terminal:
         print_wide(console, table, widest)
-    else:
-        for column, head, texts in zip(table.columns[1:], heads[1:], cells[1:], strict=True):
-            column.min_width = _least_width(head, texts)
-            if all(map(_NUMBER.fullmatch, texts)):
-                column.width = column.min_width
-        least = 1 + sum(MARGIN + (column.min_width or 0) for column in table.columns[1:])
-        print_wide(console, table, least + MARGIN + (table.columns[0].min_width or LEAST_NAME))
+        return
+    for column, (head, *texts) in zip(table.columns[1:], cells[1:], strict=True):
+        parts = [part for cell in texts for part in ([cell] if _NUMBER.fullmatch(cell) else cell.split(" "))]
+        column.min_width = max(map(cell_len, [*head.split(" "), *parts]), default=0)
+        if all(map(_NUMBER.fullmatch, texts)):
+            column.width = column.min_width
+    least = 1 + sum(MARGIN + (column.min_width or 0) for column in table.columns[1:])
+    print_wide(console, table, least + MARGIN + (table.columns[0].min_width or LEAST_NAME))
+
+
+def print_rows(
+    console: Console,
+    title: str,
+    heads: Sequence[str],
+    rows: Iterable[Sequence[str | Text]],
+    what: str = "",
+    where: str = "--json",
+) -> None:
+    """Print a heading and a ``number_table`` of plain texts: all rows, or the first ones where they are called so."""
+    table = number_table(console, title, *heads)
+    for row in first_rows(table, rows, what, where) if what else rows:
+        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    print_table(console, table)
+
+
+def print_errors(
+    console: Console,
+    title: str,
+    heads: Sequence[str],
+    system: Sequence[str],
+    agents: Iterable[Sequence[str]],
+    names: Sequence[str] | None,
+    last: Sequence[str] = (),
+) -> None:
+    """Print numbers of the system, then those of each agent; ``last``: a row below."""
+    table = number_table(console, title, "", *heads)
+    table.add_row("system", *system, end_section=True)
+    for agent, cells in enumerate(first_rows(table, agents, "agents"), start=1):
+        table.add_row(Text(agent_text(agent, names)), *cells)
+    if last:
+        table.add_section()
+        table.add_row(*last)
+    print_table(console, table)
+
+
+def _width(columns: Iterable[Sequence[str]]) -> int:
+    return 1 + sum(MARGIN + max(map(cell_len, cells)) for cells in columns)
 
 
 def table_width(columns: Mapping[str, Sequence[str]]) -> int:
     """Width of a ``number_table`` with these headings and cells, if nothing is folded."""
-    return 1 + sum(MARGIN + max(map(cell_len, (head, *cells))) for head, cells in columns.items())
+    return _width([head, *cells] for head, cells in columns.items())
 
 
 def that_fit(
@@ -85,12 +130,6 @@ def print_wide(console: Console, table: Table, least: int) -> None:
     console.width = max(width, least)
     console.print(table)
     console.width = width
-
-
-def _least_width(head: str, cells: Sequence[str]) -> int:
-    """Of a column whose heading and words may be folded, but not its numbers."""
-    parts = [part for cell in cells for part in ([cell] if _NUMBER.fullmatch(cell) else cell.split(" "))]
-    return max(map(cell_len, [*head.split(" "), *parts]), default=0)
 
 
 def fact_table(console: Console, title: str) -> Table:
@@ -124,12 +163,10 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     facts.add_row("problem", f"{document['problem']} of {document['agents']} agents in {document['time']} time")
     if names:
         facts.add_row("agents", Text(listed(names)))
-    if document["leaders"]:
-        leaders = document["leaders"]
+    if leaders := document["leaders"]:
         named = listed([agent_name(agent, names) for agent in leaders["agents"]])
-        text = f"{named}, gain {leaders['gain']}, reference {leaders['reference']}"
-        facts.add_row("leaders", Text(text))
-    add_protocol(facts, document.get("protocol"))
+        facts.add_row("leaders", Text(f"{named}, gain {leaders['gain']}, reference {leaders['reference']}"))
+    _add_protocol(facts, document.get("protocol"))
     facts.add_row("noise", Text(_noise(document["noise"], names)))
     facts.add_row("steps", f"{run['steps']} of {number_text(run['dt'])}, {number_text(run['duration'])} units of time")
     facts.add_row("stability limit of dt", number_text(document["stability_limit"]))
@@ -142,25 +179,17 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     facts.add_row("memory", f"states {amount(memory['states'])}, graphs {amount(memory['matrices'])}")
     facts.add_row("can be run", "yes" if not document["unavailable"] else "no")
     console.print(facts)
-    columns = ("connectivity", "share", "held for", "dt limit")
-    graphs = number_table(console, "Graphs", "graph", *columns)
+    graphs = number_table(console, "Graphs", "graph", "connectivity", "share", "held for", "dt limit")
     graphs.add_column("links", overflow="fold")
+    keys = ("algebraic_connectivity", "stationary", "mean_holding_time", "stability_limit")
     for graph in document["graphs"]:
-        graphs.add_row(
-            Text(graph["name"]),
-            number_text(graph["algebraic_connectivity"]),
-            number_text(graph["stationary"]),
-            number_text(graph["mean_holding_time"]),
-            number_text(graph["stability_limit"]),
-            Text(_links(graph, names)),
-        )
+        graphs.add_row(Text(graph["name"]), *(number_text(graph[key]) for key in keys), Text(_links(graph, names)))
     console.print(graphs)
-    switching = document["switching"]
     title = "Switching rates" if document["time"] == "continuous" else "Switching probabilities"
     modes = [graph["name"] for graph in document["graphs"]]
     if 1 < len(modes) <= ROWS:
         chain = number_table(console, title, "from / to", *modes)
-        for name, row in zip(modes, switching["matrix"], strict=True):
+        for name, row in zip(modes, document["switching"]["matrix"], strict=True):
             chain.add_row(Text(name), *map(number_text, row))
         console.print(chain)
     for line in document["unavailable"]:
@@ -188,9 +217,8 @@ def gaps(count: dict[str, Any]) -> list[str]:
     return lines
 
 
-def add_protocol(facts: Table, protocol: dict[str, Any] | None) -> None:
-    """Add rows for the protocol of a document of ``info``; none for the built-in law (None)."""
-    if protocol is None:
+def _add_protocol(facts: Table, protocol: dict[str, Any] | None) -> None:
+    if protocol is None:  # the built-in law
         return
     kind = "linear" if protocol["linear"] else "not linear, no prediction"
     facts.add_row("protocol", Text(f"{protocol['name']} of {protocol['package']} {protocol['version']}, {kind}"))
@@ -234,14 +262,11 @@ _TOPICS = 12  # most topics listed; --json has all
 
 
 def print_bag(document: dict[str, Any], console: Console) -> None:
-    """Print what a bag holds: a document of ``msg_analysis.report.documents.describe_bag``."""
+    """Print what a bag holds: a document of ``describe_bag``."""
     facts = fact_table(console, document["bag"])
     if document["recording"]:
         facts.add_row("recording", f"process {document['recording']} is still writing it")
-    if document["problem"]:
-        facts.add_row("not a run", Text(document["problem"], style="yellow"))
-    else:
-        _add_run(facts, document)
+    _add_run(facts, document)
     topics = document["topics"]
     for topic in topics[:_TOPICS]:
         facts.add_row("topic", Text(f"{topic['name']}, {counted(topic['messages'], 'message')}, {topic['type']}"))
@@ -256,10 +281,13 @@ def print_bag(document: dict[str, Any], console: Console) -> None:
 
 
 def _add_run(facts: Table, document: dict[str, Any]) -> None:
+    if document["problem"]:
+        facts.add_row("not a run", Text(document["problem"], style="yellow"))
+        return
     count = document["completeness"]
     facts.add_row("run", document["run"])
     facts.add_row("experiment", f"{document['experiment']}, seed {document['seed']}")
-    add_protocol(facts, document.get("protocol"))
+    _add_protocol(facts, document.get("protocol"))
     facts.add_row("agents, replicas", f"{document['agents']}, {document['replicas']}")
     facts.add_row("steps", f"{document['steps']}, {number_text(document['simulated_time'])} units of time")
     state = "complete" if count["complete"] else "incomplete"
@@ -290,12 +318,12 @@ def _state_of(file: dict[str, Any]) -> str:
 
 
 def print_salvage(document: dict[str, Any], console: Console) -> None:
-    """Print what was saved of a torn bag and what was dropped: a document of ``info.describe_salvage``."""
+    """Print what was saved of a torn bag and what was dropped: a document of ``describe_salvage``."""
     facts = fact_table(console, document["bag"])
     facts.add_row("kept", counted(document["kept_messages"], "message"))
-    dropped = (
-        [f"{amount(document['dropped_bytes'])} after the last complete record"] if document["dropped_bytes"] else []
-    )
+    dropped, size = [], document["dropped_bytes"]
+    if size:
+        dropped.append(f"{amount(size)} after the last complete record")
     if document["damaged_chunks"]:
         known = f" with {counted(document['lost_messages'], 'message')}" if document["lost_messages"] else ""
         dropped.append(f"{counted(document['damaged_chunks'], 'damaged chunk')}{known}")
@@ -304,24 +332,16 @@ def print_salvage(document: dict[str, Any], console: Console) -> None:
     facts.add_row("dropped", ", ".join(dropped) or "nothing")
     if document["torn"]:
         facts.add_row("torn", Text(document["torn"]))
-    if document["problem"]:
-        facts.add_row("not a run", Text(document["problem"], style="yellow"))
-    else:
-        _add_run(facts, document)
+    _add_run(facts, document)
     console.print(facts)
 
 
 _STYLES = {"agrees": "green", "disagrees": "bold red", "incomplete": "yellow"}
-
-
 _OPTIONAL = ("predicted", "z", "± (95 %)", "date", "experiment")  # of runs, as in ``that_fit``
 
 
 def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Console) -> None:
-    """Print the runs as a table, one line each; ``total``: how many there are in the folder.
-
-    Names, which other commands take, are never cut; a narrow terminal leaves out numbers instead.
-    """
+    """Print the runs, one line each, of ``total`` in the folder; names, which other commands take, are never cut."""
     if not runs:
         console.print(Text(f"{folder}: no run" if not total else f"{folder}: none of {counted(total, 'run')}"))
         return
@@ -340,17 +360,15 @@ def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Cons
         ]
         for run in runs
     ]
-    columns: dict[str, Sequence[str]] = dict(zip(heads, zip(*rows, strict=True), strict=True))
+    columns = dict(zip(heads, zip(*rows, strict=True), strict=True))
     if all(Path(run.folder).name.startswith(f"{run.name}_{run.date:%Y%m%d_%H%M}") for run in runs):
         del columns["experiment"], columns["date"]  # the names of the folders have them
-    columns = that_fit(console, columns, _OPTIONAL)
-    table = number_table(console, f"Runs in {folder}", *columns)
-    for run, cells in zip(runs, zip(*columns.values(), strict=True), strict=True):
-        style = _STYLES.get(run.verdict or "", "dim" if run.verdict is None else "")
-        table.add_row(
-            *(Text(cell, style if head == "verdict" else "") for head, cell in zip(columns, cells, strict=True))
-        )
-    print_wide(console, table, table_width(columns))
+    shown = that_fit(console, columns, _OPTIONAL)
+    table = number_table(console, f"Runs in {folder}", *shown)
+    for run, cells in zip(runs, zip(*shown.values(), strict=True), strict=True):
+        styles = {"verdict": _STYLES.get(run.verdict or "", "dim" if run.verdict is None else "")}
+        table.add_row(*(Text(cell, styles.get(head, "")) for head, cell in zip(shown, cells, strict=True)))
+    print_wide(console, table, table_width(shown))
     counts = Counter(run.verdict or run.status for run in runs)
     number = f"{counted(len(runs), 'run')}{f' of {total}' if len(runs) < total else ''}"
     console.print(Text(f"{number}: {', '.join(f'{count} {word}' for word, count in counts.most_common())}"))
@@ -380,17 +398,13 @@ def print_sweep(sweep: Sweep, document: dict[str, Any], picture: Picture, consol
     """Print a table of what the figure shows, what failed, and the verdict; ``document`` of ``describe_sweep``."""
     heads = ["measured", "± (95 %)", "predicted"] if picture.measured else [picture.y, "in continuous time"]
     several = len(picture.series) > 1
-    first = [picture.x] if several else []
-    table = number_table(console, f"{sweep.name}: {picture.y}", "" if several else picture.x, *first, *heads)
-    places = [(series.label, place) for series in picture.series for place in series.places]
-    for label, place in first_rows(table, places, "rows"):
-        numbers = [number_text(place.value)]
-        if picture.measured:
-            numbers += [half_width_text((place.low, place.high)), number_text(place.predicted)]
-        else:
-            numbers += [number_text(place.reference)]
-        table.add_row(*([Text(label)] if several else []), Text(value_text(place.x)), *numbers)
-    print_table(console, table)
+    heads = [*([""] if several else []), picture.x, *heads]
+    rows = []
+    for label, place in ((series.label, place) for series in picture.series for place in series.places):
+        others = [half_width_text((place.low, place.high)), number_text(place.predicted)]
+        numbers = [number_text(place.value), *(others if picture.measured else [number_text(place.reference)])]
+        rows.append([*([label] if several else []), value_text(place.x), *numbers])
+    print_rows(console, f"{sweep.name}: {picture.y}", heads, rows, "rows")
     for row in [row for row in document["points"] if row["status"] == FAILED][:ROWS]:
         console.print(Text(f"point {row['point']}: no result: {row['reason']}"))
     for row in [row for row in document["points"] if row.get("verdict") == "disagrees"][:ROWS]:

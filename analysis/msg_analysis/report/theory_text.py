@@ -12,18 +12,8 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from msg_analysis.common.text import (
-    agent_name,
-    agent_text,
-    counted,
-    duration_text,
-    listed,
-    number_text,
-    p_text,
-    percent,
-    z_text,
-)
-from msg_analysis.report.tables import fact_table, first_rows, interval_text, number_table, print_table
+from msg_analysis.common.text import agent_name, counted, duration_text, listed, number_text, p_text, percent, z_text
+from msg_analysis.report.tables import fact_table, interval_text, number_table, print_errors, print_rows, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 
 _METHODS = {"exhaustive": "exhaustive search", "greedy": "greedy selection", "swap": "greedy selection with exchanges"}
@@ -36,18 +26,14 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
         for key in LAW_NAMES
         if document.get(key) is not None
     }
-    errors = number_table(console, "Mean-square error in the steady state", "", *laws)
-    errors.add_row("system", *(number_text(law["system_error"]) for law in laws.values()), end_section=True)
-    for agent in first_rows(errors, range(document["agents"]), "agents"):
-        name = Text(agent_text(agent + 1, document.get("names")))
-        errors.add_row(name, *(number_text(law["node_errors"][agent]) for law in laws.values()))
-    errors.add_section()
-    errors.add_row("certainty", *(number_text(law["system_certainty"]) for law in laws.values()))
-    console.print(errors)
-    modes = number_table(console, "Graphs", "graph", "share of time")
-    for name, share in zip(document["modes"], document["stationary"], strict=True):
-        modes.add_row(Text(name), number_text(share))
-    console.print(modes)
+    system, certainty = (
+        [number_text(law[key]) for law in laws.values()] for key in ("system_error", "system_certainty")
+    )
+    agents = (list(map(number_text, row)) for row in zip(*(law["node_errors"] for law in laws.values()), strict=True))
+    title = "Mean-square error in the steady state"
+    print_errors(console, title, list(laws), system, agents, document.get("names"), ["certainty", *certainty])
+    shares = [(name, number_text(share)) for name, share in zip(document["modes"], document["stationary"], strict=True)]
+    print_rows(console, "Graphs", ["graph", "share of time"], shares)
     for key, title in LAW_NAMES.items():
         if key in document and document[key] is None:
             console.print(f"{title.capitalize()}: infinite, or not defined with this noise", style="dim")
@@ -80,17 +66,12 @@ def print_leaders(document: dict[str, Any], console: Console) -> None:
     gain = "held at the reference" if document["gain"] == "inf" else f"gain {document['gain']:g}"
     law = LAW_NAMES[document["law"]]
     what = "Single leaders" if document["count"] == 1 else f"Sets of {document['count']} leaders"
-    title = f"{what}, {gain}, {law}"
-    centrality = "joint centrality" if document["gain"] == "inf" else "certainty"
-    table = number_table(console, title, "agents", "system error", centrality)
-    for entry in first_rows(table, document["sets"], "sets"):
-        row = (
-            Text(_named(entry, document)),
-            number_text(entry["system_error"]),
-            number_text(entry["joint_centrality"]),
-        )
-        table.add_row(*row)
-    print_table(console, table)
+    heads = ["agents", "system error", "joint centrality" if document["gain"] == "inf" else "certainty"]
+    rows = [
+        (_named(entry, document), number_text(entry["system_error"]), number_text(entry["joint_centrality"]))
+        for entry in document["sets"]
+    ]
+    print_rows(console, f"{what}, {gain}, {law}", heads, rows, "sets")
     facts = fact_table(console, f"Method: {_METHODS[document['method']]}")
     facts.add_row("system errors computed", str(document["evaluations"]))
     bound, gap = document["bound"]["system_error"], document["bound"]["gap"]
@@ -110,24 +91,19 @@ def print_transient(document: dict[str, Any], console: Console) -> None:
     """Print the system error over time with the law of the graph; settling time and rates."""
     key = "system_second_moment" if document["unreduced"] else "system_error"
     title = f"Transient from the start of the run, {LAW_NAMES[document['law']]}"
-    columns = [key.replace("_", " ")]
     few = len(document["modes"]) <= 6
-    if few:
-        columns += [f"P({name})" for name in document["modes"]]
-    table = number_table(console, title, "time", *columns)
-    rows = list(zip(document["times"], document[key], document["graph_law"], strict=True))
-    for time, error, law in first_rows(table, rows, "times", "--json or --csv"):
-        table.add_row(number_text(time), number_text(error), *map(number_text, law if few else []))
-    print_table(console, table)
+    heads = ["time", key.replace("_", " "), *(f"P({name})" for name in document["modes"] if few)]
+    found = zip(document["times"], document[key], document["graph_law"], strict=True)
+    rows = [list(map(number_text, (time, error, *(law if few else ())))) for time, error, law in found]
+    print_rows(console, title, heads, rows, "times", "--json or --csv")
     settling, rates = document["settling"], document["rates"]
     share = f"{100 * settling['fraction']:g} %"
     facts = fact_table(console, "Steady state and rates")
     facts.add_row("system error in the steady state", number_text(document["steady_system_error"]))
     facts.add_row(f"settling time ({share}), from this start", number_text(settling["from_start"]))
     facts.add_row(f"settling time ({share}), from zero", number_text(settling["from_zero"]))
-    facts.add_row("decay rate of means", number_text(rates["mean"]))
-    facts.add_row("decay rate of second moments", number_text(rates["second_moment"]))
-    facts.add_row("decay rate of graph probabilities", number_text(rates["graph"]))
+    for key, what in {"mean": "means", "second_moment": "second moments", "graph": "graph probabilities"}.items():
+        facts.add_row(f"decay rate of {what}", number_text(rates[key]))
     console.print(facts)
 
 
@@ -139,11 +115,17 @@ def print_facts(document: dict[str, Any], console: Console) -> None:
     if bounds["lower"] is None and bounds["upper"] is None:
         console.print(Text(f"No bounds of the system error: {bounds['note']}", style="dim"))
     else:
+        lower, upper = number_text(bounds["lower"]), number_text(bounds["upper"])
         console.print(Text("Bounds of the system error for all switching rates", style="bold"))
-        console.print(
-            Text(f"  {number_text(bounds['lower'])} <= E <= {number_text(bounds['upper'])}   ({bounds['note']})")
-        )
-    _print_graphs(document, console)
+        console.print(Text(f"  {lower} <= E <= {upper}   ({bounds['note']})"))
+    if shown := [entry for entry in document["graphs"] if entry]:
+        table = number_table(console, "Undirected connected graphs", "graph", "Kirchhoff index")
+        first = ", ".join(agent_name(agent, document.get("names")) for agent in (1, 2))
+        table.add_column(Text(f"information centrality of agents {first}, ..."), overflow="fold")
+        for entry in shown:
+            values = listed([number_text(value) for value in entry["information_centrality"]])
+            table.add_row(Text(entry["name"]), number_text(entry["kirchhoff_index"]), values)
+        print_table(console, table)
     for law, form in (document["two_topology"] or {}).items():
         _print_form(law, form, document.get("names"), console)
     for note in document["notes"]:
@@ -161,34 +143,16 @@ def _print_lemmas(facts: list[dict[str, Any]], console: Console) -> None:
     print_table(console, table)
 
 
-def _print_graphs(document: dict[str, Any], console: Console) -> None:
-    shown = [entry for entry in document["graphs"] if entry]
-    if not shown:
-        return
-    table = number_table(console, "Undirected connected graphs", "graph")
-    table.add_column("Kirchhoff index", justify="right")
-    first = ", ".join(agent_name(agent, document.get("names")) for agent in (1, 2))
-    table.add_column(Text(f"information centrality of agents {first}, ..."), overflow="fold")
-    for entry in shown:
-        centrality = entry["information_centrality"]
-        values = listed([number_text(value) for value in centrality])
-        table.add_row(Text(entry["name"]), number_text(entry["kirchhoff_index"]), values)
-    print_table(console, table)
-
-
 def _print_form(law: str, form: dict[str, Any], names: Sequence[str] | None, console: Console) -> None:
     title = f"Two graphs in closed form, {LAW_NAMES[law]}, beta = {number_text(form['rate'])}"
-    table = number_table(console, title, "", "static", "switching adds", "error", "fastest adds")
     keys = ("static", "switching", "error", "fast")
-    table.add_row("system", *(number_text(form["system"][key]) for key in keys), end_section=True)
     rows = [
         # Rounding errors, for agents for which nothing changes.
-        [0.0 if abs(value) < 1e-14 * abs(row[0]) else value for value in row]
+        [number_text(0.0 if abs(value) < 1e-14 * abs(row[0]) else value) for value in row]
         for row in zip(*(form["nodes"][key] for key in keys), strict=True)
     ]
-    for agent, row in enumerate(first_rows(table, rows, "agents"), start=1):
-        table.add_row(Text(agent_text(agent, names)), *map(number_text, row))
-    print_table(console, table)
+    heads = ("static", "switching adds", "error", "fastest adds")
+    print_errors(console, title, heads, [number_text(form["system"][key]) for key in keys], rows, names)
 
 
 def print_plan(document: dict[str, Any], console: Console) -> None:
@@ -198,41 +162,29 @@ def print_plan(document: dict[str, Any], console: Console) -> None:
     facts = fact_table(console, f"Plan of {document['experiment']}")
     facts.add_row("predicted system error", number_text(document["system_error"]))
     facts.add_row("as configured", _run_text(document["file"]))
-    if document["budget"]:
-        budget = document["budget"]
+    if budget := document["budget"]:
         facts.add_row(f"best run in {duration_text(budget['time'])}", _run_text(budget))
     if document["warm_up"]:
         facts.add_row("warm-up", f"{document['warm_up']} steps, in every length below")
-    if rate:
-        facts.add_row("speed", f"{number_text(rate)} steps per second")
-    else:
-        facts.add_row("speed", "not known: --speed gives the wall time")
+    speed = f"{number_text(rate)} steps per second" if rate else "not known: --speed gives the wall time"
+    facts.add_row("speed", speed)
     console.print(facts)
-    table = number_table(
-        console,
-        f"Run length for ± {sought} (95 %): evaluated once at the end, or monitored throughout",
-        "replicas",
-        *("steps", "duration", "wall time"),
-        *("steps, monitored", "wall time, monitored"),
-    )
+    title = f"Run length for ± {sought} (95 %): evaluated once at the end, or monitored throughout"
+    heads = ("steps", "duration", "wall time", "steps, monitored", "wall time, monitored")
+    table = number_table(console, title, "replicas", *heads)
     table.columns[0].justify = "right"
     for row in document["lengths"]:
-        table.add_row(
-            str(row["replicas"]),
-            _count(row["steps"]),
-            number_text(row["duration"]),
-            _time(row["wall_time"]),
-            _count(row["any_time_steps"]),
-            _time(row["any_time_wall_time"]),
-        )
+        once = (_count(row["steps"]), number_text(row["duration"]), _time(row["wall_time"]))
+        table.add_row(str(row["replicas"]), *once, _count(row["any_time_steps"]), _time(row["any_time_wall_time"]))
     print_table(console, table)
     steps = document["file"]["steps"]
     title = f"Detectable faults: power of the tests in {steps} steps, false-alarm rate {percent(document['level'])}"
-    table = number_table(console, title, "fault", "power", "steps for 99 %", "steps, monitored")
-    for row in document["faults"]:
-        table.add_row(Text(row["fault"]), percent(row["power"]), _count(row["steps"]), _count(row["any_time_steps"]))
-    if document["faults"]:
-        print_table(console, table)
+    rows = [
+        (row["fault"], percent(row["power"]), _count(row["steps"]), _count(row["any_time_steps"]))
+        for row in document["faults"]
+    ]
+    if rows:
+        print_rows(console, title, ("fault", "power", "steps for 99 %", "steps, monitored"), rows)
     for note in document["notes"]:
         console.print(Text(f"Note: {note}", style="yellow"))
 
@@ -270,25 +222,22 @@ def _count(steps: float | None) -> str:
 
 def print_spectrum(document: dict[str, Any], console: Console) -> None:
     """Print a document of ``MeasuredSpectrum.to_json()``: some lags and frequencies, and the test of a log."""
-    lags = number_table(console, f"Autocovariance of {document['experiment']}", "lag", "system", "correlation")
-    course, error = document["system_autocovariance"], document["system_error"]
-    for place in _some(len(course)):
-        share = "-" if not error else number_text(course[place] / error, 3)
-        lags.add_row(number_text(document["lags"][place]), number_text(course[place]), share)
-    console.print(lags)
-    density = number_table(console, "Spectral density, one-sided", "frequency", "system")
-    for place in _some(len(document["frequencies"])):
-        density.add_row(number_text(document["frequencies"][place], 3), number_text(document["system_density"][place]))
-    console.print(density)
-    log = document["log"]
-    if log:
-        heads = ("predicted", "measured", "corrected for graphs", "95 % interval", "z")
-        table = number_table(console, f"The log, {log['steps']} steps", "lag", *heads)
-        keys = ("lags", "predicted", "measured", "corrected", "intervals", "z")
-        for lag, *numbers, interval, z in zip(*(log[key] for key in keys), strict=True):
-            cells = (*map(number_text, numbers), interval_text(interval), z_text(z))
-            table.add_row(number_text(lag), *cells)
-        print_table(console, table)
+    lags, course, error = document["lags"], document["system_autocovariance"], document["system_error"]
+    rows = [
+        [number_text(lags[at]), number_text(course[at]), number_text(course[at] / error, 3) if error else "-"]
+        for at in _some(len(course))
+    ]
+    print_rows(console, f"Autocovariance of {document['experiment']}", ("lag", "system", "correlation"), rows)
+    frequencies, density = document["frequencies"], document["system_density"]
+    rows = [[number_text(frequencies[at], 3), number_text(density[at])] for at in _some(len(frequencies))]
+    print_rows(console, "Spectral density, one-sided", ("frequency", "system"), rows)
+    if log := document["log"]:
+        heads = ("lag", "predicted", "measured", "corrected for graphs", "95 % interval", "z")
+        found = zip(
+            *(log[key] for key in ("lags", "predicted", "measured", "corrected", "intervals", "z")), strict=True
+        )
+        rows = [[*map(number_text, numbers), interval_text(interval), z_text(z)] for *numbers, interval, z in found]
+        print_rows(console, f"The log, {log['steps']} steps", heads, rows)
         if log["p"] is not None:
             verdict = "agrees with" if log["p"] >= document["level"] else "disagrees with"
             console.print(f"The log {verdict} the predicted autocovariance: p = {p_text(log['p'])}.")

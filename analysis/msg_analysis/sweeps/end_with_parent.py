@@ -1,10 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Lets a process get a signal when its parent has ended. As a program: does so, and becomes a command.
-
-Arguments: PARENT_PID COMMAND... The signal is Linux only (PR_SET_PDEATHSIG); elsewhere the command runs without it.
-"""
+"""Becomes a command that gets a signal when its parent has ended (on Linux); arguments: PARENT_PID COMMAND..."""
 
 from __future__ import annotations
 

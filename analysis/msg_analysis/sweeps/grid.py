@@ -1,10 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The sweep file and its grid: every point of it is a valid experiment before anything is computed.
-
-All mistakes are reported together, each once, with the points that have it.
-"""
+"""The sweep file and its grid: every point is checked before anything is computed; all mistakes are told together."""
 
 from __future__ import annotations
 
@@ -14,6 +11,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -56,10 +54,9 @@ def _axis(value: object) -> Axis:
         if len(value) > 1 or not isinstance(listed, list) or not listed:
             raise expected("values to be a list with at least one entry, and no other key")
         return Axis(listed)
-    first, last = value.get("from"), value.get("to")
-    if not is_number(first) or not is_number(last) or ("count" in value) == ("step" in value):
+    if not is_number(value.get("from")) or not is_number(value.get("to")) or ("count" in value) == ("step" in value):
         raise expected("numbers `from` and `to`, and either `count` or `step`")
-    return _range(float(first), float(last), value)  # type: ignore[arg-type]
+    return _range(float(value["from"]), float(value["to"]), value)
 
 
 def _range(first: float, last: float, value: dict[str, Any]) -> Axis:
@@ -104,13 +101,11 @@ def _experiment(value: object) -> str | dict[str, Any]:
 
 
 def _precision(value: str) -> str:
-    try:
+    with suppress(InputError):
         until = Until.parse(value)
-    except InputError as error:
-        raise expected("a precision such as 5%") from error
-    if until.decided:  # the runs of a sweep are tested together
-        raise expected("a precision such as 5%")
-    return str(until)
+        if not until.decided:  # the runs of a sweep are tested together
+            return str(until)
+    raise expected("a precision such as 5%")
 
 
 class SweepSpec(BaseModel):
@@ -175,13 +170,9 @@ class KeyProblemError(Exception):
 
 
 def put(document: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """A copy of a document with another value at a place; only the containers on the way are copied.
-
-    Names in the document may have dots in them; missing sections are made. KeyProblemError: the key leads nowhere.
-    """
-    parts = _split(key)
+    """A copy of a document with another value at a place, in new sections if need be; KeyProblemError: nowhere."""
     changed = dict(document)
-    _put(changed, parts, value, key, "")
+    _put(changed, _split(key), value, key, "")
     return changed
 
 
@@ -276,10 +267,7 @@ class Sweep:
 
 
 def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) -> Sweep:
-    """Read a sweep file (YAML; JSON is YAML too) and check every point of it.
-
-    InputError: it, or the file of the experiment, cannot be read. ExperimentError: all mistakes, with their points.
-    """
+    """Read a sweep file in YAML or JSON. InputError: a file cannot be read; ExperimentError: all mistakes."""
     path = Path(path)
     mapping = read_yaml(path)
     if not isinstance(mapping, Mapping):
@@ -292,12 +280,10 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
     except ValidationError as error:
         found = [translate(detail, SweepSpec) for detail in error.errors(include_url=False)]
         raise ExperimentError(str(path), found) from error
-    directory = path.parent
-    base: Any = spec.experiment
+    directory, base = path.parent, spec.experiment
     if isinstance(base, str):
         file = find(base, directory)
-        directory = file.parent
-        base = read_yaml(file)
+        directory, base = file.parent, read_yaml(file)
         if not isinstance(base, Mapping):
             raise ExperimentError(
                 str(path), [problem("experiment", show(base), "expected a file of keys", "correct it")]

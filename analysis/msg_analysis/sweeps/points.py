@@ -1,11 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""One point of a sweep: what is done there, on a worker, and what is left of it.
-
-Theory, twin and statistics are imported only in the jobs that need them; a network is a process of its own,
-``msg-agents run``, so nothing of ROS is imported.
-"""
+"""One point of a sweep: what is done there, on a worker, and what is left of it; a network is a process of its own."""
 
 from __future__ import annotations
 
@@ -23,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -127,7 +123,6 @@ class JobResults:
 
     outcomes: tuple[Outcome, ...]  # in the order of the jobs
     reused: int  # jobs that had been done before
-    others: int  # outcomes in the store that belong to none of the jobs
 
 
 PROGRAM = "msg-agents"
@@ -160,11 +155,7 @@ def options(directory: Path, keep: bool, at_once: int) -> NetworkOptions:
 
 
 def run_network(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
-    """Run a network and read its result, the document of ``msg-agents run --json``.
-
-    InputError has the last line that a failed run wrote to stderr. NetworkStoppedError: ``stopping`` was true, it was
-    ended.
-    """
+    """The document of ``msg-agents run --json``. InputError: the run failed; NetworkStoppedError: it was ended."""
     options = job.network
     assert options is not None
     directory = Path(options.directory) / job.id
@@ -214,10 +205,9 @@ def _run(command: Sequence[str], slot: int, stopping: Callable[[], bool]) -> tup
             _end(process)
         stdout.seek(0)
         stderr.seek(0)
-        try:
-            document: dict[str, Any] | None = json.loads(stdout.read())
-        except ValueError:
-            document = None
+        document: dict[str, Any] | None = None
+        with suppress(ValueError):
+            document = json.loads(stdout.read())
         return document, stderr.read().decode(errors="replace"), process.wait()
 
 
@@ -233,10 +223,8 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 @contextmanager
 def _slot(at_once: int, stopping: Callable[[], bool]) -> Iterator[int]:
-    """Hold one of ``at_once`` places for networks of this user on this machine; waits until one is free.
-
-    A place is a locked file, inherited by the network: it is free when all processes that hold it have ended.
-    """
+    """Hold one of ``at_once`` places for networks of this user on this machine; waits until one is free."""
+    # A place is a locked file, inherited by the network: it is free when all processes that hold it have ended.
     while True:
         for number in range(at_once):
             path = Path(tempfile.gettempdir()) / f"msg_agents_sweep_{os.getuid()}_{number}.lock"
@@ -257,10 +245,7 @@ def _slot(at_once: int, stopping: Callable[[], bool]) -> Iterator[int]:
 
 
 def evaluate(job: Job, stopping: Callable[[], bool] = lambda: False) -> Outcome:
-    """Do a job. An error becomes a failed outcome, so that the other points go on.
-
-    ``stopping`` is asked while a network runs; if the sweep is being ended, NetworkStoppedError is raised.
-    """
+    """Do a job; an error becomes a failed outcome. NetworkStoppedError: ``stopping`` ended a network."""
     begin = time.perf_counter()
     reason: str | None = None
     result: Mapping[str, Any] = {}
@@ -274,7 +259,7 @@ def evaluate(job: Job, stopping: Callable[[], bool] = lambda: False) -> Outcome:
         raise
     except MemoryError:
         reason = "out of memory"
-    except Exception as error:  # a defect, perhaps of this point only
+    except Exception as error:  # a defect, perhaps of this point only: the others go on
         reason = f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - begin
     place = f"{socket.gethostname()}:{os.getpid()}"
@@ -308,10 +293,8 @@ def of_prediction(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def of_comparison(document: Mapping[str, Any]) -> dict[str, Any]:
-    """What is left of a comparison, as ``compare --json`` prints it: the errors and the least p-value of its tests.
-
-    As the p-values are adjusted, the least one is a p-value of the hypothesis that the run follows its law.
-    """
+    """What is left of a comparison, as ``compare --json`` prints it: the errors and the least p-value of its tests."""
+    # As the p-values are adjusted, the least one is a p-value of the hypothesis that the run follows its law.
     least = min(document.get("tests") or [], key=lambda test: test["p_adjusted"], default=None)
     keys = ("verdict", "unpredicted", "steps", "simulated_time", "law", "system_error", "node_errors", "bag", "rate")
     causes = document.get("blame") or []

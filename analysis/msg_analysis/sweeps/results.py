@@ -21,6 +21,7 @@ import numpy as np
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import HALF_WIDTH_95, agent_text, json_text
 from msg_analysis.errors import ExitCode, InputError
+from msg_analysis.experiment.network_spec import is_number
 from msg_analysis.experiment.problems import show
 from msg_analysis.inference.statistics import holm
 from msg_analysis.sweeps.grid import Sweep
@@ -79,10 +80,7 @@ class ResultStore:
 
     @classmethod
     def open(cls, directory: str | Path) -> Self:
-        """Open a directory, made if needed, and read its outcomes.
-
-        InputError: another process writes there, or the directory cannot be used.
-        """
+        """Read the outcomes in a directory, made if needed. InputError: it cannot be used, or another sweep does."""
         directory = Path(directory)
         path = directory / JOURNAL
         try:
@@ -159,39 +157,31 @@ class SweepVerdict:
     @property
     def exit_code(self) -> int:
         """0 agrees or only predictions, 1 disagrees, 3 something failed."""
-        if self.verdict == "disagrees":
-            return ExitCode.DISAGREES
-        return ExitCode.INCOMPLETE if self.verdict == "incomplete" else ExitCode.FINE
+        codes = {"disagrees": ExitCode.DISAGREES, "incomplete": ExitCode.INCOMPLETE}
+        return codes.get(self.verdict or "", ExitCode.FINE)
 
 
 def evaluate_sweep(outcomes: Sequence[Outcome], level: float) -> SweepVerdict:
     """Test all runs together (Holm): the probability of any false "disagrees" is at most ``level``."""
-    p_values: list[float | None] = [outcome.result.get("p") if outcome.status == DONE else None for outcome in outcomes]
-    tested = [place for place, p in enumerate(p_values) if p is not None]
+    p_values = {place: outcome.result.get("p") for place, outcome in enumerate(outcomes) if outcome.status == DONE}
+    tested = {place: p for place, p in p_values.items() if p is not None}
     adjusted: list[float | None] = [None] * len(outcomes)
     if tested:
-        for place, p in zip(tested, holm(np.array([p_values[place] for place in tested], dtype=float)), strict=True):
+        for place, p in zip(tested, holm(np.array([*tested.values()], dtype=float)), strict=True):
             adjusted[place] = float(p)
-    verdicts = tuple(_verdict(outcome, p, level) for outcome, p in zip(outcomes, adjusted, strict=True))
+    verdicts: list[str | None] = []
+    for outcome, p in zip(outcomes, adjusted, strict=True):
+        verdict = "unpredicted" if outcome.result.get("unpredicted") else "agrees"
+        verdict = "disagrees" if p is not None and p < level else verdict
+        verdicts.append(None if outcome.status == FAILED or "verdict" not in outcome.result else verdict)
     whole = "agrees" if any(verdicts) else None
     if any(outcome.status == FAILED for outcome in outcomes):
         whole = "incomplete"
-    return SweepVerdict(tuple(adjusted), verdicts, "disagrees" if "disagrees" in verdicts else whole)
-
-
-def _verdict(outcome: Outcome, p_holm: float | None, level: float) -> str | None:
-    if outcome.status == FAILED or "verdict" not in outcome.result:
-        return None
-    if p_holm is not None and p_holm < level:
-        return "disagrees"
-    return "unpredicted" if outcome.result.get("unpredicted") else "agrees"
+    return SweepVerdict(tuple(adjusted), tuple(verdicts), "disagrees" if "disagrees" in verdicts else whole)
 
 
 def rows_of(sweep: Sweep, outcomes: Sequence[Outcome], verdict: SweepVerdict) -> list[Row]:
-    """One row for each point, by name of the column; what a row does not have is empty there.
-
-    Columns that are empty in all rows are left out, except ``reason`` and the swept keys.
-    """
+    """One row for each point, by name of the column; without columns that are empty in all."""
     rows = []
     for number, (point, outcome) in enumerate(zip(sweep.points, outcomes, strict=True)):
         row: Row = {"point": number + 1, **point.values}
@@ -225,10 +215,6 @@ def _columns(name: str, value: Any) -> Row:
     return {column: entry for key, part in parts.items() for column, entry in _columns(key, part).items()}
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def column_names(rows: Sequence[Row]) -> list[str]:
     """Of all rows, in the order in which they first appear."""
     return list(dict.fromkeys(name for row in rows for name in row))
@@ -244,9 +230,9 @@ def arrow_table(rows: Sequence[Row]) -> pa.Table:
         given = [value for value in values if value is not None]
         if given and all(isinstance(value, bool) for value in given):
             columns[name] = pa.array(values, pa.bool_())
-        elif given and all(_is_number(value) and isinstance(value, int) for value in given):
+        elif given and all(is_number(value) and isinstance(value, int) for value in given):
             columns[name] = pa.array(values, pa.int64() if max(map(abs, given)) < 2**63 else pa.float64())
-        elif given and all(map(_is_number, given)):
+        elif given and all(map(is_number, given)):
             columns[name] = pa.array([None if value is None else float(value) for value in values], pa.float64())
         else:
             texts = [value if value is None or isinstance(value, str) else json.dumps(value) for value in values]
@@ -309,9 +295,19 @@ class Picture:
         return ", ".join(f"{key_words(key, self.names)} = {value_text(value)}" for key, value in values)
 
     @property
+    def places(self) -> list[Place]:
+        """Those of all series."""
+        return [place for series in self.series for place in series.places]
+
+    @property
+    def labels(self) -> list[str]:
+        """The values along the axis, as texts."""
+        return list(dict.fromkeys(show(place.x) for place in self.places))
+
+    @property
     def numeric(self) -> bool:
         """Whether all values along the axis are numbers."""
-        return all(_is_number(place.x) for series in self.series for place in series.places)
+        return all(is_number(place.x) for place in self.places)
 
 
 def several_values(sweep: Sweep) -> list[str]:
@@ -320,16 +316,14 @@ def several_values(sweep: Sweep) -> list[str]:
 
 
 def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None, along: str | None = None) -> Picture:
-    """Choose what to draw of ``rows_of``; InputError where there is no such column of numbers.
-
-    ``along``: the key along the axis, by default the first one with several values. ``column`` may be the beginning of
-    a name: ``system_error`` stands for what is measured or predicted of it.
-    """
-    wanted = column or "system_error"
+    """What to draw of ``rows_of``: a column over the key ``along``. InputError: it is not a column of numbers."""
+    wanted = column or "system_error"  # stands for what is measured or predicted of it
     names = _drawn_columns(rows, wanted)
     if not names["value"]:
         if column is not None:
-            raise InputError(f"--column {wanted}: not a column of numbers: expected one of {_offer(rows)}")
+            short = {name.removesuffix(".measured") for name in _numeric(rows)}
+            offer = sorted(name for name in short if "[" not in name or "[1]" in name)  # of agents, the first one
+            raise InputError(f"--column {wanted}: not a column of numbers: expected one of {', '.join(offer)}")
         names["value"] = wanted  # nothing but failures
     several = several_values(sweep)
     along = along or next(iter(several), sweep.keys[0])
@@ -365,13 +359,7 @@ def _drawn_columns(rows: Sequence[Row], wanted: str) -> dict[str, str | None]:
 def _numeric(rows: Sequence[Row]) -> set[str]:
     """The columns of numbers."""
     given = {name: [row[name] for row in rows if row.get(name) is not None] for name in column_names(rows)}
-    return {name for name, values in given.items() if values and all(map(_is_number, values))}
-
-
-def _offer(rows: Sequence[Row]) -> str:
-    """Names of columns of numbers; those of agents other than the first are left out."""
-    short = {name.removesuffix(".measured") for name in _numeric(rows)}
-    return ", ".join(sorted(name for name in short if "[" not in name or "[1]" in name))
+    return {name for name, values in given.items() if values and all(map(is_number, values))}
 
 
 def _place(along: str, rows: Sequence[Row], names: Mapping[str, str | None]) -> Place:
@@ -397,7 +385,7 @@ def _logarithmic(sweep: Sweep, along: str) -> bool:
     axis = sweep.spec.over[along]
     if axis.logarithmic is not None:
         return axis.logarithmic
-    numbers = list(filter(_is_number, axis))
+    numbers = list(filter(is_number, axis))
     return len(numbers) == len(axis) and min(numbers) > 0 and max(numbers) / min(numbers) >= 50
 
 

@@ -1,10 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The jobs of a sweep on workers: processes of this machine, or a Dask cluster; a worker that dies is replaced.
-
-Items are sent in batches of about half a second of work. What kills workers is tried again alone, then given up.
-"""
+"""The jobs of a sweep on workers: processes of this machine, or a Dask cluster; a worker that dies is replaced."""
 
 from __future__ import annotations
 
@@ -76,17 +73,14 @@ class Lost:
 
 
 def warm_up() -> None:
-    """Begin to start the server that workers are forked from: it imports while this process does other things.
-
-    It ignores Ctrl-C, and so do the workers: this process ends them.
-    """
+    """Begin to start the server that workers are forked from: it imports while this process does other things."""
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return
     from multiprocessing import forkserver
 
     previous = {name: os.environ.get(name) for name in SINGLE_THREAD}
     os.environ.update(SINGLE_THREAD)
-    with _ignoring(signal.SIGINT):
+    with _ignoring(signal.SIGINT):  # and so do the workers: this process ends them
         multiprocessing.get_context("forkserver").set_forkserver_preload(["distributed", *_NEEDED])
         forkserver.ensure_running()
     for name, value in previous.items():
@@ -96,10 +90,7 @@ def warm_up() -> None:
 
 
 class Workers:
-    """Worker processes of this machine (None: one per CPU), or those of the Dask scheduler at an address.
-
-    To be used with ``with``, which raises InputError where no scheduler answers or its workers have other software.
-    """
+    """Worker processes of this machine (None: one per CPU), or those of the Dask scheduler at an address."""
 
     def __init__(self, count: int | None = None, scheduler: str | None = None) -> None:
         self._count = count or count_cores()
@@ -109,7 +100,7 @@ class Workers:
         self._stop_name = f"msg-sweep-stop-{uuid.uuid4().hex}"
 
     def __enter__(self) -> Self:
-        """Start or find the workers."""
+        """Start or find the workers. InputError: no scheduler answers, or its workers have other software."""
         import dask
 
         if not self._scheduler:
@@ -162,10 +153,9 @@ class Workers:
     def outcomes(
         self, function: Function[T, R], items: Sequence[T], *, timeout: float = 2 * NOTICE
     ) -> Generator[list[tuple[T, R | Lost]], None, None]:
-        """Results of ``function`` (at the top of a module) for all items, in batches, as they are ready.
+        """Results of ``function`` (at the top of a module), in batches; interrupted, work has ``timeout`` s to end.
 
-        An item that kills its workers again when tried alone is ``Lost``. If interrupted, running work has ``timeout``
-        [s] to end. WorkersLostError: the scheduler is gone; InputError: other software on a worker.
+        WorkersLostError: the scheduler is gone; InputError: other software on a worker.
         """
         from distributed import as_completed
 
@@ -191,7 +181,7 @@ class Workers:
                     yield list(zip(batch, results, strict=True))
                 elif alone:
                     yield [(batch[0], Lost("killed every worker that tried it, or used up its memory"))]
-                else:
+                else:  # an item of it killed them, or one that a worker had at the same time: each is tried alone
                     suspected += batch
         except BaseException as error:
             self._stop(list(running), timeout)
@@ -205,10 +195,7 @@ class Workers:
         done.add(future)
 
     def _result(self, future: Future) -> tuple[list[Any], float] | None:
-        """Results of a batch and the seconds that it took; None where workers died over and over.
-
-        An item of it may have killed them, or one that a worker had at the same time: each is then tried alone.
-        """
+        """Results of a batch and the seconds that it took; None where workers died over and over."""
         from distributed import KilledWorker
 
         if future.status == "finished":
@@ -331,10 +318,7 @@ def run_jobs(
     retry: bool = False,  # whether failed jobs are done again
     watch: SweepProgress = lambda _done, _total, _failed: None,
 ) -> JobResults:
-    """Do all jobs that have not been done; outcomes are written to ``store`` as soon as they come.
-
-    InputError: outcomes of other software ("refuse"), or no workers. WorkersLostError: the cluster went away.
-    """
+    """Do what has not been done. InputError: outcomes of other software, or no workers; WorkersLostError: they went."""
     todo = _todo(jobs, store, other_software, retry)
     reused = len(jobs) - sum(job.id in todo for job in jobs)
     total = len({job.id for job in jobs})
@@ -349,14 +333,18 @@ def run_jobs(
         timeout = {"timeout": NETWORK_TIMEOUT} if runs_networks else {}
         with Workers(workers, scheduler) as pool, closing(pool.outcomes(evaluate, items, **timeout)) as batches:
             for batch in batches:
-                found = [_lost(job, result) if isinstance(result, Lost) else result for job, result in batch]
+                found = [
+                    Outcome(job.id, FAILED, result.reason, {}, 0.0, "", installed_software())
+                    if isinstance(result, Lost)
+                    else result
+                    for job, result in batch
+                ]
                 with deferring_interrupts():  # the outcomes that are counted are on the disk
                     store.add(found)
                 done += len(found)
                 failed += sum(outcome.status == FAILED for outcome in found)
                 watch(done, total, failed)
-    outcomes = tuple(store.outcomes[job.id] for job in jobs)
-    return JobResults(outcomes, reused, len(store.outcomes.keys() - {job.id for job in jobs}))
+    return JobResults(tuple(store.outcomes[job.id] for job in jobs), reused)
 
 
 def _todo(jobs: Sequence[Job], store: ResultStore, other_software: OtherSoftware, retry: bool) -> dict[str, Job]:
@@ -376,7 +364,3 @@ def _todo(jobs: Sequence[Job], store: ResultStore, other_software: OtherSoftware
             f"{installed_software()}: choose another --out, or use --other-software redo or keep"
         )
     return todo
-
-
-def _lost(job: Job, lost: Lost) -> Outcome:
-    return Outcome(job.id, FAILED, lost.reason, {}, 0.0, "", installed_software())

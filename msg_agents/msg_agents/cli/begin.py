@@ -16,7 +16,7 @@ import click
 
 from msg_analysis.cli.console import examples as example_lines
 from msg_analysis.cli.console import print_json, print_text, result_console
-from msg_analysis.cli.options import PATH, PositiveFloat, json_option
+from msg_analysis.cli.options import PATH, choice_option, json_option, positive_option
 from msg_analysis.errors import ExitCode, InputError
 from msg_analysis.experiment.examples import (
     FOLDER,
@@ -101,20 +101,19 @@ def examples(name: str | None, *, as_json: bool) -> None:
     default=DEFAULT.graphs,
     help="A graph of the network. Repeatable: the network switches between the graphs.",
 )
-@click.option(
+@choice_option(
     "--time",
-    type=click.Choice(["continuous", "discrete"]),
+    ["continuous", "discrete"],
+    "Continuous: Euler steps of run.dt; discrete: one step is one unit of time.",
     default=DEFAULT.time,
-    help="Continuous: Euler steps of run.dt; discrete: one step is one unit of time.",
 )
-@click.option(
+@positive_option(
     "--switching",
-    type=PositiveFloat(),
-    metavar="RATE",
+    "RATE",
+    "How often a graph is left: jumps per unit of time; in discrete time the probability of a jump after a step.",
     default=DEFAULT.switching,
-    help="How often a graph is left: jumps per unit of time; in discrete time the probability of a jump after a step.",
 )
-@click.option("--noise", type=PositiveFloat(), metavar="F", default=DEFAULT.noise, help="Noise gain of all agents.")
+@positive_option("--noise", "F", "Noise gain of all agents.", default=DEFAULT.noise)
 @click.option(
     "--loss",
     type=click.FloatRange(0, 1, max_open=True),
@@ -130,19 +129,17 @@ def examples(name: str | None, *, as_json: bool) -> None:
     metavar="AGENT",
     help="An agent that knows the reference, which the others follow. Repeatable; without one, the agents agree.",
 )
-@click.option(
-    "--duration",
-    type=PositiveFloat(),
-    metavar="T",
-    show_default="4000 steps",
-    help="Duration of the run, in units of simulated time.",
-)
+@positive_option("--duration", "T", "Duration of the run, in units of simulated time.", show_default="4000 steps")
 @json_option
 def new(file: Path, *, as_json: bool, **given: Any) -> None:
     """Write a new experiment, with comments, to FILE.
 
     FILE must not exist. Without options, a terminal asks for the values; otherwise what is not given has its default.
     """
+    from msg_analysis.common.files import require_place, write_whole
+    from msg_analysis.experiment.experiment import Experiment
+    from msg_analysis.experiment.loading import parse_yaml
+
     if file.exists():
         raise InputError(f"{file}: exists already: remove it, or choose another name")
     context = click.get_current_context()
@@ -153,7 +150,11 @@ def new(file: Path, *, as_json: bool, **given: Any) -> None:
     asked = untouched and sys.stdin.isatty() and sys.stderr.isatty()
     chosen = _ask(context.command) if asked else Choices(**given)
     _check(chosen)
-    name = _write(file, chosen)
+    require_place(file)
+    name = experiment_name(file.stem)
+    text = experiment_text(name, chosen)
+    Experiment.parse(parse_yaml(text, str(file)), source=str(file)).require_available()
+    write_whole(file, text.encode())
     if as_json:
         print_json({"file": str(file), "experiment": name})
         return
@@ -161,20 +162,6 @@ def new(file: Path, *, as_json: bool, **given: Any) -> None:
     print_text(str(file))
     print_text(f"Next: msg-analysis predict {word}")
     print_text(f"      msg-agents run {word}")
-
-
-def _write(file: Path, chosen: Choices) -> str:
-    """Check the experiment as a whole, write it, and give its name."""
-    from msg_analysis.common.files import require_place, write_whole
-    from msg_analysis.experiment.experiment import Experiment
-    from msg_analysis.experiment.loading import parse_yaml
-
-    require_place(file)
-    name = experiment_name(file.stem)
-    text = experiment_text(name, chosen)
-    Experiment.parse(parse_yaml(text, str(file)), source=str(file)).require_available()
-    write_whole(file, text.encode())
-    return name
 
 
 def _check(chosen: Choices) -> None:
@@ -261,7 +248,8 @@ def doctor(*, as_json: bool) -> None:
         counted = {"errors": counts["error"], "warnings": counts["warning"]}
         print_json({"can_run": can_run, **counted, "checks": [asdict(check) for check in found]})
     else:
-        console.print(_summary(counts["error"], counts["warning"]), soft_wrap=True)
+        noted = f" ({counts['warning']} warning{'s' * (counts['warning'] > 1)})" if counts["warning"] else ""
+        console.print(f"A run can{'' if can_run else 'not'} work here{noted}.", soft_wrap=True)
     if not can_run:
         sys.exit(ExitCode.BAD_INPUT)
 
@@ -279,8 +267,3 @@ def _print_check(console: Console, check: Check) -> None:
         console.print(row)
     else:
         console.print(Text(" ").join([status, name, Text(check.text)]))
-
-
-def _summary(errors: int, warnings: int) -> str:
-    noted = f" ({warnings} warning{'s' * (warnings > 1)})" if warnings else ""
-    return f"A run cannot work here{noted}." if errors else f"A run can work here{noted}."

@@ -1,11 +1,9 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Installed entry points: the command line, the nodes as executables of the ROS 2 package, and the verb of ``ros2``.
+"""Installed entry points: the command line, its nodes as executables of the ROS 2 package, the verb of ``ros2``."""
 
-Each node is the command of that name of ``msg-agents``: ``ros2 run msg_agents agent --ros-args -p run:=... ...``. This
-module itself loads nothing, so that Ctrl-C during the imports ends the program in order.
-"""
+# This module itself loads nothing, so that Ctrl-C during the imports ends the program in order.
 
 from __future__ import annotations
 

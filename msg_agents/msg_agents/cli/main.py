@@ -9,7 +9,7 @@ input, 3 incomplete data. Modules that take long to import are imported by the c
 
 from __future__ import annotations
 
-import socket
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,24 +17,23 @@ import click
 
 import msg_agents
 from msg_agents.cli import begin, nodes, replay, watching
-from msg_agents.cli.ros_command import RenamedOption
 from msg_agents.cli.run_result import finish
 from msg_agents.cli.watching import WebCommand, announce, page, web_options
 from msg_agents.environment import LAST_DOMAIN, RESTARTS, USER_TIMEOUT
 from msg_agents.terminal import Interruption
 from msg_analysis.cli.console import CommandGroup, examples
 from msg_analysis.cli.options import (
-    PATH,
     RUN_RECORD,
     YAML,
-    PositiveFloat,
+    choice_option,
     duration_option,
     experiment_argument,
     json_option,
+    out_option,
+    positive_option,
     seed_option,
     set_option,
     source_of,
-    storage,
     storage_options,
     suggest,
     verbose_option,
@@ -44,7 +43,7 @@ from msg_analysis.cli.runs import runs
 
 if TYPE_CHECKING:
     from msg_agents.run.result import ReportWhen
-    from msg_analysis.bags.stored_file import Compression
+    from msg_analysis.bags.stored_file import Storage
 
 
 class _Commands(CommandGroup):
@@ -67,13 +66,26 @@ _no_analyse = click.option(
 _no_fork = click.option(
     "--no-fork", is_flag=True, help="Start every process as a new Python, not forked from one with all imports."
 )
-_write_report = click.option(
+_write_report = choice_option(
     "--write-report",
-    type=click.Choice(["always", "on-failure", "never"]),
+    ["always", "on-failure", "never"],
+    "When to write report.html: on-failure means that the verdict is not `agrees`.",
     default="always",
-    show_default=True,
-    help="When to write report.html: on-failure means that the verdict is not `agrees`.",
 )
+
+
+def _out(where: str) -> Callable[..., Any]:
+    return out_option("DIR", where, default=Path("runs"))
+
+
+def _override(key: str, metavar: str, values: str, *offered: str) -> Callable[..., Any]:
+    text = f"Overrides run.{key}: {values}."
+    return click.option(f"--{key}", metavar=metavar, shell_complete=suggest(*offered), help=text)
+
+
+def _restarts(what: str) -> Callable[..., Any]:
+    text = f"How often, in total, killed {what} are restarted."
+    return click.option("--restarts", type=click.IntRange(0), metavar="N", default=RESTARTS, help=text)
 
 
 def _interruption() -> Interruption:
@@ -92,13 +104,7 @@ def _interruption() -> Interruption:
     ),
 )
 @experiment_argument
-@click.option(
-    "--out",
-    type=PATH,
-    metavar="DIR",
-    default=Path("runs"),
-    help="Directory in which the bag's directory <name>_<time> is created.",
-)
+@_out("Directory in which the bag's directory <name>_<time> is created.")
 @click.option("--no-record", is_flag=True, help="Do not record: no bag, no verdict.")
 @_no_analyse
 @_write_report
@@ -112,43 +118,18 @@ def _interruption() -> Interruption:
     help="End earlier, in order: when the 95 % interval of the system error that is valid at all times has a "
     "half-width of PRECISION, such as 1%; decided: at 5%, or when the evidence exceeds its threshold.",
 )
-@click.option(
-    "--pace",
-    metavar="PACE",
-    shell_complete=suggest("lockstep", "realtime"),
-    help="Overrides run.pace: lockstep or realtime.",
-)
+@_override("pace", "PACE", "lockstep or realtime", "lockstep", "realtime")
 @click.option(
     "--speed", type=float, metavar="SPEED", help="Overrides run.speed: units of simulated time per second (realtime)."
 )
-@click.option(
-    "--delivery",
-    metavar="HOW",
-    shell_complete=suggest("best_effort", "reliable"),
-    help="Overrides run.delivery: best_effort or reliable (realtime).",
-)
-@click.option(
-    "--processes",
-    metavar="P",
-    shell_complete=suggest("auto", "one_per_agent"),
-    help="Overrides run.processes: auto, one_per_agent or a number.",
-)
-@click.option(
-    "--restarts",
-    type=click.IntRange(0),
-    metavar="N",
-    default=RESTARTS,
-    help="How often, in total, killed agents or the switcher are restarted.",
-)
+@_override("delivery", "HOW", "best_effort or reliable (realtime)", "best_effort", "reliable")
+@_override("processes", "P", "auto, one_per_agent or a number", "auto", "one_per_agent")
+@_restarts("agents or the switcher")
 @click.option(
     "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", show_default="a free one", help="ROS_DOMAIN_ID."
 )
-@click.option(
-    "--await",
-    "readers",
-    multiple=True,
-    metavar="NODE",
-    help=f"A node of yours that must read the states before the run starts, within {USER_TIMEOUT:g} s. Repeatable.",
+@nodes.await_option(
+    f"A node of yours that must read the states before the run starts, within {USER_TIMEOUT:g} s. Repeatable."
 )
 @nodes.use_sim_time
 @click.option(
@@ -182,8 +163,7 @@ def run(
     use_sim_time: bool,
     channel_file: Path | None,
     no_fork: bool,
-    compression: Compression,
-    split_size: float | None,
+    storage: Storage,
     web: int | None,
     web_host: str,
     executor: str | None,
@@ -226,7 +206,7 @@ def run(
                 None if no_record else out,
                 readers=readers,
                 use_sim_time=use_sim_time,
-                storage=storage(compression, split_size),
+                storage=storage,
                 fork=not no_fork,
                 view=view,
                 environment={"MSG_AGENTS_EXECUTOR": executor} if executor else None,
@@ -235,15 +215,8 @@ def run(
                 until=until,
                 **given,
             )
-        finish(
-            result,
-            as_json,
-            view.display.end,
-            interruption=interruption,
-            analyse=not no_analyse,
-            report=write_report,
-            verbose=verbose,
-        )
+        how: dict[str, Any] = {"analyse": not no_analyse, "report": write_report, "verbose": verbose}
+        finish(result, as_json, view.display.end, interruption=interruption, **how)
 
 
 @click.command(
@@ -255,36 +228,15 @@ def run(
 @click.argument("run_record", type=RUN_RECORD)
 @click.argument("hosts", type=YAML)
 @click.option("--name", metavar="NAME", show_default="the name of this machine", help="Name of this host in HOSTS.")
-@click.option(
-    "--out",
-    type=PATH,
-    metavar="DIR",
-    default=Path("runs"),
-    help="Where <name>_<time> is created: bag, report and logs on the recorder's host, logs on the others.",
-)
-@click.option(
-    "--discovery-timeout",
-    type=PositiveFloat(),
-    metavar="SECONDS",
-    default=USER_TIMEOUT,
-    help="How long to wait for the other hosts [s].",
-)
-@click.option(
+@_out("Where <name>_<time> is created: bag, report and logs on the recorder's host, logs on the others.")
+@positive_option("--discovery-timeout", "SECONDS", "How long to wait for the other hosts [s].", default=USER_TIMEOUT)
+@positive_option(
     "--timeout",
-    cls=RenamedOption,
-    old_name="--patience",
-    type=PositiveFloat(),
-    metavar="SECONDS",
+    "SECONDS",
+    "How long this host continues after another one has left the run before its end [s].",
     default=30.0,
-    help="How long this host continues after another one has left the run before its end [s].",
 )
-@click.option(
-    "--restarts",
-    type=click.IntRange(0),
-    metavar="N",
-    default=RESTARTS,
-    help="How often, in total, killed processes of this host are restarted.",
-)
+@_restarts("processes of this host")
 @_no_analyse
 @_write_report
 @_no_fork
@@ -307,8 +259,7 @@ def host(
     write_report: ReportWhen,
     no_fork: bool,
     only_profile: bool,
-    compression: Compression,
-    split_size: float | None,
+    storage: Storage,
     verbose: bool,
     as_json: bool,
 ) -> None:
@@ -342,7 +293,7 @@ def host(
             out,
             domain=places.domain,
             restarts=restarts,
-            storage=storage(compression, split_size),
+            storage=storage,
             fork=not no_fork,
             view=view,
             environment=places.environment(what, folder),

@@ -23,8 +23,7 @@ MODULES = (
     "numpy.random",
     "rclpy.experimental.events_executor",
     "setproctitle",
-)
-"""What the processes of nodes import, at the latest when they need it."""
+)  # what the processes of nodes import, at the latest when they need it
 
 NODES = ("agent", "recorder", "switcher")  # commands that take a run record
 
@@ -65,30 +64,23 @@ def _read_record(arguments: list[str]) -> None:
 
 
 def run_command(arguments: list[str]) -> None:
-    """Run a command of ``msg-agents`` in a forked process, which ``ps`` then shows by it."""
+    """Run a command of ``msg-agents`` in a forked process."""
     import numpy as np
+    from setproctitle import setproctitle
 
     from msg_agents.cli.main import main as command
     from msg_agents.nodes.ros import use_middleware
-    from msg_agents.run.fork_server import TRIAL
+    from msg_agents.run.fork_server import LONGEST_TITLE, TRIAL
 
-    _show_as(arguments)
+    # In ``ps``, and in the names of log files of ROS.
+    title = os.fsencode(f"msg-agents {' '.join(arguments)}")
+    setproctitle(title[:LONGEST_TITLE].decode(errors="ignore"))
     if arguments == [TRIAL]:
         use_middleware()
         return
     np.random.seed()  # laws of agents may draw from it: not the same numbers in every process
     sys.argv = ["msg-agents", *arguments]
     command(arguments, prog_name="msg-agents")
-
-
-def _show_as(arguments: list[str]) -> None:
-    """In ``ps``, and in the names of log files of ROS."""
-    from setproctitle import setproctitle
-
-    from msg_agents.run.fork_server import LONGEST_TITLE
-
-    title = os.fsencode(f"msg-agents {' '.join(arguments)}")
-    setproctitle(title[:LONGEST_TITLE].decode(errors="ignore"))
 
 
 if __name__ == "__main__":

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
-from msg_agents.cli.ros_command import RenamedOption, RosCommand
+from msg_agents.cli.ros_command import RosCommand
 from msg_agents.environment import DISCOVERY_TIMEOUT
 from msg_agents.run.fork_server import exit_with_pipe
 from msg_analysis.cli.console import examples
 from msg_analysis.cli.options import (
     PATH,
     RUN_RECORD,
-    PositiveFloat,
     experiment_argument,
-    storage,
+    out_option,
+    positive_option,
     storage_options,
     suggest,
 )
@@ -34,7 +34,7 @@ from msg_analysis.errors import ExitCode
 if TYPE_CHECKING:
     from msg_agents.nodes.base import NetworkNode
     from msg_agents.stepping.monitoring import ClockOffsets
-    from msg_analysis.bags.stored_file import Compression
+    from msg_analysis.bags.stored_file import Storage
     from msg_analysis.model.run_record import RunRecord
 
 
@@ -49,12 +49,8 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
     """Add the options that the commands of single nodes share."""
     for option in (
         click.argument("run_record", type=RUN_RECORD),
-        click.option(
-            "--discovery-timeout",
-            type=PositiveFloat(),
-            metavar="SECONDS",
-            default=DISCOVERY_TIMEOUT,
-            help="How long to wait for the other nodes [s].",
+        positive_option(
+            "--discovery-timeout", "SECONDS", "How long to wait for the other nodes [s].", default=DISCOVERY_TIMEOUT
         ),
         use_sim_time,
         click.option(
@@ -78,27 +74,20 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-_await = click.option(
-    "--await",
-    "readers",
-    multiple=True,
-    metavar="NODE",
-    shell_complete=suggest("recorder"),
-    help="A node, such as recorder, that must be present before the run starts. Repeatable.",
-)
+def await_option(text: str, *offered: str) -> Callable[..., Any]:
+    """The option ``--await``, for names of nodes; ``text``: its help."""
+    return click.option(
+        "--await", "readers", multiple=True, metavar="NODE", shell_complete=suggest(*offered), help=text
+    )
 
 
-_timeout = click.option(
+_await = await_option("A node, such as recorder, that must be present before the run starts. Repeatable.", "recorder")
+_timeout = positive_option(
     "--timeout",
-    cls=RenamedOption,
-    old_name="--patience",
-    type=PositiveFloat(),
-    metavar="SECONDS",
+    "SECONDS",
+    "How long to continue after other nodes have left before the end [s].",
     show_default="no limit",
-    help="How long to continue after other nodes have left before the end [s].",
 )
-
-
 _checkpoint = click.option(
     "--checkpoint",
     type=click.Path(file_okay=False, path_type=Path),
@@ -248,12 +237,10 @@ def switcher(
 
 @click.command(cls=RosCommand, epilog=examples("msg-agents recorder run.json --out runs/mine"))
 @_node_options
-@click.option("--out", type=PATH, metavar="BAG", required=True, help="Bag to write; must not exist.")
+@out_option("BAG", "Bag to write; must not exist.", required=True)
 @storage_options
 @_timeout
-def recorder(
-    run_record: Path, *, out: Path, compression: Compression, split_size: float | None, **options: Any
-) -> None:
+def recorder(run_record: Path, *, out: Path, storage: Storage, **options: Any) -> None:
     """Record the run in RUN_RECORD to a bag."""
     record = load_record(run_record)
 
@@ -261,7 +248,7 @@ def recorder(
         from msg_agents.nodes.recorder import Recorder, keep_freed_memory
 
         keep_freed_memory()
-        return [Recorder(record=record, directory=out, storage=storage(compression, split_size))]
+        return [Recorder(record=record, directory=out, storage=storage)]
 
     _run_nodes(nodes, record, **options)
 
@@ -327,10 +314,7 @@ def load_record(path: Path) -> RunRecord:
 
 
 def read_record_ahead(path: Path) -> None:
-    """Read a run record, and prepare its model, for the processes that this one forks: they need not do it again.
-
-    Not one with a protocol, whose code its user wrote: it is imported in the processes of the nodes only.
-    """
+    """Read a run record, and prepare its model, for the processes that this one forks: they need not do it again."""
     from msg_analysis.errors import InputError
     from msg_analysis.model.run_record import RunRecord
 
@@ -338,7 +322,7 @@ def read_record_ahead(path: Path) -> None:
         return
     with suppress(InputError):  # the nodes will say it
         text = _text_of(path)
-        if '"protocol": {' not in text:
+        if '"protocol": {' not in text:  # whose code its user wrote: it is imported in the processes of the nodes only
             record = RunRecord.from_json(text, str(path))
             _ = record.model  # kept in the record
             _read_ahead[path] = record

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
+from msg_agents.cli.nodes import await_option
 from msg_agents.cli.ros_command import RosCommand, domain_option, enter
 from msg_analysis.cli.console import examples, print_json, print_text
-from msg_analysis.cli.options import BAG, PositiveFloat, json_option
+from msg_analysis.cli.options import BAG, json_option, positive_option
 from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -75,10 +76,10 @@ class _Rate(click.types.FloatParamType):
     metavar="SECONDS",
     help="Seconds of the bag to leave out at the start.",
 )
-@click.option("--duration", type=PositiveFloat(), metavar="SECONDS", help="Seconds of the bag to play.")
+@positive_option("--duration", "SECONDS", "Seconds of the bag to play.")
 @click.option("-l", "--loop", is_flag=True, help="Start again at the end.")
 @click.option("--paused", is_flag=True, help="Start paused; the space bar continues.")
-@click.option("--clock", type=PositiveFloat(), metavar="HZ", help="Publish the time of the bag on /clock at this rate.")
+@positive_option("--clock", "HZ", "Publish the time of the bag on /clock at this rate.")
 @click.option(
     "--topics",
     multiple=True,
@@ -102,10 +103,8 @@ class _Rate(click.types.FloatParamType):
     metavar="N",
     help="Start when every topic has N readers (except latched topics, whose readers miss nothing).",
 )
-@click.option("--await", "readers", multiple=True, metavar="NODE", help="Start when NODE reads the topics. Repeatable.")
-@click.option(
-    "--wait-timeout", type=PositiveFloat(), metavar="SECONDS", default=30.0, help="How long to wait for readers [s]."
-)
+@await_option("Start when NODE reads the topics. Repeatable.")
+@positive_option("--wait-timeout", "SECONDS", "How long to wait for readers [s].", default=30.0)
 @domain_option
 @json_option
 def play(bag: Path, *, subscribers: int | None, domain: int | None, as_json: bool, **options: Any) -> None:

@@ -17,26 +17,10 @@ from msg_agents.terminal import exit_on_signals
 from msg_analysis.cli.options import PATH
 
 
-class RenamedOption(click.Option):
-    """An option that is also taken by an older name, which is not shown."""
-
-    def __init__(self, *args: Any, old_name: str, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self._old_name = old_name
-
-    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
-        """As in click."""
-        self.opts.append(self._old_name)
-        super().add_to_parser(parser, ctx)
-        self.opts.remove(self._old_name)
-
-
 class RosCommand(click.Command):
-    """Takes arguments for ROS 2 as any ROS node does: ``--ros-args ... [--]``.
+    """Takes arguments for ROS 2; parameters among them replace options that are not on the command line."""
 
-    rclpy reads these itself; parameters among them replace options that are not on the command line. Those given to one
-    node are found by ``node_name`` (default: the name of the command).
-    """
+    # rclpy reads the others itself. Parameters of one node are found by its name; by default that of the command.
 
     def __init__(self, *args: Any, node_name: str | None = None, **options: Any) -> None:
         super().__init__(*args, **options)

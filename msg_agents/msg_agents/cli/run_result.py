@@ -32,10 +32,7 @@ def finish(
     report: ReportWhen = "always",
     verbose: bool = False,
 ) -> None:
-    """Print the failures, compare what was recorded, show the result, and exit with its code.
-
-    ``interruption``: of the run; a signal ends the comparison, too, and nothing else.
-    """
+    """Print the failures, compare what was recorded (until a signal), show the result, and exit with its code."""
     for line in result.failures:
         complain(line, "failed:")
     if analyse and not result.interrupted:

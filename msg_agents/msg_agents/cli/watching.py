@@ -17,7 +17,7 @@ import click
 from msg_agents.cli import nodes
 from msg_agents.cli.ros_command import RosCommand, domain_option, enter
 from msg_analysis.cli.console import examples, print_json, print_note, print_text, result_console
-from msg_analysis.cli.options import BAG, RUN_RECORD, PositiveFloat, json_option
+from msg_analysis.cli.options import BAG, RUN_RECORD, json_option, positive_option
 from msg_analysis.errors import ExitCode
 
 if TYPE_CHECKING:
@@ -90,13 +90,7 @@ def announce(web: WebServer, host: str, note: Callable[[str], None]) -> None:
         note("all machines that can reach this one can see the page; it is not encrypted and has no password")
 
 
-_timeout = click.option(
-    "--timeout",
-    type=PositiveFloat(),
-    metavar="SECONDS",
-    show_default="no limit",
-    help="How long to wait for a network [s].",
-)
+_timeout = positive_option("--timeout", "SECONDS", "How long to wait for a network [s].", show_default="no limit")
 
 
 @click.command(

@@ -10,12 +10,12 @@ from pathlib import Path
 import click
 import pytest
 import yaml
-from click.testing import CliRunner, Result
+from click.testing import Result
+from programs import PROGRAMS, run
 from terminal import Terminal
 
 pytest.importorskip("rclpy")
 
-from msg_agents.cli.main import main
 from msg_analysis.experiment.examples import names, text_of
 from msg_analysis.experiment.experiment import Experiment
 
@@ -29,7 +29,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def call(*words: str) -> Result:
-    return CliRunner(env={"COLUMNS": "200"}).invoke(main, words, prog_name="msg-agents", catch_exceptions=False)
+    return run("msg-agents", *words, COLUMNS="200")
 
 
 def test_examples() -> None:
@@ -60,9 +60,9 @@ def test_prepare_an_example() -> None:
 
 
 def test_the_demo_has_the_options_of_run() -> None:
-    run, demo = main.commands["run"], main.commands["demo"]
-    assert type(run) is type(demo)
-    assert demo.params == [each for each in run.params if each.name != "experiment"]
+    given, demo = (PROGRAMS["msg-agents"].commands[name] for name in ("run", "demo"))
+    assert type(given) is type(demo)
+    assert demo.params == [each for each in given.params if each.name != "experiment"]
     assert any(isinstance(each, click.Option) and "--web" in each.opts for each in demo.params)
     wrong = call("demo", "--duration", "-1", "--no-fork")
     assert (wrong.exit_code, wrong.stdout) == (2, "")
@@ -150,11 +150,7 @@ def test_new_asks_on_a_terminal(terminal: Terminal, here: Path) -> None:
     assert terminal.read_to_the_end() == 0
     assert "Next: msg-analysis predict lab.yaml" in terminal.text
     experiment = Experiment.load(here / "lab.yaml")
-    assert (experiment.name, experiment.agents, experiment.problem, experiment.run.duration) == (
-        "lab",
-        6,
-        "tracking",
-        100,
-    )
+    found = (experiment.name, experiment.agents, experiment.problem, experiment.run.duration)
+    assert found == ("lab", 6, "tracking", 100)
     assert [graph.name for graph in experiment.graph_list] == ["ring", "star"]
     assert experiment.chain.matrix.tolist() == [[-0.2, 0.2], [0.2, -0.2]]

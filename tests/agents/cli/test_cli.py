@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
-import os
 import subprocess
 import sys
 import uuid
@@ -15,49 +13,38 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
+from click.testing import Result
 from networks import document as net
+from programs import run
 
 pytest.importorskip("rclpy")
 
-
-from msg_agents.cli.main import main
 from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import new_record, simulate
-
-PROGRAM = Path(sys.executable).with_name("msg-agents")
-COMMANDS = ["agent", "check", "prepare", "recorder", "run", "switcher"]
 
 
 def document() -> dict[str, Any]:
     return net(3, name="small", run={"duration": 5, "replicas": 1, "seed": 5})
 
 
-def call(*arguments: str | Path, directory: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """The command in this process, which takes a hundredth of the time."""
-    words = [str(argument) for argument in arguments]
-    with contextlib.chdir(directory or Path.cwd()):
-        result = CliRunner(env={"NO_COLOR": "1"}).invoke(main, words, prog_name="msg-agents", catch_exceptions=False)
-    return subprocess.CompletedProcess(words, result.exit_code, result.stdout, result.stderr)
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
 
 
-def execute(*arguments: str | Path, directory: Path | None = None) -> subprocess.CompletedProcess[str]:
-    """As a user does."""
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1"}
-    command = [str(PROGRAM), *(str(argument) for argument in arguments)]
-    return subprocess.run(command, env=environment, cwd=directory, capture_output=True, text=True, timeout=60)
+def call(*words: str | Path) -> Result:
+    return run("msg-agents", *words, NO_COLOR="1")
 
 
-def refused(process: subprocess.CompletedProcess[str], *words: str) -> None:
+def refused(result: Result, *words: str) -> None:
     """Exit code 2, one error that names what is wrong, nothing on stdout, no traceback."""
-    assert process.returncode == 2, process
-    assert process.stdout == ""
-    assert "Traceback" not in process.stderr
-    errors = [line for line in process.stderr.splitlines() if line.lower().startswith("error:")]
-    assert len(errors) == 1, process.stderr
+    assert (result.exit_code, result.stdout) == (2, ""), result
+    assert "Traceback" not in result.stderr
+    errors = [line for line in result.stderr.splitlines() if line.lower().startswith("error:")]
+    assert len(errors) == 1, result.stderr
     for word in words:
-        assert word in process.stderr
+        assert word in result.stderr
 
 
 @pytest.fixture
@@ -171,12 +158,12 @@ def test_out_is_not_writable(experiment: Path) -> None:
 )
 def test_malformed_run_record(tmp_path: Path, text: str, words: list[str]) -> None:
     (tmp_path / "run.json").write_text(text)
-    refused(call("agent", "run.json", "--agent", "1", directory=tmp_path), "run.json", *words)
+    refused(call("agent", "run.json", "--agent", "1"), "run.json", *words)
 
 
 @pytest.mark.parametrize("command", [["switcher"], ["recorder", "--out", "bag"]], ids=" ".join)
 def test_no_run_record(tmp_path: Path, command: list[str]) -> None:
-    refused(call(command[0], "run.json", *command[1:], directory=tmp_path), "run.json")
+    refused(call(command[0], "run.json", *command[1:]), "run.json")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -202,7 +189,7 @@ def test_damaged_run_record(tmp_path: Path, run_file: Path, change: dict[str, An
 def test_no_domain(run_file: Path, command: list[str], value: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """232 is the last that ROS knows, with ports for half of a large run; the middleware fails without saying why."""
     monkeypatch.setenv("ROS_DOMAIN_ID", value)
-    refused(call(*command, directory=run_file.parent), f"ROS_DOMAIN_ID: {value}: expected a number from 0 to 231")
+    refused(call(*command), f"ROS_DOMAIN_ID: {value}: expected a number from 0 to 231")
 
 
 @pytest.mark.parametrize(
@@ -224,40 +211,44 @@ def test_unknown_agents(run_file: Path, numbers: list[str], words: list[str]) ->
 def test_the_recorder_never_overwrites(tmp_path: Path, run_file: Path) -> None:
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "mine").write_text("mine")
-    refused(execute("recorder", run_file, "--out", tmp_path / "bag"), "exists already")
+    program = Path(sys.executable).with_name("msg-agents")  # a node needs streams that have numbers
+    command = [program, "recorder", run_file, "--out", tmp_path / "bag"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "exists already" in done.stderr
     assert [file.name for file in (tmp_path / "bag").iterdir()] == ["mine"]
 
 
 def test_check(tmp_path: Path) -> None:
     twin = simulate(Experiment.parse(document()))
     write_trajectory(twin, tmp_path / "runs" / "good")
-    process = call("check", directory=tmp_path)  # finds the newest one below ./runs
-    assert (process.returncode, process.stderr) == (0, "")
+    process = call("check")  # finds the newest one below ./runs
+    assert (process.exit_code, process.stderr) == (0, "")
     assert "equal to the twin to the last bit: 303 states" in process.stdout
 
     states = twin.states.copy()
     states[40, 1] += 1e-12
     write_trajectory(dataclasses.replace(twin, states=states), tmp_path / "bad")
     process = call("check", tmp_path / "bad")
-    assert process.returncode == 1
+    assert process.exit_code == 1
     assert "first: agent 2 at step 40" in process.stdout
     process = call("check", tmp_path / "bad", "--json")
-    assert process.returncode == 1
+    assert process.exit_code == 1
     found = json.loads(process.stdout)
     assert (found["equal"], found["compared"], found["missing"]) == (False, 303, 0)
 
     states[50:] = np.nan
     write_trajectory(dataclasses.replace(twin, states=states), tmp_path / "wrong_and_torn")
-    assert call("check", tmp_path / "wrong_and_torn").returncode == 1
+    assert call("check", tmp_path / "wrong_and_torn").exit_code == 1
     states[40, 1] = twin.states[40, 1]
     write_trajectory(dataclasses.replace(twin, states=states), tmp_path / "torn")
     process = call("check", tmp_path / "torn")
-    assert process.returncode == 3
+    assert process.exit_code == 3
     assert "150 states, 153 missing" in process.stdout
 
 
 def test_check_without_a_bag(tmp_path: Path) -> None:
-    refused(call("check", directory=tmp_path), "runs")
+    refused(call("check"), "runs")
     refused(call("check", tmp_path / "nowhere"), "nowhere")
     refused(call("check", tmp_path), str(tmp_path))
     (tmp_path / "text.mcap").write_text("no bag at all")
@@ -266,18 +257,8 @@ def test_check_without_a_bag(tmp_path: Path) -> None:
 
 def test_prepare(experiment: Path) -> None:
     process = call("prepare", experiment)
-    assert (process.returncode, process.stderr) == (0, "")
+    assert (process.exit_code, process.stderr) == (0, "")
     record = json.loads(process.stdout)
     assert uuid.UUID(record["run"]).version == 4
     assert Experiment.parse(record["experiment"]) == Experiment.parse(document())
     assert np.array_equal(record["start"], simulate(Experiment.parse(document())).states[0])
-
-
-def test_help_and_version() -> None:
-    process = call("--help")
-    assert process.returncode == 0
-    for command in COMMANDS:
-        assert command in process.stdout
-    assert "Examples:" in call("run", "--help").stdout
-    assert call("--version").stdout.startswith("msg-agents, version ")
-    refused(execute("fly"), "fly")

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
+from programs import run
 from rich.console import Console
 
 from experiments import changed, claimed, golden, simulate, write_trajectory
-from msg_analysis.cli.main import main
 from msg_analysis.report.saved_results import print_results
 from msg_analysis.runs import read_result
 
@@ -20,7 +20,7 @@ EXPERIMENT = Path(__file__).parents[3] / "analysis/msg_analysis/experiment/bundl
 
 
 def call(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+    return run("msg-analysis", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -82,8 +82,10 @@ def test_the_level_is_that_of_the_verdict(tmp_path: Path) -> None:
     write_trajectory(claimed(simulate(changed(law, noise={"process": 1.03})), law), tmp_path / "bag")
     compared = json.loads(call("compare", tmp_path / "bag", "--json").stdout)
     least = min(test["p_adjusted"] for test in compared["tests"])
-    document = json.loads(call("compare", tmp_path / "bag", "--json", "--level", least * 1.01).stdout)
-    assert (document["verdict"], document["level"]) == ("disagrees", pytest.approx(least * 1.01))
+    result = call("compare", tmp_path / "bag", "--json", "--level", least * 1.01)
+    document = json.loads(result.stdout)
+    assert (result.exit_code, document["verdict"]) == (1, "disagrees")
+    assert document["level"] == pytest.approx(least * 1.01)
     assert document["blame"]
     document = json.loads(call("compare", tmp_path / "bag", "--json", "--level", least / 2).stdout)
     assert document["verdict"] == "agrees"

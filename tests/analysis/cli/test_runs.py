@@ -6,21 +6,17 @@ from pathlib import Path
 
 import pytest
 import yaml
-from click.testing import CliRunner, Result
+from click.testing import Result
+from programs import PROGRAMS, run
 from rich.console import Console
 
-from msg_agents.cli.main import main as agents
 from msg_analysis import Experiment
-from msg_analysis.cli.main import main
 from msg_analysis.common.text import json_text
 from msg_analysis.report.tables import print_runs
 from msg_analysis.runs import list_runs
 
-DOCUMENT = {
-    "name": "pair",
-    "graphs": {"line": {"path": [1, 2, 3]}},
-    "run": {"dt": 0.1, "duration": 20, "seed": 7, "start": "zero"},
-}
+LINE = {"line": {"path": [1, 2, 3]}}
+DOCUMENT = {"name": "pair", "graphs": LINE, "run": {"dt": 0.1, "duration": 20, "seed": 7, "start": "zero"}}
 
 
 @pytest.fixture(scope="module")
@@ -28,9 +24,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two runs, one of them compared, a folder of strangers, and two experiments."""
     place = tmp_path_factory.mktemp("place")
     for seed in (7, 8):
-        run = Experiment.parse(DOCUMENT).simulate(seed=seed)
-        run.save(place / "runs" / f"pair_2026112{seed}_120000")
-    result = run.compare().to_json()
+        made = Experiment.parse(DOCUMENT).simulate(seed=seed)
+        made.save(place / "runs" / f"pair_2026112{seed}_120000")
+    result = made.compare().to_json()
     (place / "runs" / "pair_20261128_120000" / "result.json").write_text(json_text(result))
     (place / "runs" / "photos").mkdir()
     (place / "runs" / "photos" / "a.jpg").write_text("")
@@ -45,13 +41,13 @@ def _there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def invoke(*words: str, code: int = 0, columns: int = 120) -> Result:
-    result = CliRunner().invoke(main, words, prog_name="msg-analysis", env={"COLUMNS": str(columns)})
+    result = run("msg-analysis", *words, COLUMNS=str(columns))
     assert (result.exit_code, result.exception if code == 0 else None) == (code, None), result.output
     return result
 
 
 def test_both_programs_have_one_command() -> None:
-    assert agents.commands["runs"] is main.commands["runs"]
+    assert PROGRAMS["msg-agents"].commands["runs"] is PROGRAMS["msg-analysis"].commands["runs"]
 
 
 def test_runs() -> None:

@@ -5,23 +5,16 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import click
 import pytest
-from click.testing import CliRunner, Result
+from programs import run
 
-from msg_agents.cli.main import main as agents
-from msg_analysis.cli.main import main as analysis
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.problems import ExperimentError
 
 
-def call(group: click.Group, *words: str) -> Result:
-    return CliRunner().invoke(group, words)
-
-
 def system_error(*changes: str) -> float:
     words = [word for change in changes for word in ("--set", change)]
-    result = call(analysis, "predict", "line_ring", "--json", *words)
+    result = run("msg-analysis", "predict", "line_ring", "--json", *words)
     assert result.exit_code == 0, result.stderr
     return float(json.loads(result.stdout)["emulated"]["system_error"])
 
@@ -47,7 +40,7 @@ def test_values_of_the_experiment_are_replaced() -> None:
 def test_every_such_command_takes_it(words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     command, *options = words
-    given = call(analysis, command, "line_ring", "--set", "name=other", "--set", "run.duration=10", *options)
+    given = run("msg-analysis", command, "line_ring", "--set", "name=other", "--set", "run.duration=10", *options)
     assert given.exit_code == 0, given.stderr
     assert json.loads(given.stdout)["experiment"] == "other"
 
@@ -63,23 +56,23 @@ def test_every_such_command_takes_it(words: list[str], tmp_path: Path, monkeypat
         ("run.dt=[1", "--set run.dt=[1: line 2, column 1"),
     ],
 )
-@pytest.mark.parametrize(("group", "command"), [(analysis, "predict"), (agents, "run")])
-def test_refused(group: click.Group, command: str, change: str, words: str) -> None:
-    result = call(group, command, "line_ring", "--set", change)
+@pytest.mark.parametrize(("program", "command"), [("msg-analysis", "predict"), ("msg-agents", "run")])
+def test_refused(program: str, command: str, change: str, words: str) -> None:
+    result = run(program, command, "line_ring", "--set", change)
     assert (result.exit_code, result.stdout) == (2, "")
     assert words in result.stderr
 
 
 def test_not_with_a_bag(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").touch()
-    result = call(analysis, "spectrum", str(tmp_path), "--set", "noise.process=2")
+    result = run("msg-analysis", "spectrum", tmp_path, "--set", "noise.process=2")
     assert result.exit_code == 2
     assert "--set: not with the bag" in result.stderr
 
 
 def test_names_of_examples_and_protocols_that_are_meant() -> None:
-    assert call(analysis, "predict", "line_rign").stderr.rstrip().endswith(": did you mean line_ring?")
-    assert call(agents, "examples", "discret").stderr.rstrip().endswith(": did you mean discrete?")
+    assert run("msg-analysis", "predict", "line_rign").stderr.rstrip().endswith(": did you mean line_ring?")
+    assert run("msg-agents", "examples", "discret").stderr.rstrip().endswith(": did you mean discrete?")
     document = {"name": "a", "graphs": {"g": {"path": [1, 2]}}, "protocol": {"name": "metropoli"}}
     with pytest.raises(ExperimentError) as error:
         Experiment.parse(document)

@@ -14,10 +14,9 @@ from typing import Any
 import pyarrow.parquet
 import pytest
 import yaml
-from click.testing import CliRunner
+from programs import run
 
 from experiments import Experiment, compare, simulate
-from msg_analysis.cli.main import main
 from msg_analysis.sweeps.workers import ENDING
 
 Call = Callable[..., tuple[int, str, str]]
@@ -55,7 +54,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Iterator[Call]:
     before = {number: signal.getsignal(number) for number in ENDING}
 
     def invoke(*arguments: str | Path) -> tuple[int, str, str]:
-        result = CliRunner().invoke(main, ["sweep", *map(str, arguments)])
+        result = run("msg-analysis", "sweep", *arguments)
         return result.exit_code, result.stdout, result.stderr
 
     yield invoke

@@ -1,7 +1,6 @@
 """The corrections of the paper: each is borne out by its numbers, and stands in the docs."""
 
 import importlib.util
-import subprocess
 import sys
 from pathlib import Path
 
@@ -29,11 +28,15 @@ def test_correction(number):
     assert f"errata.py {number}\n" in page
 
 
-def test_what_is_printed():
-    result = subprocess.run([sys.executable, SCRIPT, "6"], capture_output=True, text=True, timeout=60, check=True)
-    assert result.stdout.startswith("6. The paper: Switching never hurts")
-    assert "E = 0.202898, static 0.201800" in result.stdout
-    assert subprocess.run([sys.executable, SCRIPT, "99"], capture_output=True, check=False).returncode == 2
+def test_what_is_printed(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["errata.py", "6"])
+    assert errata.main() == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("6. The paper: Switching never hurts")
+    assert "E = 0.202898, static 0.201800" in printed
+    monkeypatch.setattr(sys, "argv", ["errata.py", "99"])
+    with pytest.raises(SystemExit, match=r"^2$"):
+        errata.main()
 
 
 @pytest.mark.parametrize("noise", [[1.0] * 5, np.sqrt([0.001, 0.001, 0.001, 1.0, 0.001]).tolist()])

@@ -10,27 +10,21 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
+from programs import run as call
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from experiments import document
 from msg_analysis import Experiment, InputError, NotAvailableError, Run, read_bag
-from msg_analysis.cli.main import main
 from msg_analysis.messages.messages import ACTIVE_GRAPH, AGENT_STATE
 from msg_analysis.report import export as export_files
-from msg_analysis.report import export as run_tables
 
-DOCUMENT: dict[str, Any] = {
-    "name": "net",
-    "names": ["one, 1", 'two "2"', "three"],
-    "graphs": {"line": {"path": [1, 2, 3]}, "ring": {"cycle": [1, 2, 3]}},
-    "switching": {"rates": {"line": {"ring": 1}, "ring": {"line": 1}}},
-    "run": {"duration": 15, "replicas": 2, "seed": 4},
-}
+DOCUMENT = document(names=["one, 1", 'two "2"', "three"], run={"duration": 15, "seed": 4})
 
 
 def export(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(main, ["export", *map(str, arguments)])
+    return call("msg-analysis", "export", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -40,15 +34,18 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def exported(bag: Path) -> Path:
-    """All formats, in pieces of a few steps."""
-    folder = bag.parent / "data"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run_tables, "ROWS", 7 * 6)
-        patch.setattr(export_files, "BLOCK_NUMBERS", 50)
-        result = export(bag, "--csv", "--parquet", "--npz", "--out", folder)
+    """All formats, by the command; in pieces of a few steps they are the same."""
+    folder, others = bag.parent / "data", bag.parent / "pieces"
+    result = export(bag, "--csv", "--parquet", "--npz", "--out", folder)
     assert result.exit_code == 0, result.output
     assert result.stdout.split() == [str(folder / name) for name in NAMES]
     assert sorted(file.name for file in folder.iterdir()) == sorted(NAMES)
+    for file in export_files.export_run(read_bag(bag), others, ["csv", "parquet", "npz"], rows=7 * 6):
+        if file.suffix == ".parquet":
+            assert pyarrow.parquet.ParquetFile(file).num_row_groups > 40
+            assert pyarrow.parquet.read_table(file).equals(pyarrow.parquet.read_table(folder / file.name))
+        else:
+            assert file.read_bytes() == (folder / file.name).read_bytes()
     return folder
 
 
@@ -155,12 +152,13 @@ def test_what_is_missing_is_empty(tmp_path: Path) -> None:
 
 def test_numbers_of_other_runs(tmp_path: Path) -> None:
     """What agents publish, and in real time when; without names there is no column for them."""
-    document = {key: value for key, value in DOCUMENT.items() if key != "names"}
-    noisy = Experiment.parse(document | {"noise": {"broadcast": 0.5, "loss": 0.1}}).simulate(duration=1)
+    noisy = Experiment.parse(document(run=DOCUMENT["run"]) | {"noise": {"broadcast": 0.5, "loss": 0.1}}).simulate(
+        duration=1
+    )
     frame = noisy.to_dataframe()
     assert list(frame.columns) == ["step", "time", "agent", "replica", "state", "published"]
     assert frame["published"].tolist() == noisy.published.ravel().tolist()
-    timed = Experiment.parse(document).with_run(pace="realtime", duration=1).simulate()
+    timed = Experiment.parse(document(run=DOCUMENT["run"])).with_run(pace="realtime", duration=1).simulate()
     frame = timed.to_dataframe()
     assert list(frame.columns) == ["step", "time", "agent", "replica", "state", "made"]
     assert frame["made"].tolist() == np.repeat(timed.made.ravel() / 1e9, 2).tolist()
@@ -200,10 +198,14 @@ def test_files_are_replaced_whole_or_not_at_all(bag: Path, tmp_path: Path, monke
     (tmp_path / "graphs.csv").write_text("old")
     run: Run = read_bag(bag)
 
-    def full(*_: Any) -> Any:
-        raise OSError(28, "No space left on device")
+    graphs = export_files._COLUMNS["graphs"]
 
-    monkeypatch.setitem(vars(run_tables), "_graphs", full)
+    def full(run: Run, first: int, end: int) -> Any:
+        if end > 0:
+            raise OSError(28, "No space left on device")
+        return graphs(run, first, end)
+
+    monkeypatch.setitem(export_files._COLUMNS, "graphs", full)
     with pytest.raises(InputError, match=r"graphs\.csv: cannot be written \(No space left on device\)"):
         export_files.export_run(run, tmp_path, ["csv"])
     assert (tmp_path / "graphs.csv").read_text() == "old"

@@ -11,7 +11,8 @@ import yaml
 from browser import CUT, FAINT, Log, Tab
 
 from msg_analysis import Experiment
-from msg_analysis.report.list_pages import write_runs_page, write_sweep_page
+from msg_analysis.common.files import write_whole
+from msg_analysis.report.list_pages import render_sweep, write_runs_page
 from msg_analysis.report.look import shifted
 from msg_analysis.runs import RunEntry
 from msg_analysis.sweeps.grid import load_sweep
@@ -168,7 +169,7 @@ def page_of(directory: Path, over: dict[str, list[Any]], fails: Any = None) -> P
             measured = {"measured": float(number), "predicted": number + 0.25, "standard_error": 0.5}
             row |= {f"system_error.{key}": value for key, value in measured.items()}
         rows.append(row)
-    return write_sweep_page(sweep, rows, None, "made up", "agrees", directory)
+    return write_whole(directory / "sweep.html", render_sweep(sweep, rows, None, "made up", "agrees").encode())
 
 
 KEYS = {"switching.rates.<b>$$x$$.ring": [0.1, 1, 10], "noise.loss": [0, 0.5, 0.9], "run.dt": [0.05, 0.1]}

@@ -85,7 +85,7 @@ def test_the_difference_of_the_covariances(louder: Comparison) -> None:
 
 
 def test_the_cause_is_the_headline(louder: Comparison) -> None:
-    text = render(louder, louder.trajectory)
+    text = render(louder)
     headline = re.search(r"<strong>(.*?)</strong>", text)
     assert headline
     assert headline[1].startswith("✗ Agent 2&#39;s noise variance is")

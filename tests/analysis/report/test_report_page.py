@@ -125,7 +125,7 @@ def _checked(text: str) -> Page:
 def _made_up(agents: int) -> tuple[Comparison, str]:
     """A comparison of made-up numbers, and its report."""
     comparison = _comparison(_trajectory(agents, 60))
-    return comparison, render(comparison, comparison.trajectory)
+    return comparison, render(comparison)
 
 
 def _plots(page: Page) -> int:
@@ -219,14 +219,8 @@ def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     write_report(comparison, tmp_path / "report.html")
     page = Page((tmp_path / "report.html").read_text())
     assert "The run agrees with the prediction; 100 % of the deadlines were missed." in page.text
-    for text in (
-        "Real time",
-        "lateness [ms]",
-        "600 of 600 (100 %)",
-        "Models",
-        "logged pattern",
-        "predicted, logged pattern",
-    ):
+    texts = ("Real time", "lateness [ms]", "600 of 600 (100 %)", "Models", "predicted, logged pattern")
+    for text in texts:
         assert text in page.text
     assert _plots(page) == 16
     without_figures(monkeypatch)
@@ -273,16 +267,9 @@ def test_rows_links_and_data(tmp_path: Path) -> None:
 
 
 def test_hostile_names_of_runs(tmp_path: Path) -> None:
+    evil = str(tmp_path / EVIL.replace("/", ""))
     runs = [
-        RunEntry(
-            str(tmp_path / EVIL.replace("/", "")),
-            "compared",
-            DAY + timedelta(1),
-            name=EVIL,
-            seed=1,
-            verdict=EVIL,
-            measured=1.0,
-        ),
+        RunEntry(evil, "compared", DAY + timedelta(1), name=EVIL, seed=1, verdict=EVIL, measured=1.0),
         RunEntry(str(tmp_path / "\udcff"), "foreign", DAY, problem=EVIL),
     ]
     path = tmp_path / "index.html"

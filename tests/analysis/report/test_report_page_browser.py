@@ -14,25 +14,21 @@ import pytest
 from browser import CUT, FAINT, Log, Tab
 from PIL import Image
 
-from experiments import Completeness, Experiment, Run, claimed, compare, late, simulate
+from experiments import Completeness, Experiment, Run, claimed, compare, document, late, simulate
 from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.report.page import write_report
 from msg_analysis.report.plot_style import BLUE, DARK
 
 # Not stationary: a run of 100 agents from their stationary law has a long past to be simulated.
-HUNDRED: dict[str, Any] = {"duration": 50, "replicas": 16, "start": "zero"}
+HUNDRED: dict[str, Any] = {"duration": 25, "replicas": 16, "start": "zero"}
 LONG: dict[str, Any] = {"duration": 200, "replicas": 16, "start": "zero"}
 KILLED: dict[str, Any] = {"kind": "killed", "step": 1800, "node": "agent_2", "words": "agent_2: killed"}
 
 
 def _document(agents: int, **run: Any) -> dict[str, Any]:
     numbers = list(range(1, agents + 1))
-    return {
-        "name": "seen",
-        "graphs": {"line": {"path": numbers}, "ring $$x$$": {"cycle": numbers}},
-        "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
-        "run": {"dt": 0.05, "duration": 20, "replicas": 2, "seed": 7} | run,
-    }
+    graphs = {"line": {"path": numbers}, "ring $$x$$": {"cycle": numbers}}
+    return document(agents, 0.5, name="seen", graphs=graphs, run={"seed": 7} | run)
 
 
 def _trajectory(agents: int, **run: Any) -> Run:
@@ -174,7 +170,7 @@ def kinds(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Any], Path]:
     @functools.cache
     def made(make: Any) -> Path:
         path = tmp_path_factory.mktemp("kinds") / "report.html"
-        write_report(make()[0], path)
+        write_report(make(), path)
         return path
 
     return made
@@ -351,36 +347,30 @@ def test_replicas(tab: Tab, reports: Callable[..., tuple[Path, Run]], agents: in
     assert log.complaints == []
 
 
-def _in_real_time() -> tuple[Any, Run]:
-    trajectory = _trajectory(3, pace="realtime", speed=5.0)
-    trajectory = late(trajectory, 60_000_000)
-    return compare(trajectory), trajectory
+def _in_real_time() -> Any:
+    return compare(late(_trajectory(3, pace="realtime", speed=5.0), 60_000_000))
 
 
-def _disagreeing() -> tuple[Any, Run]:
-    document = _document(4)
-    wrong = document | {"graphs": document["graphs"] | {"ring $$x$$": {"edges": [[1, 2], [2, 3], [3, 4], [1, 4, 0.3]]}}}
-    said, did = Experiment.parse(document), simulate(Experiment.parse(wrong).with_run(duration=100))
-    said = said.with_run(duration=100)
-    trajectory = claimed(did, said)
-    return compare(trajectory), trajectory
+def _disagreeing() -> Any:
+    said = _document(4, duration=100)
+    ring = {"ring $$x$$": {"edges": [[1, 2], [2, 3], [3, 4], [1, 4, 0.3]]}}
+    did = simulate(Experiment.parse(said | {"graphs": said["graphs"] | ring}))
+    return compare(claimed(did, Experiment.parse(said)))
 
 
-def _incomplete() -> tuple[Any, Run]:
+def _incomplete() -> Any:
     trajectory = _trajectory(3)
     trajectory.states[5, 1] = np.nan
     count = Completeness(expected=1203, received=1202, missing=1)
-    trajectory = dataclasses.replace(trajectory, completeness=count)
-    return compare(trajectory), trajectory
+    return compare(dataclasses.replace(trajectory, completeness=count))
 
 
-def _pooled() -> tuple[Any, Run]:
-    comparison = compare_pooled([(f"bag_{seed}", _trajectory(3, seed=seed)) for seed in (1, 2, 3)])
-    return comparison, comparison.trajectory
+def _pooled() -> Any:
+    return compare_pooled([(f"bag_{seed}", _trajectory(3, seed=seed)) for seed in (1, 2, 3)])
 
 
-def _tracking() -> tuple[Any, Run]:
-    document = {
+def _tracking() -> Any:
+    led = {
         "name": "led",
         "problem": "tracking",
         "time": "discrete",
@@ -391,8 +381,7 @@ def _tracking() -> tuple[Any, Run]:
         "noise": {"process": 0.5, "loss": 0.1},
         "run": {"duration": 300},
     }
-    trajectory = simulate(Experiment.parse(document))
-    return compare(trajectory), trajectory
+    return compare(simulate(Experiment.parse(led)))
 
 
 @pytest.mark.parametrize(

@@ -6,18 +6,20 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from programs import run as call
 
 from experiments import Experiment, Run, RunRecord, compare, line_ring, new_record, simulate
 from msg_analysis import write_report
-from msg_analysis.cli.main import main
 from msg_analysis.common.text import agent_name, agent_text, with_names
 from msg_analysis.errors import InputError
 from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.report.comparison_text import furthest, order_statements, sentence
+from msg_analysis.report.list_pages import render_sweep
 from msg_analysis.report.page import page_title, run_facts
+from msg_analysis.report.sweep_plots import write_figure
 from msg_analysis.sweeps.grid import load_sweep
-from msg_analysis.sweeps.results import axis_name, column_words
+from msg_analysis.sweeps.points import evaluate
+from msg_analysis.sweeps.results import axis_name, column_words, evaluate_sweep, picture, rows_of
 
 AGENTS = ["agent 1", "agent 2", "agent 3"]
 
@@ -151,20 +153,17 @@ def test_every_command(named_run: Run, tmp_path: Path) -> None:
         ["predict", file], ["info", file], ["leaders", file, "--count", "2"], ["facts", file], ["compare", bag],
     ]  # fmt: skip
     for command in commands:
-        texts, document = (
-            CliRunner().invoke(main, [str(word) for word in [*command, *option]]).stdout for option in ([], ["--json"])
-        )
+        texts, document = (call("msg-analysis", *command, *option).stdout for option in ([], ["--json"]))
         assert "Bonn" in texts, command
         assert "agent 2" not in texts, command
         assert json.loads(document)["names"] == NAMES, command
     assert json.loads(document)["leaders"] == [2]
-    plan = CliRunner().invoke(main, ["plan", str(file)]).stdout
-    assert "agent Kiel x 0.5" in plan
+    assert "agent Kiel x 0.5" in call("msg-analysis", "plan", file).stdout
     saved = tmp_path / "saved.json"
     saved.write_text(document)
-    assert "Bonn" in CliRunner().invoke(main, ["tabulate", str(saved)]).stdout
+    assert "Bonn" in call("msg-analysis", "tabulate", saved).stdout
     table = tmp_path / "transient.csv"
-    CliRunner().invoke(main, ["transient", str(file), "--times", "0,1", "--csv", str(table)])
+    call("msg-analysis", "transient", file, "--times", "0,1", "--csv", table)
     assert "mean of agent Kiel" in table.read_text().partition("\n")[0]
 
 
@@ -205,13 +204,13 @@ def test_keys_of_a_sweep(tmp_path: Path) -> None:
     sweep = load_sweep(file)
     assert axis_name("noise.process[2]", sweep.names) == "process noise of agent Bonn [noise.process[2]]"
     assert column_words("continuous.node_errors[3]", sweep.names) == "error of agent Kiel, continuous time"
-    out = tmp_path / "out"
-    result = CliRunner().invoke(main, ["sweep", str(file), "--out", str(out), "--column", "node_errors[3]"])
-    assert result.exit_code == 0, result.output
-    page = (out / "sweep.html").read_text(encoding="utf-8")
+    outcomes = [evaluate(point.job) for point in sweep.points]
+    rows, column = rows_of(sweep, outcomes, evaluate_sweep(outcomes, 0.01)), "node_errors[3]"
+    page = render_sweep(sweep, rows, column, "two points", None)
     assert "process noise of agent Bonn" in page
     assert "Error of agent Kiel over one key" in page
-    assert "agent 2" not in page + (out / "figure.svg").read_text(encoding="utf-8")
+    (figure, _) = write_figure(picture(sweep, rows, column), "noise", tmp_path)
+    assert "agent 2" not in page + figure.read_text(encoding="utf-8")
     # Points that have other names have none together.
     document["over"] = {"names": [NAMES, NAMES[::-1]]}
     file.write_text(json.dumps(document))
