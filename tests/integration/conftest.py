@@ -25,6 +25,7 @@ from typing import Any
 import pytest
 import yaml
 from left_processes import describe, last_line
+from many_commands import ForkedCommand, ensure_running
 from networks import assert_equal_to_twin, document, experiment
 from started_processes import started_processes
 
@@ -40,6 +41,7 @@ from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.simulate import simulate
 
+Command = ForkedCommand | subprocess.Popen[str]
 MARK = "MSG_AGENTS_TEST"
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 PLAIN_RECORDER = Path(__file__).parents[1] / "support" / "plain_recorder.py"
@@ -108,12 +110,13 @@ class Network:
     mark: str
     directory: Path
     traces: set[Path] = field(default_factory=set)  # what nobody should find after the end
-    commands: list[subprocess.Popen[str]] = field(default_factory=list)  # that it has started
+    commands: list[Command] = field(default_factory=list)  # that it has started
     _looked: list[float] = field(default_factory=lambda: [0.0])
 
     def processes(self, *kinds: str) -> list[Process]:
         """Living processes of this test, of all kinds or only of some."""
-        found = []
+        forked = [command for command in self.commands if isinstance(command, ForkedCommand)]
+        found = [Process(one.pid, born, tuple(one.args)) for one in forked if (born := _born(one.pid))]
         wanted = f"{MARK}={self.mark}".encode()
         for entry in Path("/proc").iterdir():
             if not entry.name.isdigit():
@@ -154,8 +157,13 @@ class Network:
         """Files of Fast DDS in shared memory that the nodes have mapped: a killed node would leave them behind."""
         return {path for node in self.nodes() for path in _mapped(node.pid)}
 
-    def start(self, *arguments: str | Path, machine: Sequence[str] = (), **environment: str) -> subprocess.Popen[str]:
-        """Start ``msg-agents`` with these arguments; ``machine``: see ``ill_machines``."""
+    def start(self, *arguments: str | Path) -> ForkedCommand:
+        """Start ``msg-agents`` with these arguments."""
+        self.commands.append(ForkedCommand("msg-agents", arguments, os.environ | {"NO_COLOR": "1"}))
+        return self.commands[-1]
+
+    def execute(self, *arguments: str | Path, machine: Sequence[str] = (), **environment: str) -> subprocess.Popen[str]:
+        """The same, as from a shell, with variables that are read when a program starts; see ``ill_machines``."""
         command = subprocess.Popen(
             [*machine, str(PROGRAM), *(str(argument) for argument in arguments)],
             stdout=subprocess.PIPE,
@@ -166,9 +174,13 @@ class Network:
         self.commands.append(command)
         return command
 
-    def record(self, file: Path, *options: str | Path, **environment: str) -> subprocess.Popen[str]:
+    def record(self, file: Path, *options: str | Path) -> ForkedCommand:
         """Start ``msg-agents run`` without a verdict."""
-        return self.start("run", file, "--out", self.directory / "runs", "--no-analyse", *options, **environment)
+        return self.start(*self.recording(file), *options)
+
+    def recording(self, file: Path) -> tuple[str | Path, ...]:
+        """Command of a run without a verdict."""
+        return "run", file, "--out", self.directory / "runs", "--no-analyse"
 
     experiment = staticmethod(experiment)
 
@@ -183,7 +195,7 @@ class Network:
         return run_network(what, self.directory / out, **options)
 
     @staticmethod
-    def completed(run: subprocess.Popen[str]) -> dict[str, Any]:
+    def completed(run: Command) -> dict[str, Any]:
         """Wait for the end of ``msg-agents run --json``: all is there, once, and as the twin says.
 
         Its result comes back, and what it noted on the way. Whether a run agrees with the prediction depends on its
@@ -232,9 +244,10 @@ class Network:
 
 @pytest.fixture
 def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network]:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    ensure_running()  # without the mark: it serves all tests
     mark = uuid.uuid4().hex
     monkeypatch.setenv(MARK, mark)
-    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
     for name in list(os.environ):
         if name.startswith(("ROS_DOMAIN", "ROS_AUTOMATIC", "ROS_STATIC", "FASTDDS_", "FASTRTPS_")):
             monkeypatch.delenv(name)

@@ -89,7 +89,7 @@ def test_a_foreign_profile(plain_shell: Any, tmp_path: Path) -> None:
     """One that lets nodes meet: the run works with it."""
     profile = tmp_path / "mine.xml"
     profile.write_text(LOOPBACK_PROFILE.read_text())
-    run = plain_shell.start("doctor", "--json", FASTRTPS_DEFAULT_PROFILES_FILE=str(profile))
+    run = plain_shell.execute("doctor", "--json", FASTRTPS_DEFAULT_PROFILES_FILE=str(profile))
     code, checks = examined(run)
     assert checks["profiles"]["status"] == "warning"
     assert str(profile) in checks["profiles"]["text"]
@@ -98,9 +98,9 @@ def test_a_foreign_profile(plain_shell: Any, tmp_path: Path) -> None:
 
 def refused(network: Any, name: str, machine: Sequence[str] = (), **variables: str) -> str:
     """The doctor has this error, and a run the same, before anything is made; ``machine``: see ``ill_machines``."""
-    code, checks = examined(network.start("doctor", "--json", machine=machine, **variables))
+    code, checks = examined(network.execute("doctor", "--json", machine=machine, **variables))
     assert (code, checks[name]["status"], checks["round_trip"]["status"]) == (2, "error", "warning")
-    run = network.start("run", network.file(), "--out", network.directory / "runs", machine=machine, **variables)
+    run = network.execute("run", network.file(), "--out", network.directory / "runs", machine=machine, **variables)
     stdout, stderr = run.communicate(timeout=60)
     assert (run.returncode, stdout) == (2, "")
     assert stderr == f"error: {checks[name]['text']}\n"
@@ -145,5 +145,5 @@ def test_no_loopback(plain_shell: Any) -> None:
 
 def test_few_descriptors(plain_shell: Any) -> None:
     """Too few for two processes: the round trip says so, without a traceback."""
-    code, checks = examined(plain_shell.start("doctor", "--json", machine=ill_machines.FEW_DESCRIPTORS))
+    code, checks = examined(plain_shell.execute("doctor", "--json", machine=ill_machines.FEW_DESCRIPTORS))
     assert (code, checks["round_trip"]["status"]) == (2, "error")

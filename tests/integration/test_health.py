@@ -73,7 +73,7 @@ def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
             environment = node_environment(domain)
             # What gets lost while they look for each other comes again after 3 s, and the same can happen to that.
             doubles = {
-                agent: network.start("agent", record, "--agent", agent, "--discovery-timeout", "12", **environment)
+                agent: network.execute("agent", record, "--agent", agent, "--discovery-timeout", "12", **environment)
                 for agent, record in (("4", network.run_file()), ("5", other))
             }
 

@@ -107,7 +107,7 @@ def test_a_chain_that_jumps_in_nearly_every_step(network: Any, processes: int) -
 def test_a_network_on_another_processor(network: Any) -> None:
     """What it records is what the twin of this processor gives, from the experiment alone."""
     file = network.file(**CASES["discrete"])
-    result = network.completed(network.record(file, "--json", **another_processor()))
+    result = network.completed(network.execute(*network.recording(file), "--json", **another_processor()))
     equals_the_twin(network.experiment(**CASES["discrete"]), read_bag(result["bag"]))
 
 

@@ -113,7 +113,7 @@ def test_a_protocol_that_ends_its_process(network: Any) -> None:
     """With the exit code of success: the others do not wait for its agents for ever."""
     packages = _install(network, LEAVING)
     file = network.file(protocol={"name": "broken"}, run={"duration": 60, "start": "zero", "processes": 2})
-    process = network.record(file, PYTHONPATH=str(packages))
+    process = network.execute(*network.recording(file), PYTHONPATH=str(packages))
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 3, stderr
     assert "failed: agents_3_to_5: exit code 0 before its last step" in stderr
@@ -140,7 +140,7 @@ def test_a_protocol_that_fails(network: Any) -> None:
     packages = _install(network, BROKEN)
     run = {"duration": 60, "start": "zero", "processes": 2}
     file = network.file(protocol={"name": "broken"}, run=run)
-    process = network.record(file, PYTHONPATH=str(packages))
+    process = network.execute(*network.recording(file), PYTHONPATH=str(packages))
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 3, stderr
     assert "Traceback" not in stderr

@@ -145,7 +145,7 @@ def test_without_a_clock(network: Any, option: list[str]) -> None:
     file = run_file(network.directory, 5, run=REALTIME)
     with free_domain() as domain:
         agents = [part for number in "12345" for part in ("--agent", number)]
-        node = network.start("agent", file, *agents, "--discovery-timeout", "2", *option, ROS_DOMAIN_ID=str(domain))
+        node = network.execute("agent", file, *agents, "--discovery-timeout", "2", *option, ROS_DOMAIN_ID=str(domain))
         stdout, stderr = node.communicate(timeout=60)
     assert (node.returncode, stdout) == (2, ""), stderr
     assert "did not discover: a publisher of /clock." in stderr
@@ -181,7 +181,7 @@ def test_an_agent_stands_still_and_the_clock_is_set_back(network: Any) -> None:
     """
     clock = SetClock(network.directory)
     file = network.file(run=REALTIME | {"duration": 35, "processes": 2})
-    run = network.record(file, "--json", **clock.environment)
+    run = network.execute(*network.recording(file), "--json", **clock.environment)
     steps = network.wait_for_steps()
     (agent, *_) = network.processes("agent")
     agent.kill(signal.SIGSTOP)

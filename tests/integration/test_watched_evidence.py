@@ -80,7 +80,7 @@ def test_a_wrong_network_is_ended(network: Any, law: str) -> None:
     file = network.file(**changes | {"run": {"duration": 4000, "replicas": 8, "processes": 2} | changes.get("run", {})})
     path = os.pathsep.join([str(network.directory), *filter(None, [os.environ.get("PYTHONPATH")])])
     options = ("--out", network.directory, "--json", "--until", "decided", "--write-report", "never")
-    run = network.start("run", file, *options, PYTHONPATH=path)
+    run = network.execute("run", file, *options, PYTHONPATH=path)
     stdout, stderr = run.communicate(timeout=150)
     assert run.returncode == 1, stderr + stdout
     result = json.loads(stdout)

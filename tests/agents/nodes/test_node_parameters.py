@@ -18,7 +18,6 @@ pytest.importorskip("rclpy")
 import click
 
 from msg_agents.cli.main import main
-from msg_agents.cli.node_server import MODULES as NODE_MODULES
 from msg_agents.cli.ros_command import RosCommand, split_arguments
 from msg_agents.discovery.rtps import free_domain
 from msg_agents.nodes.parameters import describe, name_of, options_of
@@ -50,9 +49,7 @@ def start(executable: str, *arguments: Any) -> Ended:
     words = [executable, *(str(argument) for argument in arguments)]
     with free_domain() as domain:
         environment = {"NO_COLOR": "1", "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        ((code, stdout, stderr),) = many_commands.outcomes(
-            [["msg-agents", words, "pipe"]], Path.cwd(), NODE_MODULES, **environment
-        )
+        ((code, stdout, stderr),) = many_commands.outcomes([("msg-agents", words, "pipe")], Path.cwd(), **environment)
     return Ended(code, stdout, stderr)
 
 
