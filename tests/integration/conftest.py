@@ -157,13 +157,14 @@ class Network:
         """Files of Fast DDS in shared memory that the nodes have mapped: a killed node would leave them behind."""
         return {path for node in self.nodes() for path in _mapped(node.pid)}
 
-    def start(self, *arguments: str | Path) -> ForkedCommand:
-        """Start ``msg-agents`` with these arguments."""
-        self.commands.append(ForkedCommand("msg-agents", arguments, os.environ | {"NO_COLOR": "1"}))
-        return self.commands[-1]
+    def start(self, *arguments: str | Path, first: Callable[[], object] | None = None) -> ForkedCommand:
+        """Start ``msg-agents`` with these arguments; ``first``: what the process does before."""
+        command = ForkedCommand("msg-agents", arguments, os.environ | {"NO_COLOR": "1"}, first=first)
+        self.commands.append(command)
+        return command
 
     def execute(self, *arguments: str | Path, machine: Sequence[str] = (), **environment: str) -> subprocess.Popen[str]:
-        """The same, as from a shell, with variables that are read when a program starts; see ``ill_machines``."""
+        """The same, as from a shell, by words before it, and with variables that are read when a program starts."""
         command = subprocess.Popen(
             [*machine, str(PROGRAM), *(str(argument) for argument in arguments)],
             stdout=subprocess.PIPE,

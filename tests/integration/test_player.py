@@ -144,7 +144,7 @@ def test_keys_pause_and_step(network: Any, twin_bag: Path, plain: Any, terminal:
     file = network.directory / "plain.mcap"
     first = plain(file, {"/agent_3/state": 3})
     screen = terminal(
-        PROGRAM, "play", twin_bag, "--paused", "--rate", "max", "--topics", "/agent_3/state", "--await", "plain"
+        "msg-agents", "play", twin_bag, "--paused", "--rate", "max", "--topics", "/agent_3/state", "--await", "plain"
     )
     screen.wait_for("paused")
     screen.wait_for("space: pause")
@@ -163,7 +163,7 @@ def test_keys_pause_and_step(network: Any, twin_bag: Path, plain: Any, terminal:
 def paused_player(terminal: Any, bag: Path) -> Terminal:
     """One that waits for the node `plain`, and shows that it stands still."""
     screen: Terminal = terminal(
-        *(PROGRAM, "play", bag, "--paused", "--rate", "max", "--await", "plain"),
+        *("msg-agents", "play", bag, "--paused", "--rate", "max", "--await", "plain"),
         *("--topics", "/agent_3/state", "--topics", "/graph"),
     )
     screen.wait_for("paused")
@@ -210,7 +210,7 @@ def test_to_a_typed_time(network: Any, twin_bag: Path, plain: Any, terminal: Any
 def test_the_terminal_is_left_as_it_was(twin_bag: Path, terminal: Any) -> None:
     """Whatever ends the player; the bag alone never does."""
     screens = {
-        number: terminal(PROGRAM, "play", "--loop", twin_bag)
+        number: terminal("msg-agents", "play", "--loop", twin_bag)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     }
     for number, screen in screens.items():
@@ -287,7 +287,7 @@ def test_standing_is_no_time_of_the_bag_without_a_terminal(network: Any, domain:
 
 def test_ctrl_c_while_waiting_for_readers(network: Any, twin_bag: Path, terminal: Any) -> None:
     """It says for whom it waits, and what was played: nothing."""
-    screen = terminal(PROGRAM, "play", twin_bag, "--await", "nobody")
+    screen = terminal("msg-agents", "play", twin_bag, "--await", "nobody")
     screen.wait_for("waiting for readers, 30 s at most: nobody does not read /agent_1/state")
     screen.type(b"\x03")
     assert screen.process.wait(timeout=30) == 130

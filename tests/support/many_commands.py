@@ -46,7 +46,7 @@ LONGEST = 60  # s of a job
 class ForkedCommand:
     """A running command, with what tests use of ``subprocess.Popen``; its stdout and stderr are pipes of text.
 
-    ``stdout``: a file instead; ``first``: what the process does before all else.
+    ``terminal``: the streams are this one instead, and ``stdout`` a file; ``first``: what the process does before.
     """
 
     def __init__(
@@ -56,13 +56,16 @@ class ForkedCommand:
         environment: Mapping[str, str],
         *,
         folder: Path | None = None,
-        stdout: str | None = None,
+        terminal: str | None = None,
+        stdout: str | Path | None = None,
         first: Callable[[], object] | None = None,
     ) -> None:
         self.args = [program, *map(str, arguments)]
         pipes = [FORKING.Pipe(duplex=False) for _ in range(2)]
-        words = (self.args, dict(environment), folder or Path.cwd(), [write for _, write in pipes], stdout, first)
-        self._process = FORKING.Process(target=_become, args=words)
+        streams = ([write for _, write in pipes], terminal, stdout)
+        self._process = FORKING.Process(
+            target=_become, args=(self.args, dict(environment), folder or Path.cwd(), *streams, first)
+        )
         self._process.start()
         self.pid: int = self._process.pid
         self.stdout, self.stderr = (os.fdopen(os.dup(read.fileno())) for read, _ in pipes)
@@ -115,19 +118,26 @@ def _become(
     words: list[str],
     environment: dict[str, str],
     folder: Path,
-    streams: list[Connection],
-    stdout: str | None,
+    pipes: list[Connection],
+    terminal: str | None,
+    stdout: str | Path | None,
     first: Callable[[], object] | None,
 ) -> None:
     """Turn this process, which has been forked, into one that the program had been executed in."""
     from msg_agents.run.fork_server import run_and_end
 
     gc.freeze()  # the collector writes to what it looks at, and the memory would be copied
-    for number, stream in enumerate(streams, start=1):
-        os.dup2(stream.fileno(), number)
-        stream.close()
+    for number, pipe in enumerate(pipes, start=1):
+        os.dup2(pipe.fileno(), number)
+        pipe.close()
+    if terminal is not None:
+        os.setsid()
+        opened = os.open(terminal, os.O_RDWR)  # from now on that of this session
+        for number in range(3):
+            os.dup2(opened, number)
+        sys.stdin = open(0, closefd=False)  # noqa: SIM115
     if stdout is not None:
-        os.dup2(os.open(stdout, os.O_RDWR | os.O_NOCTTY), 1)
+        os.dup2(os.open(stdout, os.O_RDWR | os.O_CREAT), 1)
     sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115  as Python does it at its start
     sys.stderr = open(2, "w", buffering=1, errors="backslashreplace", closefd=False)  # noqa: SIM115
     os.environ.clear()
