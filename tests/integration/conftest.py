@@ -157,9 +157,11 @@ class Network:
         """Files of Fast DDS in shared memory that the nodes have mapped: a killed node would leave them behind."""
         return {path for node in self.nodes() for path in _mapped(node.pid)}
 
-    def start(self, *arguments: str | Path, first: Callable[[], object] | None = None) -> ForkedCommand:
-        """Start ``msg-agents`` with these arguments; ``first``: what the process does before."""
-        command = ForkedCommand("msg-agents", arguments, os.environ | {"NO_COLOR": "1"}, first=first)
+    def start(
+        self, *arguments: str | Path, program: str = "msg-agents", first: Callable[[], object] | None = None
+    ) -> ForkedCommand:
+        """Start a command with these arguments; ``first``: what the process does before."""
+        command = ForkedCommand(program, arguments, os.environ | {"NO_COLOR": "1"}, first=first)
         self.commands.append(command)
         return command
 

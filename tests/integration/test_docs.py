@@ -23,7 +23,7 @@ def started(command: str, place: Path) -> Any:
     """Typed in a wide terminal, with the commands on the path; one of ours that needs no shell is forked."""
     environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
     found = re.fullmatch(r"(msg-(?:agents|analysis)) ([\w./ -]+?)(?: > ([\w.]+))?", command)
-    if found and str(place) not in environment.get("PYTHONPATH", ""):
+    if found:
         stdout = place / found[3] if found[3] else None
         return ForkedCommand(found[1], found[2].split(), environment, folder=place, stdout=stdout)
     environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"

@@ -109,11 +109,12 @@ def _install(network: Any, code: str) -> Path:
     return packages
 
 
-def test_a_protocol_that_ends_its_process(network: Any) -> None:
+def test_a_protocol_that_ends_its_process(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the exit code of success: the others do not wait for its agents for ever."""
     packages = _install(network, LEAVING)
     file = network.file(protocol={"name": "broken"}, run={"duration": 60, "start": "zero", "processes": 2})
-    process = network.execute(*network.recording(file), PYTHONPATH=str(packages))
+    monkeypatch.setenv("PYTHONPATH", str(packages))
+    process = network.record(file)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 3, stderr
     assert "failed: agents_3_to_5: exit code 0 before its last step" in stderr
@@ -135,12 +136,13 @@ def test_a_protocol_that_hangs(network: Any, monkeypatch: pytest.MonkeyPatch, re
     assert re.search(r"most recent call first.*broken_module\.py\", line 14 in step\n", log, re.DOTALL)
 
 
-def test_a_protocol_that_fails(network: Any) -> None:
+def test_a_protocol_that_fails(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Said in a line with protocol, package, agent and step; in full in the log."""
     packages = _install(network, BROKEN)
     run = {"duration": 60, "start": "zero", "processes": 2}
     file = network.file(protocol={"name": "broken"}, run=run)
-    process = network.execute(*network.recording(file), PYTHONPATH=str(packages))
+    monkeypatch.setenv("PYTHONPATH", str(packages))
+    process = network.record(file)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 3, stderr
     assert "Traceback" not in stderr
