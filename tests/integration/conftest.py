@@ -39,6 +39,7 @@ from msg_agents.run.supervisor import STEPS
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.run import Run
 from msg_analysis.twin.simulate import simulate
 
 Command = ForkedCommand | subprocess.Popen[str]
@@ -193,20 +194,39 @@ class Network:
         path.write_text(yaml.safe_dump(document(**changes)))
         return path
 
-    def run(self, what: Experiment, out: str = "runs", **options: Any) -> RunResult:
+    def bag(self) -> Path:
+        """The only run."""
+        (bag,) = (self.directory / "runs").iterdir()
+        return bag
+
+    def run(self, what: Experiment, *, fails: bool = False, **options: Any) -> RunResult:
         """A whole run from this process, without comparison and report."""
-        return run_network(what, self.directory / out, **options)
+        result = run_network(what, self.directory / "runs", **options)
+        assert bool(result.failures) == fails, result.failures
+        return result
 
     @staticmethod
-    def completed(run: Command) -> dict[str, Any]:
+    def ended(process: Command, code: int = 0) -> tuple[str, str]:
+        """Wait for the end of a process with this exit code; what it has printed."""
+        stdout, stderr = process.communicate(timeout=150)
+        assert process.returncode == code, stdout + stderr
+        assert "Traceback" not in stderr
+        return stdout, stderr
+
+    @classmethod
+    def result(cls, process: Command, code: int = 0) -> dict[str, Any]:
+        """The same of one that prints JSON; its object."""
+        found: dict[str, Any] = json.loads(cls.ended(process, code)[0])
+        return found
+
+    @classmethod
+    def completed(cls, run: Command) -> dict[str, Any]:
         """Wait for the end of ``msg-agents run --json``: all is there, once, and as the twin says.
 
         Its result comes back, and what it noted on the way. Whether a run agrees with the prediction depends on its
         seed only, so most runs are not analysed.
         """
-        stdout, stderr = run.communicate(timeout=150)
-        assert run.returncode == 0, stderr + stdout
-        assert "Traceback" not in stderr
+        stdout, stderr = cls.ended(run)
         assert stdout.count("\n") == 1
         result: dict[str, Any] = json.loads(stdout)
         assert result["failures"] == []
@@ -216,6 +236,20 @@ class Network:
         trajectory = read_bag(result["bag"])
         assert_equal_to_twin(trajectory)
         return result | {"notes": re.findall(r"^note: (.*)", stderr, re.MULTILINE)}
+
+    def killed_and_back(self, run: Command, victims: Callable[[], Sequence[Process]], times: int = 1) -> Run:
+        """Kill these processes of agents in the middle of a run, which must restart them; the run."""
+        self.wait_for_steps()
+        for _ in range(times):
+            for victim in self.wait_for(victims, 30, "a living agent"):
+                victim.kill()
+        result = self.result(run)
+        assert len(result["restarts"]) >= 1
+        return read_bag(result["bag"])
+
+    def any_agent(self) -> list[Process]:
+        """A living process of agents, if there is one: the same of the same ones."""
+        return random.Random(1).choices(there) if (there := self.processes("agent")) else []
 
     def recorded_bytes(self, out: str = "runs") -> int:
         """Size of what has been recorded so far."""

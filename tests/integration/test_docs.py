@@ -103,6 +103,8 @@ def test_python_blocks(name: str, network, domain: int) -> None:
     assert process.returncode == 0, process.stderr
     printed = process.stdout.split(f"{NEXT_BLOCK}\n")
     assert [missing(shown, text) for (_, shown), text in zip(found, printed, strict=True)] == [[]] * len(found)
+    made = re.findall(r'"(\w+\.(?:png|html))"\)', code)
+    assert [file for file in made if (place / file).stat().st_size < 1000] == []
 
 
 @pytest.mark.parametrize("name", ["discrete", "tracking"])

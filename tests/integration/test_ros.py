@@ -39,14 +39,6 @@ def python(code: str, **options: Any) -> subprocess.Popen[str]:
     return subprocess.Popen([sys.executable, "-P", "-c", code], **pipes, text=True, **options)
 
 
-def end(process: Any, code: int = 0) -> str:
-    """Wait for it; what it printed."""
-    stdout, stderr = process.communicate(timeout=90)
-    assert process.returncode == code, stderr
-    assert "Traceback" not in stderr
-    return stdout
-
-
 def topics(bag: Path) -> Counter[str]:
     """Messages by topic, as mcap's own reader counts them."""
     (file,) = bag.glob("*.mcap")
@@ -86,14 +78,14 @@ def test_parameters_namespace_and_remapping(network: Any) -> None:
         ]
         nodes.append(network.start("recorder", *ros))
         if namespace == "/lab":  # before the run can be over
-            described = json.loads(end(python(DESCRIBE)))
+            described = json.loads(network.ended(python(DESCRIBE))[0])
         nodes += [
             network.start("agent", *ros, "-p", "agents:=[1, 3]"),
             network.start("agent", "--agent", "2", "--agent", "4", "--agent", "5", *ros),
             network.start("switcher", *ros),
         ]
     for node in nodes:
-        assert end(node) == ""
+        assert network.ended(node)[0] == ""
     assert described["out"] == {"type": 4, "read_only": True, "value": str(bags["/lab"])}
     assert described["compression"]["value"] == "lz4"
     for namespace, bag in bags.items():
@@ -180,7 +172,7 @@ def test_a_node_of_your_own(network: Any, domain: int) -> None:
     file = network.file(run={"pace": "realtime", "speed": 2.5, "processes": 2})  # 6 s
     result = network.completed(network.record(file, "--domain", str(domain), "--json"))
     assert result["strangers"] == []
-    printed = end(watching)
+    printed, _ = network.ended(watching)
     graphs = re.findall(r"^steps (\d+) to (\d+): (line|ring), (\d+) arcs$", printed, re.M)
     assert (graphs[0][0], graphs[-1][1]) == ("0", "299")
     assert all(arcs == {"line": "8", "ring": "10"}[name] for _, _, name, arcs in graphs)
@@ -197,8 +189,8 @@ def test_a_guest_gets_everything(network: Any, domain: int) -> None:
     ros = ["--ros-args", "-p", f"run:={record}", "-p", "await:=[rosbag2_recorder]"]
     nodes = [network.start("switcher", *ros), network.start("agent", *ros, "-p", "agents:=[1, 2, 3, 4, 5]")]
     for node in nodes:
-        end(node)
-    assert json.loads(end(guest)) == [[i, step] for i in range(1, 6) for step in range(301)]
+        network.ended(node)
+    assert json.loads(network.ended(guest)[0]) == [[i, step] for i in range(1, 6) for step in range(301)]
 
 
 GUEST = """

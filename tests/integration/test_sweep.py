@@ -75,10 +75,7 @@ def test_a_worker_is_killed_in_the_middle(network: Any, cluster: tuple[str, list
     process = network.start("sweep", path, "--scheduler", address, "--out", out, "--json", program="msg-analysis")
     network.wait_for(lambda: lines(out / "points.jsonl") >= 2, 60, "results")
     workers[0].kill()
-    stdout, stderr = process.communicate(timeout=100)
-    assert process.returncode == 0, stderr
-    assert "Traceback" not in stderr
-    result = json.loads(stdout)
+    result = network.result(process)
     assert (result["done"], result["failed"], result["verdict"]) == (12, 0, "agrees")
     assert lines(out / "points.jsonl") == 12
     places = {json.loads(line)["place"] for line in (out / "points.jsonl").read_text().splitlines()}
@@ -108,8 +105,7 @@ def test_networks_interrupted_killed_and_resumed(network: Any) -> None:
     process = started(15, 10_000, workers=two)
     network.wait_for(lambda: lines(out / "points.jsonl") == 1, 100, "the shorter run")
     process.terminate()  # as a queue of a cluster does; Ctrl-C: tests/analysis/cli/test_sweep.py
-    stdout, stderr = process.communicate(timeout=100)
-    assert process.returncode == 128 + signal.SIGTERM, stderr
+    stdout, stderr = network.ended(process, 128 + signal.SIGTERM)
     assert stdout == ""
     assert "Traceback" not in stderr
     assert network.processes() == []
@@ -126,8 +122,7 @@ def test_networks_interrupted_killed_and_resumed(network: Any) -> None:
     network.wait_for(lambda: network.processes("recorder"), 60, "the second network")
     (run,) = network.processes("run")
     run.kill(signal.SIGINT)
-    stdout, stderr = process.communicate(timeout=100)
-    assert process.returncode == 3, stderr + stdout
+    stdout, stderr = network.ended(process, 3)
     result = json.loads(stdout)
     assert result["kept"] == 1
     assert [row["status"] for row in result["points"]] == ["done", "failed", "done"]
@@ -137,9 +132,7 @@ def test_networks_interrupted_killed_and_resumed(network: Any) -> None:
     (left,) = (out / "runs").iterdir()  # the others agree: their bags are not kept
 
     process = started(15, 20)
-    stdout, stderr = process.communicate(timeout=100)
-    assert process.returncode == 0, stderr
-    result = json.loads(stdout)
+    result = network.result(process)
     assert (result["done"], result["kept"], result["verdict"]) == (2, 2, "agrees")
     assert list((out / "runs").iterdir()) == [left]
 
@@ -169,7 +162,7 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
         "        print('ended', end.code, points.count('\\n'))",
     ]
     command = [sys.executable, "-P", "-c", "\n".join(code)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=280)
     assert result.returncode == 0, result.stderr
     first, second, rest = result.stdout.split("ended 0 2\n")
     for text, counts in ((first, "7 points of 2 networks"), (second, "6 points of 1 networks")):

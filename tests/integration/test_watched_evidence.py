@@ -81,9 +81,7 @@ def test_a_wrong_network_is_ended(network: Any, law: str, monkeypatch: pytest.Mo
     options = ("--out", network.directory, "--json", "--until", "decided", "--write-report", "never")
     monkeypatch.setenv("PYTHONPATH", str(network.directory), prepend=os.pathsep)  # of the processes of agents
     run = network.start("run", file, *options)
-    stdout, stderr = run.communicate(timeout=150)
-    assert run.returncode == 1, stderr + stdout
-    result = json.loads(stdout)
+    result = network.result(run, 1)
     assert (result["verdict"], result["failures"]) == ("disagrees", [])
     assert result["until"]["ended_early"]
     assert result["until"]["reason"].startswith("evidence against the prediction passed 100 at step ")
