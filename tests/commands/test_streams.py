@@ -154,9 +154,9 @@ def test_a_result_that_cannot_be_printed(folder: Path) -> None:
 def test_a_disk_that_is_full(folder: Path) -> None:
     """Files cannot grow: one line says which, exit code 2, no traceback."""
     writing = [(("msg-analysis", name), "limit") for name in ("simulate", "figures", "salvage", "export")]
-    for command, _, code, text, _ in outcomes(folder, *writing):
+    for command, _, code, *texts in outcomes(folder, *writing):
         assert code == 2, command
-        assert re.fullmatch(r"error: .*File too large.*\n", text), (command, text)
+        assert re.fullmatch(r"error: .*File too large.*\n", "".join(texts)), (command, texts)
 
 
 @pytest.mark.parametrize("option", ["--report", "--csv"])

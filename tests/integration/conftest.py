@@ -25,6 +25,7 @@ from typing import Any
 import pytest
 import yaml
 from left_processes import describe, last_line
+from many_commands import ForkedCommand, ensure_running
 from networks import assert_equal_to_twin, document, experiment
 from started_processes import started_processes
 
@@ -38,8 +39,10 @@ from msg_agents.run.supervisor import STEPS
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.model.run import Run
 from msg_analysis.twin.simulate import simulate
 
+Command = ForkedCommand | subprocess.Popen[str]
 MARK = "MSG_AGENTS_TEST"
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 PLAIN_RECORDER = Path(__file__).parents[1] / "support" / "plain_recorder.py"
@@ -108,12 +111,13 @@ class Network:
     mark: str
     directory: Path
     traces: set[Path] = field(default_factory=set)  # what nobody should find after the end
-    commands: list[subprocess.Popen[str]] = field(default_factory=list)  # that it has started
+    commands: list[Command] = field(default_factory=list)  # that it has started
     _looked: list[float] = field(default_factory=lambda: [0.0])
 
     def processes(self, *kinds: str) -> list[Process]:
         """Living processes of this test, of all kinds or only of some."""
-        found = []
+        forked = [command for command in self.commands if isinstance(command, ForkedCommand)]
+        found = [Process(one.pid, born, tuple(one.args)) for one in forked if (born := _born(one.pid))]
         wanted = f"{MARK}={self.mark}".encode()
         for entry in Path("/proc").iterdir():
             if not entry.name.isdigit():
@@ -154,8 +158,16 @@ class Network:
         """Files of Fast DDS in shared memory that the nodes have mapped: a killed node would leave them behind."""
         return {path for node in self.nodes() for path in _mapped(node.pid)}
 
-    def start(self, *arguments: str | Path, machine: Sequence[str] = (), **environment: str) -> subprocess.Popen[str]:
-        """Start ``msg-agents`` with these arguments; ``machine``: see ``ill_machines``."""
+    def start(
+        self, *arguments: str | Path, program: str = "msg-agents", first: Callable[[], object] | None = None
+    ) -> ForkedCommand:
+        """Start a command with these arguments; ``first``: what the process does before."""
+        command = ForkedCommand(program, arguments, os.environ | {"NO_COLOR": "1"}, first=first)
+        self.commands.append(command)
+        return command
+
+    def execute(self, *arguments: str | Path, machine: Sequence[str] = (), **environment: str) -> subprocess.Popen[str]:
+        """The same, as from a shell, by words before it, and with variables that are read when a program starts."""
         command = subprocess.Popen(
             [*machine, str(PROGRAM), *(str(argument) for argument in arguments)],
             stdout=subprocess.PIPE,
@@ -166,9 +178,13 @@ class Network:
         self.commands.append(command)
         return command
 
-    def record(self, file: Path, *options: str | Path, **environment: str) -> subprocess.Popen[str]:
+    def record(self, file: Path, *options: str | Path) -> ForkedCommand:
         """Start ``msg-agents run`` without a verdict."""
-        return self.start("run", file, "--out", self.directory / "runs", "--no-analyse", *options, **environment)
+        return self.start(*self.recording(file), *options)
+
+    def recording(self, file: Path) -> tuple[str | Path, ...]:
+        """Command of a run without a verdict."""
+        return "run", file, "--out", self.directory / "runs", "--no-analyse"
 
     experiment = staticmethod(experiment)
 
@@ -178,20 +194,39 @@ class Network:
         path.write_text(yaml.safe_dump(document(**changes)))
         return path
 
-    def run(self, what: Experiment, out: str = "runs", **options: Any) -> RunResult:
+    def bag(self) -> Path:
+        """The only run."""
+        (bag,) = (self.directory / "runs").iterdir()
+        return bag
+
+    def run(self, what: Experiment, *, fails: bool = False, **options: Any) -> RunResult:
         """A whole run from this process, without comparison and report."""
-        return run_network(what, self.directory / out, **options)
+        result = run_network(what, self.directory / "runs", **options)
+        assert bool(result.failures) == fails, result.failures
+        return result
 
     @staticmethod
-    def completed(run: subprocess.Popen[str]) -> dict[str, Any]:
+    def ended(process: Command, code: int = 0) -> tuple[str, str]:
+        """Wait for the end of a process with this exit code; what it has printed."""
+        stdout, stderr = process.communicate(timeout=150)
+        assert process.returncode == code, stdout + stderr
+        assert "Traceback" not in stderr
+        return stdout, stderr
+
+    @classmethod
+    def result(cls, process: Command, code: int = 0) -> dict[str, Any]:
+        """The same of one that prints JSON; its object."""
+        found: dict[str, Any] = json.loads(cls.ended(process, code)[0])
+        return found
+
+    @classmethod
+    def completed(cls, run: Command) -> dict[str, Any]:
         """Wait for the end of ``msg-agents run --json``: all is there, once, and as the twin says.
 
         Its result comes back, and what it noted on the way. Whether a run agrees with the prediction depends on its
         seed only, so most runs are not analysed.
         """
-        stdout, stderr = run.communicate(timeout=150)
-        assert run.returncode == 0, stderr + stdout
-        assert "Traceback" not in stderr
+        stdout, stderr = cls.ended(run)
         assert stdout.count("\n") == 1
         result: dict[str, Any] = json.loads(stdout)
         assert result["failures"] == []
@@ -201,6 +236,20 @@ class Network:
         trajectory = read_bag(result["bag"])
         assert_equal_to_twin(trajectory)
         return result | {"notes": re.findall(r"^note: (.*)", stderr, re.MULTILINE)}
+
+    def killed_and_back(self, run: Command, victims: Callable[[], Sequence[Process]], times: int = 1) -> Run:
+        """Kill these processes of agents in the middle of a run, which must restart them; the run."""
+        self.wait_for_steps()
+        for _ in range(times):
+            for victim in self.wait_for(victims, 30, "a living agent"):
+                victim.kill()
+        result = self.result(run)
+        assert len(result["restarts"]) >= 1
+        return read_bag(result["bag"])
+
+    def any_agent(self) -> list[Process]:
+        """A living process of agents, if there is one: the same of the same ones."""
+        return random.Random(1).choices(there) if (there := self.processes("agent")) else []
 
     def recorded_bytes(self, out: str = "runs") -> int:
         """Size of what has been recorded so far."""
@@ -232,9 +281,10 @@ class Network:
 
 @pytest.fixture
 def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network]:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
+    ensure_running()  # without the mark: it serves all tests
     mark = uuid.uuid4().hex
     monkeypatch.setenv(MARK, mark)
-    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
     for name in list(os.environ):
         if name.startswith(("ROS_DOMAIN", "ROS_AUTOMATIC", "ROS_STATIC", "FASTDDS_", "FASTRTPS_")):
             monkeypatch.delenv(name)

@@ -194,8 +194,7 @@ def test_a_killed_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
     wait_for_steps(network, hosts)
     (channel,) = network.processes("channel")
     channel.kill()
-    stdout, stderr = run.communicate(timeout=60)
-    assert run.returncode == 3
+    stdout, stderr = network.ended(run, 3)
     assert "failed: channel: killed by SIGKILL" in stderr
     result = json.loads(stdout)
     assert totals(result, "sent") > 0
@@ -208,8 +207,7 @@ def test_a_stopped_channel_ends_the_run(network: Any, hosts: set[int]) -> None:
     wait_for_steps(network, hosts)
     (channel,) = network.processes("channel")
     channel.kill(signal.SIGSTOP)
-    _, stderr = run.communicate(timeout=90)
-    assert run.returncode == 3
+    _, stderr = network.ended(run, 3)
     assert "no report from channel" in stderr
     assert "failed: channel: no report for 10 s, as if it was stopped" in stderr
 

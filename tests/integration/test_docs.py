@@ -6,11 +6,11 @@ import os
 import re
 import subprocess
 import sys
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
+from many_commands import ForkedCommand
 from pages import EXPERIMENTS, ROOT, blocks, console, experiments, files, missing, python
 
 from msg_analysis.bags.reading import read_record
@@ -19,20 +19,19 @@ DOCS = ROOT / "docs"
 NEXT_BLOCK = "next block of the page"
 
 
-def started(command: str, place: Path) -> subprocess.Popen[str]:
-    """Typed in a wide terminal, with the commands on the path; one of ours that needs no shell is started without."""
-    programs = Path(sys.executable).parent
+def started(command: str, place: Path) -> Any:
+    """Typed in a wide terminal, with the commands on the path; one of ours that needs no shell is forked."""
     environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1"}
-    if found := re.fullmatch(r"(msg-(?:agents|analysis)) ([\w./ -]+?)(?: > ([\w.]+))?", command):
-        words = [programs / found[1], *found[2].split()]
-    else:
-        words = ["bash", "-e", "-c", command]
-        environment["PATH"] = f"{programs}{os.pathsep}{os.environ['PATH']}"
-    with (place / found[3]).open("w") if found and found[3] else nullcontext(subprocess.PIPE) as stdout:
-        return subprocess.Popen(words, cwd=place, env=environment, stdout=stdout, stderr=subprocess.PIPE, text=True)
+    found = re.fullmatch(r"(msg-(?:agents|analysis)) ([\w./ -]+?)(?: > ([\w.]+))?", command)
+    if found:
+        stdout = place / found[3] if found[3] else None
+        return ForkedCommand(found[1], found[2].split(), environment, folder=place, stdout=stdout)
+    environment["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    pipes = dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
+    return subprocess.Popen(["bash", "-e", "-c", command], cwd=place, env=environment, text=True, **pipes)
 
 
-def ended(process: subprocess.Popen[str], code: int = 0) -> str:
+def ended(process: Any, code: int = 0) -> str:
     """What it printed."""
     stdout, stderr = process.communicate(timeout=100)
     assert process.returncode == code, stderr
@@ -42,7 +41,7 @@ def ended(process: subprocess.Popen[str], code: int = 0) -> str:
 def script(text: str, place: Path, patch: pytest.MonkeyPatch) -> None:
     """Line by line; those that end with "&" go on until "wait"."""
     subprocess.run(["bash", "-n", "-c", text], check=True)
-    meanwhile: list[subprocess.Popen[str]] = []
+    meanwhile: list[Any] = []
     for line in filter(None, text.splitlines()):
         word, *rest = line.split()
         if line.endswith(" &"):
@@ -104,6 +103,8 @@ def test_python_blocks(name: str, network, domain: int) -> None:
     assert process.returncode == 0, process.stderr
     printed = process.stdout.split(f"{NEXT_BLOCK}\n")
     assert [missing(shown, text) for (_, shown), text in zip(found, printed, strict=True)] == [[]] * len(found)
+    made = re.findall(r'"(\w+\.(?:png|html))"\)', code)
+    assert [file for file in made if (place / file).stat().st_size < 1000] == []
 
 
 @pytest.mark.parametrize("name", ["discrete", "tracking"])

@@ -6,8 +6,8 @@ import json
 import re
 import shutil
 import subprocess
-import sys
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ import pytest
 
 from msg_agents.discovery.rtps import LOOPBACK_PROFILE, free_domain
 
-PROGRAM = Path(sys.executable).with_name("msg-agents")
 NAMES = [
     *("python", "cores", "clock", "open_files", "processes", "shared_memory", "home", "temporary_directory"),
     *("loopback", "multicast", "socket_buffers", "rclpy", "profiles", "discovery_range", "discovery_server"),
@@ -25,7 +24,7 @@ NAMES = [
 OF_MACHINE = {*NAMES[:10], "socket_buffers", "rclpy", "free_domains"}
 
 
-def examined(process: subprocess.Popen[str]) -> tuple[int, dict[str, Any]]:
+def examined(process: Any) -> tuple[int, dict[str, Any]]:
     """Exit code, and the document with its checks by name."""
     stdout, stderr = process.communicate(timeout=60)
     assert stderr == ""
@@ -73,10 +72,10 @@ def test_many_warnings(plain_shell: Any, monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(other_rclpy(tmp_path).parents[2]))
     with free_domain() as held:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(held))
-        command = ["sh", "-c", 'ulimit -n 64; exec "$@"', "sh", PROGRAM, "doctor"]
-        doctor = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert (doctor.returncode, doctor.stderr) == (0, "")
-    *lines, last = doctor.stdout.splitlines()
+        doctor = plain_shell.start("doctor", first=ill_machines.some_descriptors)
+        stdout, stderr = doctor.communicate(timeout=60)
+    assert (doctor.returncode, stderr) == (0, "")
+    *lines, last = stdout.splitlines()
     found = {line[9:30].rstrip().replace(" ", "_"): line[:9].rstrip() for line in lines}
     assert list(found) == NAMES
     warned = {name for name, status in found.items() if status == "warning"}
@@ -85,22 +84,22 @@ def test_many_warnings(plain_shell: Any, monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert found["round_trip"] == "ok"
 
 
-def test_a_foreign_profile(plain_shell: Any, tmp_path: Path) -> None:
+def test_a_foreign_profile(plain_shell: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """One that lets nodes meet: the run works with it."""
     profile = tmp_path / "mine.xml"
     profile.write_text(LOOPBACK_PROFILE.read_text())
-    run = plain_shell.start("doctor", "--json", FASTRTPS_DEFAULT_PROFILES_FILE=str(profile))
-    code, checks = examined(run)
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
+    code, checks = examined(plain_shell.start("doctor", "--json"))
     assert checks["profiles"]["status"] == "warning"
     assert str(profile) in checks["profiles"]["text"]
     assert (code, checks["round_trip"]["status"]) == (0, "ok")
 
 
-def refused(network: Any, name: str, machine: Sequence[str] = (), **variables: str) -> str:
-    """The doctor has this error, and a run the same, before anything is made; ``machine``: see ``ill_machines``."""
-    code, checks = examined(network.start("doctor", "--json", machine=machine, **variables))
+def refused(network: Any, name: str, start: Callable[..., Any]) -> str:
+    """The doctor has this error, and a run the same, before anything is made."""
+    code, checks = examined(start("doctor", "--json"))
     assert (code, checks[name]["status"], checks["round_trip"]["status"]) == (2, "error", "warning")
-    run = network.start("run", network.file(), "--out", network.directory / "runs", machine=machine, **variables)
+    run = start("run", network.file(), "--out", network.directory / "runs")
     stdout, stderr = run.communicate(timeout=60)
     assert (run.returncode, stdout) == (2, "")
     assert stderr == f"error: {checks[name]['text']}\n"
@@ -108,22 +107,25 @@ def refused(network: Any, name: str, machine: Sequence[str] = (), **variables: s
     return stderr
 
 
-def test_a_foreign_middleware(plain_shell: Any) -> None:
-    said = refused(plain_shell, "middleware", RMW_IMPLEMENTATION="rmw_none_cpp")
+def test_a_foreign_middleware(plain_shell: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_none_cpp")
+    said = refused(plain_shell, "middleware", plain_shell.start)
     words = "RMW_IMPLEMENTATION: rmw_none_cpp: this ROS 2 .*: unset it, or install that middleware"
     assert re.fullmatch(f"error: {words}\n", said)
 
 
 def test_a_sourced_foreign_ros(plain_shell: Any, tmp_path: Path) -> None:
-    said = refused(plain_shell, "middleware", PYTHONPATH=str(other_rclpy(tmp_path)), ROS_DISTRO="foxy")
+    other = {"PYTHONPATH": str(other_rclpy(tmp_path)), "ROS_DISTRO": "foxy"}
+    said = refused(plain_shell, "middleware", partial(plain_shell.execute, **other))
     words = (
         r"/rclpy: cannot be used \(ImportError: libpython3.9.so: not found\): PYTHONPATH and ROS_DISTRO may lead to "
     )
     assert re.search(words + "another ROS 2: unset them, ", said)
 
 
-def test_no_discovery(plain_shell: Any) -> None:
-    refused(plain_shell, "discovery_range", ROS_AUTOMATIC_DISCOVERY_RANGE="OFF")
+def test_no_discovery(plain_shell: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
+    refused(plain_shell, "discovery_range", plain_shell.start)
 
 
 def need_unshare(*words: str) -> None:
@@ -134,16 +136,16 @@ def need_unshare(*words: str) -> None:
 
 def test_a_full_shared_memory(plain_shell: Any) -> None:
     need_unshare("--mount")
-    refused(plain_shell, "shared_memory", ill_machines.FULL_SHARED_MEMORY)
+    refused(plain_shell, "shared_memory", partial(plain_shell.start, first=ill_machines.full_shared_memory))
 
 
 def test_no_loopback(plain_shell: Any) -> None:
     """A new network namespace has an interface that is down."""
     need_unshare("--net")
-    refused(plain_shell, "loopback", ill_machines.NO_LOOPBACK)
+    refused(plain_shell, "loopback", partial(plain_shell.start, first=ill_machines.no_loopback))
 
 
 def test_few_descriptors(plain_shell: Any) -> None:
     """Too few for two processes: the round trip says so, without a traceback."""
-    code, checks = examined(plain_shell.start("doctor", "--json", machine=ill_machines.FEW_DESCRIPTORS))
+    code, checks = examined(plain_shell.start("doctor", "--json", first=ill_machines.few_descriptors))
     assert (code, checks["round_trip"]["status"]) == (2, "error")

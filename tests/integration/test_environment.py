@@ -37,7 +37,7 @@ def test_no_home_and_warnings_are_errors(network: Any, monkeypatch: pytest.Monke
     monkeypatch.delenv("HOME")
     for name, value in {"PYTHONWARNINGS": "error", "PYTHONPATH": "/nowhere", "ROS_LOCALHOST_ONLY": "1"}.items():
         monkeypatch.setenv(name, value)
-    run = network.start("run", network.file(run=RUN), "--out", network.directory / "runs", "--json")
+    run = network.execute("run", network.file(run=RUN), "--out", network.directory / "runs", "--json")
     undisturbed(network, run)
 
 

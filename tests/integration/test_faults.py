@@ -27,6 +27,11 @@ from msg_analysis.twin.check import check
 
 # 20,000 steps: no test waits for them; of states that are soon seen in the bag
 LONG = {"duration": 1000, "replicas": 16, "processes": 2}
+THIRTY = [*range(1, 31)]
+LARGE = {
+    "graphs": {"line": {"path": THIRTY}, "ring": {"cycle": THIRTY}},
+    "run": {"duration": 100, "replicas": 1, "processes": 1},
+}
 
 
 @pytest.mark.parametrize("kind", ["agent", "switcher"])
@@ -52,15 +57,13 @@ def kill_and_see(network: Any, run: subprocess.Popen[str], victim: Any, *, early
     assert network.shared_memory() == set()  # nothing that the victim could leave behind
     kind = victim.kind
     victim.kill()
-    _, stderr = run.communicate(timeout=60)
-    assert run.returncode == 3, stderr
-    assert "Traceback" not in stderr
+    _, stderr = network.ended(run, 3)
     assert network.processes() == []
     first = {1: "agents_1_to_2", 3: "agents_3_to_5"}[victim.agent] if kind == "agent" else kind
     assert re.search(rf"^failed: {first}: killed by SIGKILL", stderr, re.MULTILINE), stderr
     failed = re.findall(r"^failed: (agents?_\w+|switcher|recorder): ", stderr, re.MULTILINE)
     assert failed == [first], stderr
-    (bag,) = (network.directory / "runs").iterdir()
+    bag = network.bag()
     assert (bag / "log" / f"{first}.log").exists()
     recorded = not early or bool(list(bag.glob("*.mcap")))
     assert ("nothing was recorded" in stderr) == (not recorded)
@@ -85,14 +88,13 @@ def test_in_the_middle(network: Any, repetition: int, rng: random.Random) -> Non
     time.sleep(rng.uniform(0.0, 1.0) if repetition else 0.0)
     assert network.shared_memory() == set()
     run.send_signal(number)
-    stdout, stderr = run.communicate(timeout=60)
-    assert run.returncode == 3, stderr
+    stdout, stderr = network.ended(run, 3)
     assert network.processes() == []
     assert re.search(rf"^failed: stopped by {NAMES[number]} at step \d+ of 20000$", stderr, re.M)
     assert "Traceback" not in stderr
     assert stdout.count("\n") == 1  # one JSON object
 
-    (bag,) = (network.directory / "runs").iterdir()
+    bag = network.bag()
     result = json.loads(stdout)
     assert (result["verdict"], result["bag"], result["report"]) == ("incomplete", str(bag), None)
     assert result == json.loads((bag / "result.json").read_text())
@@ -115,42 +117,34 @@ def test_before_anything_has_begun(network: Any, repetition: int, rng: random.Ra
     time.sleep(rng.uniform(0.0, 1.5) if repetition else 0.0)
     number = signal.SIGINT if repetition % 2 else signal.SIGTERM
     run.send_signal(number)
-    _, stderr = run.communicate(timeout=60)
-    assert run.returncode == 3, stderr
+    _, stderr = network.ended(run, 3)
     assert f"failed: stopped by {NAMES[number]} " in stderr
     assert "Traceback" not in stderr
     assert network.processes() == []
 
 
-def test_while_the_run_is_compared_with_the_prediction(network: Any) -> None:
-    """The network has ended; the user does not wait for the verdict. The bag is whole, and can be compared later."""
-    graphs = {"line": {"path": list(range(1, 31))}, "ring": {"cycle": list(range(1, 31))}}
-    file = network.file(graphs=graphs, run={"duration": 100, "replicas": 1, "processes": 1})
-    run = network.start("run", file, "--out", network.directory / "runs", "--json")
-    network.wait_for(lambda: list(network.directory.glob("runs/*/log/run.json")), 60, "the end of the network")
-    time.sleep(0.2)
+@pytest.mark.parametrize(
+    ("there", "changes", "words"),
+    [
+        ("log/run.json", LARGE, "run was compared with the prediction"),
+        ("log", {"run": {"duration": 5, "replicas": 500}}, ".+"),
+    ],
+    ids=["compared", "at any moment"],
+)
+def test_after_the_network(network: Any, there: str, changes: dict[str, Any], words: str) -> None:
+    """The user does not wait for the verdict. The result is printed; the bag is whole, and can be compared later.
+
+    The comparison takes longer than this test needs to see that the logs are there, or as soon as they are being kept.
+    """
+    run = network.start("run", network.file(**changes), "--out", network.directory / "runs", "--json")
+    network.wait_for(lambda: list(network.directory.glob(f"runs/*/{there}")), 60, "the end of the network")
+    time.sleep(0.2 if there == "log/run.json" else 0.0)
     run.send_signal(signal.SIGINT)
-    stdout, stderr = run.communicate(timeout=60)
-    assert run.returncode == 3, stderr
-    assert stderr.splitlines()[-1] == "failed: stopped by Ctrl-C while the run was compared with the prediction"
-    (bag,) = (network.directory / "runs").iterdir()
-    result = json.loads(stdout)
+    stdout, stderr = network.ended(run, 3)
+    assert re.fullmatch(f"failed: stopped by Ctrl-C while the {words}", stderr.splitlines()[-1])
+    bag, result = network.bag(), json.loads(stdout)
     assert (result["verdict"], result["bag"], result["report"]) == ("incomplete", str(bag), None)
     assert result == json.loads((bag / "result.json").read_text())
-    assert read_bag(bag).completeness.complete
-
-
-def test_at_any_moment_after_the_network(network: Any) -> None:
-    """As soon as the logs are being kept: whatever is done then, the result is printed, and the bag is whole."""
-    many = {"duration": 5, "replicas": 500}  # so that the comparison takes longer than this test needs to see the logs
-    run = network.start("run", network.file(run=many), "--out", network.directory / "runs", "--json")
-    network.wait_for(lambda: list(network.directory.glob("runs/*/log")), 60, "the end of the network")
-    run.send_signal(signal.SIGINT)
-    stdout, stderr = run.communicate(timeout=60)
-    assert run.returncode == 3, stderr
-    assert stderr.splitlines()[-1].startswith("failed: stopped by Ctrl-C while the ")
-    (bag,) = (network.directory / "runs").iterdir()
-    assert json.loads(stdout)["verdict"] == "incomplete"
     assert read_bag(bag).completeness.complete
 
 
@@ -162,9 +156,8 @@ def test_agents_that_are_interrupted_say_nothing(network: Any) -> None:
     agents = network.processes("agent")
     for process in agents:
         os.kill(process.pid, signal.SIGINT)
-    _, stderr = run.communicate(timeout=60)
-    assert run.returncode == 3, stderr
-    (bag,) = (network.directory / "runs").iterdir()
+    network.ended(run, 3)
+    bag = network.bag()
     for log in (bag / "log").glob("*.log"):
         assert not re.search("FATAL|Traceback|Error", log.read_text()), log
 
@@ -177,7 +170,7 @@ def test_a_killed_runner_takes_everybody_along(network: Any) -> None:
     run.communicate(timeout=60)
     network.wait_for(lambda: network.processes() == [], 10, "the end of every child")
     network.traces.clear()  # whoever runs the next network clears its folder away
-    (bag,) = (network.directory / "runs").iterdir()
+    bag = network.bag()
     trajectory = read_bag(bag)  # its recorder had the time to close it
     assert trajectory.completeness.received > 0
     assert check(trajectory).difference is None
@@ -221,9 +214,7 @@ def test_full_disk(network: Any, small_disk: Path, repetition: int) -> None:
     # 20,000 steps, of states that fill it in some 2,000.
     file = network.file(run={"duration": 1000, "replicas": 8, "processes": 2})
     run = network.start("run", file, "--out", small_disk)
-    _, stderr = run.communicate(timeout=120)
-    assert run.returncode == 3, stderr
-    assert "Traceback" not in stderr
+    _, stderr = network.ended(run, 3)
     assert re.search(r"^failed: recorder: .*No space left on device", stderr, re.MULTILINE), stderr
     assert network.processes() == []
     (bag,) = (path for path in small_disk.iterdir() if path.is_dir())

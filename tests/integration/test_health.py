@@ -73,7 +73,7 @@ def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
             environment = node_environment(domain)
             # What gets lost while they look for each other comes again after 3 s, and the same can happen to that.
             doubles = {
-                agent: network.start("agent", record, "--agent", agent, "--discovery-timeout", "12", **environment)
+                agent: network.execute("agent", record, "--agent", agent, "--discovery-timeout", "12", **environment)
                 for agent, record in (("4", network.run_file()), ("5", other))
             }
 
@@ -86,8 +86,7 @@ def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
             # Before anybody goes on, since who has just gone on is not silent. A slow start is said in lines before it.
             note = next(line for line in run.stderr if line.startswith("note"))
             for agent, double in doubles.items():
-                _, said = double.communicate(timeout=60)
-                assert double.returncode == 2, said
+                _, said = network.ended(double, 2)
                 assert re.search(rf"more than one node was still called .*agent_{agent}.* in ROS_DOMAIN_ID", said), said
             victim.kill(signal.SIGCONT)
             result = network.completed(run)

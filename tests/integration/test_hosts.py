@@ -9,10 +9,10 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,13 @@ import yaml
 from networks import assert_equal_to_twin
 from processors import another_processor
 from set_clock import SetClock
+from user_namespace import enter_network
 
 from msg_agents.discovery.rtps import PROFILE_VARIABLES
 from msg_analysis.bags.reading import read_bag
 
 PREFIX = "msga"
 NAMES = ("base", "left", "right")
-PROGRAM = Path(sys.executable).with_name("msg-agents")
 
 
 def ip(*words: str) -> None:
@@ -59,25 +59,19 @@ class Lan:
     hosts_file: Path
     run_file: Path
 
-    def start(self, host: str, *arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
-        """Start ``msg-agents`` on a host."""
-        return subprocess.Popen(
-            ["ip", "netns", "exec", self.prefix + host, str(PROGRAM), *(str(argument) for argument in arguments)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"NO_COLOR": "1"} | environment,
-        )
-
-    def start_all(self, *options: str, **environments: dict[str, str]) -> dict[str, subprocess.Popen[str]]:
-        """What every host runs, with additions to its environment; what they leave is in a directory of each."""
-        return {
-            name: self.start(
-                name, "host", self.run_file, self.hosts_file, "--name", name, "--json", *options,
-                "--out", self.network.directory / name, **environments.get(name, {}),
-            )
-            for name in NAMES
-        }  # fmt: skip
+    def start_all(self, *options: str, left: dict[str, str] | None = None) -> dict[str, Any]:
+        """What every host runs; what they leave is in a directory of each; ``left``: variables at the start of one."""
+        started = {}
+        for name in NAMES:
+            command = ("host", self.run_file, self.hosts_file, "--name", name, "--json", *options)
+            place = ("--out", self.network.directory / name)
+            if name == "left" and left:
+                enter = ("ip", "netns", "exec", self.prefix + name)
+                started[name] = self.network.execute(*command, *place, machine=enter, **left)
+            else:
+                enter_it = partial(enter_network, Path("/run/netns", self.prefix + name))
+                started[name] = self.network.start(*command, *place, first=enter_it)
+        return started
 
     def plug(self, host: str, state: str, *, cable: bool) -> None:
         """Set a host's interface, or the port of the bridge that its cable is in, up or down."""
@@ -125,12 +119,11 @@ def lan(network: Any) -> Iterator[Lan]:
 def prepare(lan: Lan, duration: float, **changes: Any) -> None:
     """The run record, made once for all hosts."""
     run = {"duration": duration, **changes.pop("run", {})}
-    file = lan.network.file(**changes, run=run)
-    done = subprocess.run([str(PROGRAM), "prepare", file], capture_output=True, text=True, check=True)
-    lan.run_file.write_text(done.stdout)
+    prepared, _ = lan.network.start("prepare", lan.network.file(**changes, run=run)).communicate(60)
+    lan.run_file.write_text(prepared)
 
 
-def ended(processes: dict[str, subprocess.Popen[str]], code: int, timeout: float = 90) -> dict[str, tuple[str, str]]:
+def ended(processes: dict[str, Any], code: int, timeout: float = 90) -> dict[str, tuple[str, str]]:
     texts = {name: process.communicate(timeout=timeout) for name, process in processes.items()}
     assert {name: process.returncode for name, process in processes.items()} == dict.fromkeys(NAMES, code), texts
     assert not any("Traceback" in text for pair in texts.values() for text in pair), texts
@@ -187,7 +180,7 @@ def test_a_host_that_leaves_takes_the_others_with_it(lan: Lan) -> None:
     They say so themselves, so nobody waits for a lease of a minute, or for the timeout of the others.
     """
     prepare(lan, 5000)
-    hosts = lan.start_all("--no-analyse", "--patience", "1000")
+    hosts = lan.start_all("--no-analyse", "--timeout", "1000")
     lan.network.wait_until_moving("base")
     hosts["left"].send_signal(signal.SIGINT)
     texts = ended(hosts, 3, timeout=50)
@@ -197,18 +190,19 @@ def test_a_host_that_leaves_takes_the_others_with_it(lan: Lan) -> None:
     assert read_bag(json.loads(texts["base"][0])["bag"]).completeness.missing > 0
 
 
-def rejoined(lan: Lan, duration: float, run: dict[str, Any]) -> dict[str, tuple[str, str]]:
+def rejoined(lan: Lan, patch: pytest.MonkeyPatch, duration: float, run: dict[str, Any]) -> dict[str, tuple[str, str]]:
     """A lease of 3 s instead of a minute; a host is cut off for 7 s, so that both sides have given each other up."""
     prepare(lan, duration, run=run)
-    command = [str(PROGRAM), "host", str(lan.run_file), str(lan.hosts_file), "--profile"]
-    profile = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    profile, _ = lan.network.start("host", lan.run_file, lan.hosts_file, "--profile").communicate(60)
     for key, before, after in (("leaseDuration", 60, 3), ("leaseAnnouncement", 3, 1)):
         profile, count = re.subn(rf"(<{key}>\s*<sec>){before}<", rf"\g<1>{after}<", profile)
         assert count == 1
     file = lan.network.directory / "short.xml"
     file.write_text(profile)
     setting = dict.fromkeys(PROFILE_VARIABLES, str(file)) | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SYSTEM_DEFAULT"}
-    hosts = lan.start_all("--no-analyse", "--timeout", "60", **dict.fromkeys(NAMES, setting))
+    for name, value in setting.items():
+        patch.setenv(name, value)
+    hosts = lan.start_all("--no-analyse", "--timeout", "60")
     lan.network.wait_until_moving("base")
     assert all(process.poll() is None for process in hosts.values()), "too fast to be cut off"
     lan.plug("left", "down", cable=True)
@@ -220,15 +214,15 @@ def rejoined(lan: Lan, duration: float, run: dict[str, Any]) -> dict[str, tuple[
 
 
 @pytest.mark.timeout(300)
-def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan) -> None:
-    rejoined(lan, 200, {})
+def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan, monkeypatch: pytest.MonkeyPatch) -> None:
+    rejoined(lan, monkeypatch, 200, {})
 
 
 @pytest.mark.timeout(300)
-def test_a_host_that_comes_back_in_real_time(lan: Lan) -> None:
+def test_a_host_that_comes_back_in_real_time(lan: Lan, monkeypatch: pytest.MonkeyPatch) -> None:
     """The clocks of these hosts are one clock, so 0 is in every interval, and there is no warning."""
     # Fewer and larger messages: soon seen in the bag.
-    texts = rejoined(lan, 18, {"pace": "realtime", "dt": 0.1, "replicas": 32})
+    texts = rejoined(lan, monkeypatch, 18, {"pace": "realtime", "dt": 0.1, "replicas": 32})
     clocks = {name: json.loads(stdout)["clocks"] for name, (stdout, _) in texts.items()}
     assert [entry["node"] for entry in clocks["base"]] == [f"agent_{i}" for i in range(1, 6)]
     assert all(low <= 0 <= high for low, high in (entry["ahead_ms"] for entry in clocks["base"]))

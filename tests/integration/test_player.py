@@ -23,13 +23,6 @@ from waiting import state_of
 from msg_analysis.bags.reading import read_bag
 
 
-def finished(process: subprocess.Popen[str], seconds: float = 60) -> str:
-    """What a process that must end well printed on stderr."""
-    stdout, stderr = process.communicate(timeout=seconds)
-    assert process.returncode == 0, stdout + stderr
-    return stderr
-
-
 def test_a_replay_recorded_again_is_the_original(network: Any, domain: int, plain: Any) -> None:
     """By our recorder and by a plain subscriber at once, as fast as it goes: all messages, their order, their times."""
     result = network.run(network.experiment(run={"processes": 2}), domain=None)
@@ -38,8 +31,8 @@ def test_a_replay_recorded_again_is_the_original(network: Any, domain: int, plai
     recorder = network.start("recorder", result.bag / "log" / "run.json", "--out", network.directory / "again")
     other = plain(network.directory / "plain.mcap", {topic: len(data) for topic, data in original.items()})
     played = network.start("play", result.bag, "--rate", "max", "--await", "recorder", "--await", "plain")
-    assert f"{sum(map(len, original.values()))} messages played" in finished(played)
-    finished(other)
+    assert f"{sum(map(len, original.values()))} messages played" in network.ended(played)[1]
+    network.ended(other)
     time.sleep(0.5)
     recorder.send_signal(signal.SIGINT)  # nobody says `end` to it
     recorder.communicate(timeout=30)
@@ -60,11 +53,9 @@ def test_a_stopped_reader_loses_nothing(network: Any, domain: int, twin_bag: Pat
     reader.send_signal(signal.SIGSTOP)
     time.sleep(2.0)
     reader.send_signal(signal.SIGCONT)
-    finished(reader)
+    network.ended(reader)
     played.send_signal(signal.SIGINT)
-    _, stderr = played.communicate(timeout=30)
-    assert played.returncode == 130, stderr
-    assert "Traceback" not in stderr
+    network.ended(played, 130)
     found = contents(file)
     assert set(found) == set(original)
     for topic, messages in found.items():
@@ -77,13 +68,12 @@ def test_a_late_reader_gets_what_is_latched(network: Any, domain: int, twin_bag:
     played = network.start("play", twin_bag, "--start-offset", "7", "--rate", "0.5")
     time.sleep(3.0)
     late = plain(network.directory / "plain.mcap", {"/experiment": 1, "/graph": 2})
-    finished(late)
+    network.ended(late)
     found = contents(network.directory / "plain.mcap")
     assert texts(found["/experiment"]) == texts(original["/experiment"])
     assert texts(found["/graph"]) == texts(original["/graph"][: len(found["/graph"])])
     played.send_signal(signal.SIGTERM)
-    _, stderr = played.communicate(timeout=30)
-    assert played.returncode == 128 + signal.SIGTERM, stderr
+    network.ended(played, 128 + signal.SIGTERM)
 
 
 def test_a_part_under_other_names_with_the_time(network: Any, domain: int, twin_bag: Path, plain: Any) -> None:
@@ -93,7 +83,7 @@ def test_a_part_under_other_names_with_the_time(network: Any, domain: int, twin_
     other = plain(network.directory / "plain.mcap", {"/lab/state": len(wanted), "/clock": 5})
     options = ("--topics", "/agent_[12]/state", "-x", "agent_1/*", "-m", "/agent_2/state:=/lab/state", "--clock", "20")
     played = network.start("play", twin_bag, *options, "--start-offset", "5", "--duration", "2", "--await", "plain")
-    finished(other)
+    network.ended(other)
     found = contents(network.directory / "plain.mcap")
     assert set(found) == {"/lab/state", "/clock"}
     assert found["/lab/state"] == wanted[: len(found["/lab/state"])]
@@ -116,10 +106,9 @@ def test_nothing_but_the_time_is_refused(network: Any, domain: int) -> None:
         writer.add_message(channel, 1, bytes([0, 1, 0, 0]) + bytes(8), 1)
         writer.finish()
     played = network.start("play", file, "--clock", "10")
-    _, stderr = played.communicate(timeout=60)
-    assert played.returncode == 2, stderr
+    _, stderr = network.ended(played, 2)
     assert "error: --clock: publishes /clock itself, and nothing else is chosen" in stderr
-    assert "1 messages played" in finished(network.start("play", file, "--rate", "max"))
+    assert "1 messages played" in network.ended(network.start("play", file, "--rate", "max"))[1]
 
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
@@ -144,7 +133,7 @@ def test_keys_pause_and_step(network: Any, twin_bag: Path, plain: Any, terminal:
     file = network.directory / "plain.mcap"
     first = plain(file, {"/agent_3/state": 3})
     screen = terminal(
-        PROGRAM, "play", twin_bag, "--paused", "--rate", "max", "--topics", "/agent_3/state", "--await", "plain"
+        "msg-agents", "play", twin_bag, "--paused", "--rate", "max", "--topics", "/agent_3/state", "--await", "plain"
     )
     screen.wait_for("paused")
     screen.wait_for("space: pause")
@@ -163,7 +152,7 @@ def test_keys_pause_and_step(network: Any, twin_bag: Path, plain: Any, terminal:
 def paused_player(terminal: Any, bag: Path) -> Terminal:
     """One that waits for the node `plain`, and shows that it stands still."""
     screen: Terminal = terminal(
-        *(PROGRAM, "play", bag, "--paused", "--rate", "max", "--await", "plain"),
+        *("msg-agents", "play", bag, "--paused", "--rate", "max", "--await", "plain"),
         *("--topics", "/agent_3/state", "--topics", "/graph"),
     )
     screen.wait_for("paused")
@@ -210,7 +199,7 @@ def test_to_a_typed_time(network: Any, twin_bag: Path, plain: Any, terminal: Any
 def test_the_terminal_is_left_as_it_was(twin_bag: Path, terminal: Any) -> None:
     """Whatever ends the player; the bag alone never does."""
     screens = {
-        number: terminal(PROGRAM, "play", "--loop", twin_bag)
+        number: terminal("msg-agents", "play", "--loop", twin_bag)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     }
     for number, screen in screens.items():
@@ -278,8 +267,7 @@ def test_standing_is_no_time_of_the_bag_without_a_terminal(network: Any, domain:
     played.send_signal(signal.SIGSTOP)
     time.sleep(2.0)
     played.send_signal(signal.SIGCONT)
-    _, stderr = played.communicate(timeout=60)
-    assert played.returncode == 0, stderr
+    _, stderr = network.ended(played)
     assert "messages played" in stderr
     # It looks for readers for 0.8 s at least; the last message before the third second is a little before it.
     assert time.monotonic() - began > 0.8 + 2.5 + 2.0
@@ -287,7 +275,7 @@ def test_standing_is_no_time_of_the_bag_without_a_terminal(network: Any, domain:
 
 def test_ctrl_c_while_waiting_for_readers(network: Any, twin_bag: Path, terminal: Any) -> None:
     """It says for whom it waits, and what was played: nothing."""
-    screen = terminal(PROGRAM, "play", twin_bag, "--await", "nobody")
+    screen = terminal("msg-agents", "play", twin_bag, "--await", "nobody")
     screen.wait_for("waiting for readers, 30 s at most: nobody does not read /agent_1/state")
     screen.type(b"\x03")
     assert screen.process.wait(timeout=30) == 130

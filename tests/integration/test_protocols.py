@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import random
 import re
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +62,6 @@ def test_examples(network: Any, name: str, processes: int | str) -> None:
     """
     what = Experiment.load(EXPERIMENTS / f"{name}.yaml")
     result = network.run(what.with_run(duration=600 * what.step_length, processes=processes))
-    assert result.failures == []
     trajectory = result.trajectory
     twin = simulate(trajectory.record.experiment)
     assert trajectory.completeness == twin.completeness
@@ -83,15 +79,7 @@ def test_noise_and_loss_and_killed_agents(network: Any) -> None:
     document["run"] |= {"duration": 120, "replicas": 32, "processes": 3}
     file = network.file(**document)
     process = network.record(file, "--restarts", "3", "--json")
-    network.wait_until_moving()
-    for _ in range(2):
-        victims = network.wait_for(lambda: network.processes("agent"), 30, "a living agent")
-        random.Random(1).choice(victims).kill(signal.SIGKILL)
-    stdout, stderr = process.communicate(timeout=120)
-    assert process.returncode == 0, stderr
-    result = json.loads(stdout)
-    assert len(result["restarts"]) >= 1
-    trajectory = read_bag(result["bag"])
+    trajectory = network.killed_and_back(process, network.any_agent, 2)
     assert trajectory.completeness.complete
     assert trajectory.completeness.refused == {}
     assert trajectory.lost is not None
@@ -109,13 +97,13 @@ def _install(network: Any, code: str) -> Path:
     return packages
 
 
-def test_a_protocol_that_ends_its_process(network: Any) -> None:
+def test_a_protocol_that_ends_its_process(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the exit code of success: the others do not wait for its agents for ever."""
     packages = _install(network, LEAVING)
     file = network.file(protocol={"name": "broken"}, run={"duration": 60, "start": "zero", "processes": 2})
-    process = network.record(file, PYTHONPATH=str(packages))
-    _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 3, stderr
+    monkeypatch.setenv("PYTHONPATH", str(packages))
+    process = network.record(file)
+    _, stderr = network.ended(process, 3)
     assert "failed: agents_3_to_5: exit code 0 before its last step" in stderr
 
 
@@ -126,7 +114,7 @@ def test_a_protocol_that_hangs(network: Any, monkeypatch: pytest.MonkeyPatch, re
     monkeypatch.syspath_prepend(packages)
     what = network.experiment(protocol={"name": "broken"}, run={"duration": 60, "start": "zero", "processes": 2})
     environment = {"PYTHONPATH": str(packages), "MSG_AGENTS_HANGING": str(network.directory / "mark")}
-    result = network.run(what, restarts=restarts, environment=environment, hung_timeout=3.0)
+    result = network.run(what, restarts=restarts, environment=environment, hung_timeout=3.0, fails=not restarts)
     words = "agents_3_to_5: hung, its main thread has not run for 3 s (stacks in log/agents_3_to_5.log)"
     assert [line.startswith(words) for line in result.restarts] == ([True] if restarts else [])
     assert (words in result.failures) == (not restarts)
@@ -135,15 +123,14 @@ def test_a_protocol_that_hangs(network: Any, monkeypatch: pytest.MonkeyPatch, re
     assert re.search(r"most recent call first.*broken_module\.py\", line 14 in step\n", log, re.DOTALL)
 
 
-def test_a_protocol_that_fails(network: Any) -> None:
+def test_a_protocol_that_fails(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Said in a line with protocol, package, agent and step; in full in the log."""
     packages = _install(network, BROKEN)
     run = {"duration": 60, "start": "zero", "processes": 2}
     file = network.file(protocol={"name": "broken"}, run=run)
-    process = network.record(file, PYTHONPATH=str(packages))
-    _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 3, stderr
-    assert "Traceback" not in stderr
+    monkeypatch.setenv("PYTHONPATH", str(packages))
+    process = network.record(file)
+    _, stderr = network.ended(process, 3)
     wanted = "protocol broken (broken_package 0.3), agent 3, step 17: ZeroDivisionError: division by zero"
     assert f"failed: agents_3_to_5: exit code 2: error: {wanted}" in stderr
     assert "last recorded step: agent 1: " in stderr

@@ -1,30 +1,22 @@
-"""The example of docs/python.md that starts a network, several runs in one program, and `play --json`."""
+"""The test of docs/python.md, several runs in one program, and `play --json`."""
 
 from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from pages import ROOT, python
 
 pytest.importorskip("rclpy")
 
 from msg_agents.discovery.rtps import free_domain
 from msg_analysis import Experiment
 
-ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
-
-
-def snippet(word: str) -> str:
-    """The code of the page that has this word in it."""
-    page = (ROOT / "docs/python.md").read_text(encoding="utf-8")
-    (code,) = [code for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if word in code]
-    return str(code)
 
 
 def in_python(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -33,21 +25,9 @@ def in_python(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=100)
 
 
-def test_what_the_page_says(tmp_path: Path) -> None:
-    """In a process of its own, as a reader's script is; the seed of the run is fixed."""
-    code = snippet("run_network(")
-    process = in_python("-c", code + "print(run, run.compare(), run.network.failures)", folder=tmp_path)
-    assert process.returncode == 0, process.stderr
-    bag = Path(process.stdout.split()[0])
-    assert (tmp_path / bag).parent == tmp_path / "runs"
-    assert "complete> <Comparison, run of 'line_ring': agrees;" in process.stdout
-    assert process.stdout.rstrip().endswith("[]")
-    assert (tmp_path / "report.html").read_text(encoding="utf-8").startswith("<!")
-
-
 def test_the_pytest_recipe_of_the_page(tmp_path: Path) -> None:
     """It passes as it is; where the run does not follow its law, it fails with the reason."""
-    code = snippet("msg_agents.testing")
+    (code,) = [code for code, _ in python(ROOT / "docs/python.md") if "msg_agents.testing" in code]
     (tmp_path / "test_good.py").write_text(code)
     wrong = code.replace("    assert_agrees", "    run.states[:] *= 2.0\n    assert_agrees")
     (tmp_path / "test_wrong.py").write_text(wrong)
@@ -99,8 +79,7 @@ for duration in (2, 3):
 @pytest.mark.skipif(sys.platform != "linux", reason="this machine: not Linux")
 def test_several_runs(tmp_path: Path) -> None:
     """Each is whole and equal to its twin, and leaves no process."""
-    words = [sys.executable, "-P", "-c", SEVERAL]
-    process = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    process = in_python("-c", SEVERAL, folder=tmp_path)
     assert process.returncode == 0, process.stderr
     assert process.stdout.splitlines() == ["2 [] None 0 []", "3 [] None 0 []"]
 

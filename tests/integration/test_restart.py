@@ -111,8 +111,7 @@ def test_budget(network: Any) -> None:
     first[0].kill()
     network.wait_for(lambda: {p.pid for p in network.processes("agent")} - {p.pid for p in first}, 30, "the next one")
     network.processes("switcher")[0].kill()
-    _, stderr = run.communicate(timeout=60)
-    assert run.returncode == 3
+    _, stderr = network.ended(run, 3)
     (line,) = re.findall(r"^note: (agents_\w+): killed by SIGKILL.*, started again$", stderr, re.MULTILINE)
     assert re.search(
         rf"^failed: switcher: killed by SIGKILL.*all restarts are used up \(--restarts 1\): {line} once$",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
 import sys
@@ -23,8 +22,6 @@ from msg_agents.run.launch import ANALYSIS, NETWORK_ARGUMENTS, LaunchedNetwork, 
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.twin.check import check
 
-BIN = Path(sys.executable).parent
-COMMANDS = {"player": "play"}  # whose executable, where colcon has installed it, has another name
 ROOT = Path(__file__).parents[2]
 
 
@@ -37,26 +34,9 @@ def domain(network: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
         yield number
 
 
-def start(executable: str, *arguments: Any, **options: Any) -> subprocess.Popen[str]:
-    """A command of ``msg-agents``, or another program."""
-    ours = executable not in ("python", "msg-analysis")
-    command = ["msg-agents", COMMANDS.get(executable, executable)] if ours else [executable]
-    return subprocess.Popen(
-        [str(BIN / command[0]), *command[1:], *(str(argument) for argument in arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"NO_COLOR": "1"} | options.pop("environment", {}),
-        **options,
-    )
-
-
-def end(process: subprocess.Popen[str], code: int = 0) -> str:
-    """Wait for it; what it printed."""
-    stdout, stderr = process.communicate(timeout=90)
-    assert process.returncode == code, stderr
-    assert "Traceback" not in stderr
-    return stdout
+def python(code: str, **options: Any) -> subprocess.Popen[str]:
+    pipes = dict.fromkeys(("stdout", "stderr"), subprocess.PIPE)
+    return subprocess.Popen([sys.executable, "-P", "-c", code], **pipes, text=True, **options)
 
 
 def topics(bag: Path) -> Counter[str]:
@@ -96,16 +76,16 @@ def test_parameters_namespace_and_remapping(network: Any) -> None:
             "-r",
             f"agent_1/state:=/other{namespace}/one",
         ]
-        nodes.append(start("recorder", *ros))
+        nodes.append(network.start("recorder", *ros))
         if namespace == "/lab":  # before the run can be over
-            described = json.loads(end(start("python", "-P", "-c", DESCRIBE)))
+            described = json.loads(network.ended(python(DESCRIBE))[0])
         nodes += [
-            start("agent", *ros, "-p", "agents:=[1, 3]"),
-            start("agent", "--agent", "2", "--agent", "4", "--agent", "5", *ros),
-            start("switcher", *ros),
+            network.start("agent", *ros, "-p", "agents:=[1, 3]"),
+            network.start("agent", "--agent", "2", "--agent", "4", "--agent", "5", *ros),
+            network.start("switcher", *ros),
         ]
     for node in nodes:
-        assert end(node) == ""
+        assert network.ended(node)[0] == ""
     assert described["out"] == {"type": 4, "read_only": True, "value": str(bags["/lab"])}
     assert described["compression"]["value"] == "lz4"
     for namespace, bag in bags.items():
@@ -153,10 +133,7 @@ def test_what_the_launch_files_do(network: Any) -> None:
     }
     launched = LaunchedNetwork(arguments)
     ros = ["--ros-args", "-r", "__ns:=/lab"]
-    running = {
-        spec.name: start(spec.arguments[0], *spec.arguments[1:], *ros, environment=environment())
-        for spec in launched.processes
-    }
+    running = {spec.name: network.execute(*spec.arguments, *ros, **environment()) for spec in launched.processes}
     for name, process in running.items():
         assert not launched.over
         process.communicate(timeout=90)
@@ -165,7 +142,7 @@ def test_what_the_launch_files_do(network: Any) -> None:
     assert launched.bag
     comparison = launched.analysis()
     assert comparison
-    analysis = start("msg-analysis", *comparison)
+    analysis = network.start(*comparison, program="msg-analysis")
     stdout, stderr = analysis.communicate(timeout=90)
     launched.ended(ANALYSIS, analysis.returncode)
     assert (launched.reason is None) == (analysis.returncode == 0)
@@ -190,12 +167,12 @@ def watcher() -> str:
 @pytest.mark.timeout(150)
 def test_a_node_of_your_own(network: Any, domain: int) -> None:
     """A plain rclpy node sees graphs and states of a running network, and ends with it."""
-    watching = start("python", "-P", "-c", watcher(), cwd=network.directory)
+    watching = python(watcher(), cwd=network.directory)
     network.wait_for(lambda: participants(domain), 60, "the watcher has a node")  # later it would wait for ever
     file = network.file(run={"pace": "realtime", "speed": 2.5, "processes": 2})  # 6 s
     result = network.completed(network.record(file, "--domain", str(domain), "--json"))
     assert result["strangers"] == []
-    printed = end(watching)
+    printed, _ = network.ended(watching)
     graphs = re.findall(r"^steps (\d+) to (\d+): (line|ring), (\d+) arcs$", printed, re.M)
     assert (graphs[0][0], graphs[-1][1]) == ("0", "299")
     assert all(arcs == {"line": "8", "ring": "10"}[name] for _, _, name, arcs in graphs)
@@ -208,12 +185,12 @@ def test_a_node_of_your_own(network: Any, domain: int) -> None:
 def test_a_guest_gets_everything(network: Any, domain: int) -> None:
     """A reader that is no recorder of ours, named to the agents, gets every state, the last one too."""
     record = run_file(network.directory, 5)
-    guest = start("python", "-P", "-c", GUEST)
+    guest = python(GUEST)
     ros = ["--ros-args", "-p", f"run:={record}", "-p", "await:=[rosbag2_recorder]"]
-    nodes = [start("switcher", *ros), start("agent", *ros, "-p", "agents:=[1, 2, 3, 4, 5]")]
+    nodes = [network.start("switcher", *ros), network.start("agent", *ros, "-p", "agents:=[1, 2, 3, 4, 5]")]
     for node in nodes:
-        end(node)
-    assert json.loads(end(guest)) == [[i, step] for i in range(1, 6) for step in range(301)]
+        network.ended(node)
+    assert json.loads(network.ended(guest)[0]) == [[i, step] for i in range(1, 6) for step in range(301)]
 
 
 GUEST = """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import pytest
 from joining_node import watched_endpoints
+from networks import assert_equal_to_twin
 
 from msg_agents.run.result import read_steps
 from msg_analysis.bags.reading import read_bag
@@ -29,11 +29,8 @@ def test_complete_and_equal_to_the_twin(network: Any, rows: int, columns: int, p
     agents = rows * columns
     run = {"duration": 2, "start": "zero", "processes": processes}
     result = network.run(network.experiment(**grid(rows, columns), run=run))
-    assert result.failures == []
-    assert result.trajectory.completeness.complete
-    assert result.trajectory.completeness.duplicates == 0
-    outcome = check(result.trajectory)
-    assert (outcome.difference, outcome.missing, outcome.compared) == (None, 0, agents * 41)
+    assert_equal_to_twin(result.trajectory)
+    assert result.trajectory.completeness.expected == agents * 41
 
 
 def test_a_killed_process_of_many_agents_comes_back(network: Any) -> None:
@@ -98,9 +95,7 @@ def test_processes_of_one_agent_that_hear_all_others(network: Any) -> None:
     before = max(read_steps(steps))
     network.wait_for(lambda: min(read_steps(steps)) > before, 60, "steps of all after that")
     process.send_signal(signal.SIGINT)
-    stdout, stderr = process.communicate(timeout=60)
-    assert process.returncode == 3, stderr
-    result = json.loads(stdout)
+    result = network.result(process, 3)
     assert (len(result["restarts"]), result["strangers"]) == (1, [])
     assert check(read_bag(result["bag"])).difference is None
 

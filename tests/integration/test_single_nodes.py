@@ -30,7 +30,7 @@ def test_started_by_hand(network: Any, record: Path) -> None:
     await_recorder = ("--await", "recorder")
     with free_domain() as domain:
         nodes: list[subprocess.Popen[str]] = [
-            network.start(*command, ROS_DOMAIN_ID=str(domain))
+            network.execute(*command, ROS_DOMAIN_ID=str(domain))
             for command in (
                 ("switcher", record, *await_recorder),
                 ("agent", record, "--agent", "5", *await_recorder),
@@ -90,7 +90,7 @@ def test_alone(network: Any, record: Path, command: tuple[str, ...], missing: li
     """Nobody comes: exit code 2 (something is wrong with what was started), naming everyone who is missing."""
     kind, *options = command
     with free_domain() as domain:
-        node = network.start(kind, record, *options, "--discovery-timeout", "3", ROS_DOMAIN_ID=str(domain))
+        node = network.execute(kind, record, *options, "--discovery-timeout", "3", ROS_DOMAIN_ID=str(domain))
         stdout, stderr = node.communicate(timeout=60)
     assert (node.returncode, stdout) == (2, ""), stderr
     error = re.search(r"^error: after 3 s (.*) did not discover: (.*?)\. Are they running", stderr, re.MULTILINE)
@@ -104,10 +104,10 @@ def test_the_others_end_without_an_agent(network: Any) -> None:
     """A process of agents leaves and does not come back: all end by themselves, and the bag is closed."""
     record = run_file(network.directory, 5, run={"pace": "realtime", "duration": 900, "speed": 5})
     bag = network.directory / "runs/mine"
-    options = ("--await", "recorder", "--patience", "2")
+    options = ("--await", "recorder", "--timeout", "2")
     with free_domain() as domain:
         *others, leaving = (
-            network.start(*command, ROS_DOMAIN_ID=str(domain))
+            network.execute(*command, ROS_DOMAIN_ID=str(domain))
             for command in (
                 ("switcher", record, *options),
                 ("agent", record, *(p for i in "2345" for p in ("--agent", i)), *options),
@@ -132,7 +132,7 @@ def test_a_missing_agent_is_named_by_the_others(network: Any, record: Path) -> N
     others = [part for number in "1235" for part in ("--agent", number)]
     with free_domain() as domain:
         nodes = [
-            network.start(*command, ROS_DOMAIN_ID=str(domain))
+            network.execute(*command, ROS_DOMAIN_ID=str(domain))
             for command in (
                 ("switcher", record, "--discovery-timeout", "6"),
                 ("agent", record, *others, "--discovery-timeout", "10"),

@@ -28,16 +28,6 @@ def sweep_file(network: Any, **sweep: Any) -> Path:
     return path
 
 
-def start(*arguments: str | Path) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [BIN / "msg-analysis", "sweep", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-
-
 def lines(journal: Path) -> int:
     return journal.read_bytes().count(b"\n") if journal.exists() else 0
 
@@ -82,13 +72,10 @@ def test_a_worker_is_killed_in_the_middle(network: Any, cluster: tuple[str, list
     out = network.directory / "out"
     rates = [0.25 * 1.3**k for k in range(12)]
     path = sweep_file(network, kind="simulate", over={"switching.generator": generators(*rates), "run.duration": [150]})
-    process = start(path, "--scheduler", address, "--out", out, "--json")
+    process = network.start("sweep", path, "--scheduler", address, "--out", out, "--json", program="msg-analysis")
     network.wait_for(lambda: lines(out / "points.jsonl") >= 2, 60, "results")
     workers[0].kill()
-    stdout, stderr = process.communicate(timeout=100)
-    assert process.returncode == 0, stderr
-    assert "Traceback" not in stderr
-    result = json.loads(stdout)
+    result = network.result(process)
     assert (result["done"], result["failed"], result["verdict"]) == (12, 0, "agrees")
     assert lines(out / "points.jsonl") == 12
     places = {json.loads(line)["place"] for line in (out / "points.jsonl").read_text().splitlines()}
@@ -104,21 +91,21 @@ def test_networks_interrupted_killed_and_resumed(network: Any) -> None:
     """
     out = network.directory / "out"
 
-    def started(*durations: int, workers: tuple[str, ...] = ()) -> subprocess.Popen[str]:
-        rates = {15: 0.5, 300: 2.0, 10_000: 0.5, 20: 1.0}
+    def started(*durations: int, workers: tuple[str, ...] = ()) -> Any:
+        rates = {15: 0.5, 10_000: 0.5, 20: 1.0}
         over = {
             "switching.generator": generators(*(rates[each] for each in durations)),
             "run.duration": list(durations),
             "run.pace": ["realtime" if each == 10_000 else "lockstep" for each in durations],  # it costs less
         }
-        return start(sweep_file(network, kind="network", over=over, combine="zip"), *workers, "--out", out, "--json")
+        file = sweep_file(network, kind="network", over=over, combine="zip")
+        return network.start("sweep", file, *workers, "--out", out, "--json", program="msg-analysis")
 
     two = ("--workers", "2")
-    process = started(15, 300, workers=two)
+    process = started(15, 10_000, workers=two)
     network.wait_for(lambda: lines(out / "points.jsonl") == 1, 100, "the shorter run")
     process.terminate()  # as a queue of a cluster does; Ctrl-C: tests/analysis/cli/test_sweep.py
-    stdout, stderr = process.communicate(timeout=100)
-    assert process.returncode == 128 + signal.SIGTERM, stderr
+    stdout, stderr = network.ended(process, 128 + signal.SIGTERM)
     assert stdout == ""
     assert "Traceback" not in stderr
     assert network.processes() == []
@@ -131,25 +118,21 @@ def test_networks_interrupted_killed_and_resumed(network: Any) -> None:
     network.wait_for(lambda: not network.processes(), 60, "the end of all processes")
     assert lines(out / "points.jsonl") == 1
 
-    process = started(15, 300, 10_000, 20)
-    network.wait_for(lambda: lines(out / "points.jsonl") == 2, 100, "the first network")
-    network.wait_for(lambda: network.processes("recorder"), 60, "the second one")
+    process = started(15, 10_000, 20)
+    network.wait_for(lambda: network.processes("recorder"), 60, "the second network")
     (run,) = network.processes("run")
     run.kill(signal.SIGINT)
-    stdout, stderr = process.communicate(timeout=100)
-    assert process.returncode == 3, stderr + stdout
+    stdout, stderr = network.ended(process, 3)
     result = json.loads(stdout)
     assert result["kept"] == 1
-    assert [row["status"] for row in result["points"]] == ["done", "done", "failed", "done"]
-    assert result["points"][2]["reason"].startswith("stopped by Ctrl-C")
+    assert [row["status"] for row in result["points"]] == ["done", "failed", "done"]
+    assert result["points"][1]["reason"].startswith("stopped by Ctrl-C")
     check_against_the_twin(network, [row for row in result["points"] if row["status"] == "done"])
     assert not (out / "runs" / "report.html").exists()
     (left,) = (out / "runs").iterdir()  # the others agree: their bags are not kept
 
-    process = started(15, 300)
-    stdout, stderr = process.communicate(timeout=100)
-    assert process.returncode == 0, stderr
-    result = json.loads(stdout)
+    process = started(15, 20)
+    result = network.result(process)
     assert (result["done"], result["kept"], result["verdict"]) == (2, 2, "agrees")
     assert list((out / "runs").iterdir()) == [left]
 
@@ -179,7 +162,7 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
         "        print('ended', end.code, points.count('\\n'))",
     ]
     command = [sys.executable, "-P", "-c", "\n".join(code)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=280)
     assert result.returncode == 0, result.stderr
     first, second, rest = result.stdout.split("ended 0 2\n")
     for text, counts in ((first, "7 points of 2 networks"), (second, "6 points of 1 networks")):

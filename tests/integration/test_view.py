@@ -6,7 +6,6 @@ import json
 import re
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -16,7 +15,6 @@ import pytest
 from browser import CUT, FAINT, Log
 from terminal import Terminal
 
-PROGRAM = Path(sys.executable).with_name("msg-agents")
 PAGE = re.compile(r"live page at (http://127\.0\.0\.1:\d+/)")
 HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
 
@@ -50,7 +48,7 @@ def _plain(text: str) -> str:
 
 def test_panel_and_ctrl_c(network: Any, terminal: Any) -> None:
     """Graph, steps and errors; smaller windows get less; Ctrl-C ends the run in order and leaves the terminal tidy."""
-    screen = terminal(PROGRAM, "run", _long(network, processes=2), "--out", network.directory / "runs")
+    screen = terminal("msg-agents", "run", _long(network, processes=2), "--out", network.directory / "runs")
     screen.wait_for("starting")
     screen.wait_for("predicted 1.", seconds=60)
     screen.read(0.5)
@@ -98,8 +96,8 @@ def test_page_of_a_run(network: Any, terminal: Any, page: Any) -> None:
     file, out = network.file(run={"processes": 2}), network.directory / "result"
     options = ("--out", network.directory / "runs", "--json", "--web", "0")
     log = Log(page)
-    with out.open("w") as stdout, ThreadPoolExecutor() as reader:
-        screen = terminal(PROGRAM, "run", file, *options, stdout=stdout)
+    with ThreadPoolExecutor() as reader:
+        screen = terminal("msg-agents", "run", file, *options, stdout=out)
         address = network.wait_for(lambda: (screen.read(0.1), PAGE.search(screen.text))[1], 60, "the page")[1]
         reading = reader.submit(screen.read_to_the_end)  # a full terminal would hold up the run
         page.goto(address)

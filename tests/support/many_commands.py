@@ -1,177 +1,227 @@
-"""Runs command lines in processes of their own, forked from one that has imported everything before.
+"""Commands as processes of their own, forked from one that has imported everything: each would take seconds for that.
 
-A job is a list: program, arguments, and what its stdout is: "pipe", "full" (a full disk), "closed", "gone" (a pipe that
-nobody reads), "terminal", "ascii" (it has few characters), "limit" (files cannot grow beyond a few bytes), or "memory"
-(there is 1 GB of it). A job is killed after a minute. ``outcomes`` gives exit code, stdout, stderr of each. ``main`` is
-the process that forks: it answers each line, a request, by a line.
+A test of how a program starts, of its environment for example, executes it instead.
 """
 
-import atexit
-import contextlib
-import functools
 import gc
 import importlib
-import json
+import multiprocessing
 import os
 import pty
 import resource
+import selectors
 import signal
 import subprocess
 import sys
-import tempfile
-import traceback
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
+from multiprocessing import forkserver
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
+from msg_agents.cli.node_server import MODULES
+
+Job = tuple[str, list[str], str]
 PROGRAMS = {"msg-analysis": "msg_analysis.cli.main", "msg-agents": "msg_agents.cli.main"}
-PREPARED = (
-    *PROGRAMS.values(),
-    "msg_analysis.experiment.experiment",
-    "msg_analysis.cli.console",
-    "msg_analysis.common.text",
-    "msg_analysis.report.documents",
-    "msg_analysis.report.documents",
-    "msg_analysis.report.tables",
-    "msg_analysis.report.comparison_text",
-    "msg_analysis.report.tables",
-    "msg_analysis.report.tables",
-    "msg_analysis.report.theory_text",
-    "msg_analysis.twin.check",
-    "rich._emoji_codes",
-    "rich.progress",
-    "threadpoolctl",
+FORKING = multiprocessing.get_context("forkserver")
+FORKING.set_forkserver_preload(
+    [
+        *PROGRAMS.values(),
+        *MODULES,
+        *("msg_agents.nodes.live", "msg_agents.nodes.markers", "msg_agents.nodes.player", "msg_agents.run.runner"),
+        *("msg_analysis.report.documents", "msg_analysis.report.page", "msg_analysis.report.tables"),
+        *("msg_analysis.report.theory_text", "msg_analysis.sweeps.results"),
+        *("networkx", "rich._emoji_codes", "rich.progress", "scipy.stats", "threadpoolctl"),
+    ]
 )
-BY_COMMAND = {  # what takes long to import, and no other command needs
-    "export": ("pyarrow.csv", "pyarrow.parquet"),
-    "figures": ("msg_analysis.paper.figures",),
-    "spectrum": ("scipy.signal",),
-    "sweep": (
-        "msg_analysis.report.sweep_plots",
-        "msg_analysis.report.list_pages",
-        "msg_analysis.sweeps.results",
-    ),
-}
-CODE = f"import sys; sys.path.append({str(Path(__file__).parent)!r}); import many_commands; many_commands.main()"
+ensure_running = forkserver.ensure_running
+"""Start what forks them: its own environment is that of now."""
 MEMORY = 1 << 30  # bytes
 LONGEST = 60  # s of a job
 
 
-def outcomes(
-    jobs: list[list[Any]], folder: Path, prepared: tuple[str, ...] = (), **environment: str
-) -> list[list[Any]]:
-    """Exit code, stdout, stderr of each job, with this folder to work in and additions to the environment.
+class ForkedCommand:
+    """A running command, with what tests use of ``subprocess.Popen``; its stdout and stderr are pipes of text.
 
-    ``prepared``: more modules that are to be imported before.
+    ``terminal``: the streams are this one instead, and ``stdout`` a file; ``first``: what the process does before.
     """
-    server = _server()
-    assert server.stdin is not None
-    assert server.stdout is not None
-    all_of_it = {**os.environ, **environment}
-    request = {"jobs": jobs, "folder": str(folder), "environment": all_of_it, "prepared": prepared}
-    try:
-        server.stdin.write(f"{json.dumps(request)}\n")
-        server.stdin.flush()
-        found: list[list[Any]] = json.loads(server.stdout.readline())
-    except BaseException:  # its answer would be taken for that of the next request
-        server.kill()
-        _server.cache_clear()
-        raise
-    return found
+
+    def __init__(
+        self,
+        program: str,
+        arguments: Sequence[str | Path],
+        environment: Mapping[str, str],
+        *,
+        folder: Path | None = None,
+        terminal: str | None = None,
+        stdout: str | Path | None = None,
+        first: Callable[[], object] | None = None,
+    ) -> None:
+        self.args = [program, *map(str, arguments)]
+        pipes = [FORKING.Pipe(duplex=False) for _ in range(2)]
+        streams = ([write for _, write in pipes], terminal, stdout)
+        self._process = FORKING.Process(
+            target=_become, args=(self.args, dict(environment), folder or Path.cwd(), *streams, first)
+        )
+        self._process.start()
+        self.pid: int = self._process.pid
+        self.stdout, self.stderr = (os.fdopen(os.dup(read.fileno())) for read, _ in pipes)
+        for ends in pipes:
+            for end in ends:
+                end.close()
+
+    @property
+    def returncode(self) -> int | None:
+        return self._process.exitcode
+
+    poll = returncode.fget
+
+    def wait(self, timeout: float | None = None) -> int:
+        self._process.join(timeout)
+        if (code := self.returncode) is None:
+            raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
+        return code
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
+        """Wait for the end; what has not been read of both streams."""
+        end = None if timeout is None else time.monotonic() + timeout
+        texts = {self.stdout: b"", self.stderr: b""}
+        with selectors.DefaultSelector() as selector:
+            for stream in texts:
+                selector.register(stream, selectors.EVENT_READ)
+            while selector.get_map():
+                ready = selector.select(end and end - time.monotonic())
+                if not ready:
+                    raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
+                for key, _ in ready:
+                    texts[key.fileobj] += (new := os.read(key.fd, 65536))
+                    if not new:
+                        selector.unregister(key.fileobj)
+        self.wait(timeout)
+        return texts[self.stdout].decode(), texts[self.stderr].decode()
+
+    def send_signal(self, number: int) -> None:
+        if self.returncode is None:
+            os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
 
 
-@functools.cache
-def _server() -> subprocess.Popen[str]:
-    """It ends with this process, which holds the other end of its stdin."""
-    server = subprocess.Popen(
-        [sys.executable, "-P", "-c", CODE],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-    )
-    atexit.register(server.wait)
-    atexit.register(server.terminate)
-    return server
+def _become(
+    words: list[str],
+    environment: dict[str, str],
+    folder: Path,
+    pipes: list[Connection],
+    terminal: str | None,
+    stdout: str | Path | None,
+    first: Callable[[], object] | None,
+) -> None:
+    """Turn this process, which has been forked, into one that the program had been executed in."""
+    from msg_agents.run.fork_server import run_and_end
 
-
-def child(program: str, arguments: list[str], kind: str, stdout: int, stderr: int) -> int:
-    os.dup2(stderr, 2)
-    signal.alarm(LONGEST)
-    sys.argv = [program, *arguments]
-    if kind == "limit":
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # as Python has it at its start
-        resource.setrlimit(resource.RLIMIT_FSIZE, (64, 64))
-    if kind == "memory":
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    if kind == "ascii":
-        sys.stdout.reconfigure(encoding="ascii", errors="strict")  # type: ignore[union-attr]
-        sys.stderr.reconfigure(encoding="ascii")  # type: ignore[union-attr]
-    if kind == "closed":
-        os.close(1)
-        sys.stdout = None  # type: ignore[assignment]  # as Python has it at its start
-    else:
-        os.dup2(stdout, 1)
-    try:
-        importlib.import_module(PROGRAMS[program]).main(arguments, prog_name=program)
-    except SystemExit as end:
-        code = int(end.code or 0)
-    except BaseException:
-        traceback.print_exc()
-        code = 1
-    try:
-        if sys.stdout:
-            sys.stdout.flush()
-    except OSError:
-        code = 120  # as Python has it at its end
-    return code
-
-
-def run(program: str, arguments: list[str], kind: str) -> list[Any]:
-    terminal = None
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        stdout = out.fileno()
-        if kind == "full":
-            stdout = os.open("/dev/full", os.O_WRONLY)
-        elif kind == "gone":
-            read, stdout = os.pipe()
-            os.close(read)
-        elif kind == "limit":  # the limit is for files, and stdout is none
-            read, stdout = os.pipe()
-        elif kind == "terminal":
-            terminal, stdout = pty.openpty()
-        pid = os.fork()
-        if pid == 0:
-            os._exit(child(program, arguments, kind, stdout, err.fileno() if kind != "limit" else stdout))
-        if stdout != out.fileno():
-            os.close(stdout)
-        text = b""
-        if terminal is not None or kind == "limit":
-            source = read if terminal is None else terminal
-            with contextlib.suppress(OSError):  # a terminal that nobody writes to any more
-                while chunk := os.read(source, 65536):
-                    text += chunk
-            os.close(source)
-        code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-        out.seek(0)
-        err.seek(0)
-        return [code, (text or out.read()).decode(), err.read().decode()]
-
-
-def main() -> None:
-    """Serve requests."""
-    requests, answers = os.fdopen(os.dup(0)), os.fdopen(os.dup(1), "w")
-    with Path(os.devnull).open() as nothing:
-        os.dup2(nothing.fileno(), 0)
-    for name in PREPARED:
-        importlib.import_module(name)
-    gc.collect()
     gc.freeze()  # the collector writes to what it looks at, and the memory would be copied
-    for line in requests:
-        request = json.loads(line)
-        os.chdir(request["folder"])
-        os.environ.clear()
-        os.environ.update({"MPLBACKEND": "agg", **request["environment"]})
-        commands = {arguments[0] for _, arguments, _ in request["jobs"]}
-        for name in (*request["prepared"], *(name for command in commands for name in BY_COMMAND.get(command, ()))):
-            importlib.import_module(name)
-        print(json.dumps([run(*job) for job in request["jobs"]]), file=answers, flush=True)
+    for number, pipe in enumerate(pipes, start=1):
+        os.dup2(pipe.fileno(), number)
+        pipe.close()
+    if terminal is not None:
+        os.setsid()
+        opened = os.open(terminal, os.O_RDWR)  # from now on that of this session
+        for number in range(3):
+            os.dup2(opened, number)
+        sys.stdin = open(0, closefd=False)  # noqa: SIM115
+    if stdout is not None:
+        os.dup2(os.open(stdout, os.O_RDWR | os.O_CREAT), 1)
+    sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115  as Python does it at its start
+    sys.stderr = open(2, "w", buffering=1, errors="backslashreplace", closefd=False)  # noqa: SIM115
+    os.environ.clear()
+    os.environ.update(environment)
+    sys.path[:0] = filter(None, environment.get("PYTHONPATH", "").split(os.pathsep))
+    os.chdir(folder)
+    program, *arguments = sys.argv = words
+    if first is not None:
+        first()
+    run_and_end(partial(importlib.import_module(PROGRAMS[program]).main, arguments, prog_name=program))
+
+
+def outcomes(jobs: Sequence[Job], folder: Path, **environment: str) -> list[tuple[int, str, str]]:
+    """Exit code, stdout and stderr of each job, with this folder to work in and additions to the environment.
+
+    A job is a program, its arguments, and where it runs: with a stdout that is a "pipe" or a "terminal", or one of
+    ``FILES`` or ``SURROUNDINGS``.
+    """
+    everything = {**os.environ, "MPLBACKEND": "agg", **environment}
+    return [_outcome(program, arguments, kind, everything, folder) for program, arguments, kind in jobs]
+
+
+def _outcome(
+    program: str, arguments: list[str], kind: str, environment: dict[str, str], folder: Path
+) -> tuple[int, str, str]:
+    shown = bytearray()
+    with _terminal(shown) if kind == "terminal" else nullcontext(FILES.get(kind)) as stdout:
+        first = SURROUNDINGS.get(kind)
+        command = ForkedCommand(program, arguments, environment, folder=folder, stdout=stdout, first=first)
+        printed, complaints = command.communicate(LONGEST)
+    return command.wait(), printed + shown.decode(), complaints
+
+
+@contextmanager
+def _terminal(shown: bytearray) -> Iterator[str]:
+    """Its name; what is shown on it."""
+
+    def read() -> None:
+        with suppress(OSError):  # nobody writes to it any more
+            while True:
+                shown.extend(os.read(master, 65536))
+
+    master, slave = pty.openpty()
+    reading = threading.Thread(target=read)
+    reading.start()
+    try:
+        yield os.ttyname(slave)
+    finally:
+        os.close(slave)
+        reading.join()
+        os.close(master)
+
+
+def _ascii() -> None:
+    sys.stdout.reconfigure(encoding="ascii", errors="strict")
+    sys.stderr.reconfigure(encoding="ascii")
+
+
+def _closed() -> None:
+    os.close(1)
+    sys.stdout = None  # as Python has it at its start
+
+
+def _gone() -> None:
+    read, write = os.pipe()
+    os.dup2(write, 1)
+    os.close(read)
+    os.close(write)
+
+
+def _limit() -> None:
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # as Python has it at its start
+    resource.setrlimit(resource.RLIMIT_FSIZE, (64, 64))
+
+
+def _memory() -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+
+
+FILES = {"full": "/dev/full"}  # as stdout: a full disk
+SURROUNDINGS: dict[str, Callable[[], object]] = {
+    "ascii": _ascii,  # stdout has few characters
+    "closed": _closed,
+    "gone": _gone,  # nobody reads the pipe that is stdout
+    "limit": _limit,  # files cannot grow beyond a few bytes
+    "memory": _memory,  # there is 1 GB
+}

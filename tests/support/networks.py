@@ -52,4 +52,4 @@ def assert_equal_to_twin(run: Run) -> None:
     assert run.completeness.complete
     assert run.completeness.duplicates == 0
     outcome = check(run)
-    assert (outcome.difference, outcome.missing) == (None, 0)
+    assert (outcome.difference, outcome.missing, outcome.compared) == (None, 0, run.completeness.expected)

@@ -9,36 +9,43 @@ import subprocess
 import termios
 import time
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
+
+from many_commands import PROGRAMS, ForkedCommand
+
+
+def default_signals() -> None:
+    """The tests may run under nohup or in the background."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def take_terminal() -> None:
     """Make the terminal that is stdin that of this process, in a session of its own."""
     os.setsid()
-    for number in (signal.SIGINT, signal.SIGHUP):  # the tests may run under nohup or in the background
-        signal.signal(number, signal.SIG_DFL)
+    default_signals()
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
 
 class Terminal:
-    """A program on a terminal of its own; its ``stdout`` may be elsewhere."""
+    """A program on a terminal of its own, one of ours forked, others executed; stdout may be a file."""
 
-    def __init__(self, *command: str | Path, columns: int = 80, rows: int = 24, stdout: IO[str] | None = None) -> None:
+    def __init__(self, *command: str | Path, columns: int = 80, rows: int = 24, stdout: Path | None = None) -> None:
         self._master, slave = pty.openpty()
         termios.tcsetwinsize(slave, (rows, columns))
         self.before = termios.tcgetattr(slave)
         self._slave = slave
         self.text = ""
-
-        self.process = subprocess.Popen(
-            command,
-            stdin=slave,
-            stdout=stdout or slave,
-            stderr=slave,
-            preexec_fn=take_terminal,
-            # readline adds its own, also to the environment of pytest's workers, and they would fix the size
-            env={name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")},
-        )
+        # readline adds its own, also to the environment of pytest's workers, and they would fix the size
+        environment = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+        program, *words = command
+        self.process: Any
+        if program in PROGRAMS:
+            where = {"terminal": os.ttyname(slave), "stdout": stdout}
+            self.process = ForkedCommand(str(program), words, environment, first=default_signals, **where)
+        else:
+            streams = dict.fromkeys(("stdin", "stdout", "stderr"), slave)
+            self.process = subprocess.Popen(command, **streams, preexec_fn=take_terminal, env=environment)
 
     def type(self, keys: bytes) -> None:
         os.write(self._master, keys)

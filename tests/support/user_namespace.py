@@ -1,8 +1,9 @@
-"""What a process does at its start to be in a user namespace of its own."""
+"""What a process does at its start to be in another namespace."""
 
 import ctypes
+from pathlib import Path
 
-CLONE_NEWUSER = 0x10000000  # linux/sched.h
+CLONE_NEWUSER, CLONE_NEWNET = 0x10000000, 0x40000000  # linux/sched.h
 CAPABILITY_VERSION = 0x20080522  # linux/capability.h: the third, with two words of each set
 
 
@@ -12,3 +13,10 @@ def give_up_rights() -> None:
     header, none = (ctypes.c_uint32 * 2)(CAPABILITY_VERSION, 0), (ctypes.c_uint32 * 6)()
     if libc.unshare(CLONE_NEWUSER) or libc.capset(header, none):
         raise OSError(ctypes.get_errno(), "no user namespace")
+
+
+def enter_network(name: Path) -> None:
+    """As ``ip netns exec`` does it."""
+    with name.open() as file:
+        if ctypes.CDLL(None, use_errno=True).setns(file.fileno(), CLONE_NEWNET):
+            raise OSError(ctypes.get_errno(), "setns")

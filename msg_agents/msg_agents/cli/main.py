@@ -9,6 +9,7 @@ input, 3 incomplete data. Modules that take long to import are imported by the c
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any

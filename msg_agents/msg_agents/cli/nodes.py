@@ -63,8 +63,6 @@ def _node_options(command: Callable[..., None]) -> Callable[..., None]:
         click.option("--namespace", type=int, hidden=True),
         click.option(
             "--status-file",
-            cls=RenamedOption,
-            old_name="--account",
             type=PATH,
             metavar="FILE",
             help="Status file, written every second: rejected messages, what the nodes wait for (health checks).",

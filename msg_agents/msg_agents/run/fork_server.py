@@ -297,7 +297,7 @@ def run_and_end(run: Callable[[], object]) -> NoReturn:
     gc.collect()  # what the command has left, such as nodes of ROS, which say that they go
     threading._shutdown()  # type: ignore[attr-defined]  # waits for threads, as multiprocessing does it
     atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
+    for stream in filter(None, (sys.stdout, sys.stderr)):
         try:
             stream.flush()
         except (OSError, ValueError):

@@ -25,7 +25,6 @@ from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.validation import heard_links
 from msg_analysis.model.step_model import Wiring
-from msg_analysis.theory.prediction import predict
 
 if TYPE_CHECKING:
     from msg_analysis.inference.timing import LostMessages
@@ -108,6 +107,8 @@ def predicted_errors(channel: Channel, experiment: Experiment) -> dict[str, Any]
         return None
     if any(link.loss.good != link.loss.bad for link in channel.links.values()):
         return None
+    from msg_analysis.theory.prediction import predict  # a third of the imports of a run
+
     document = experiment.to_document()
     probability = channel.agent_loss(experiment.agents) * heard_links(experiment.graph_list, experiment.time)
     arcs = [[j + 1, i + 1, float(probability[i, j])] for i, j in np.argwhere(probability).tolist()]

@@ -25,7 +25,6 @@ from msg_analysis.common.console import print_note
 from msg_analysis.common.text import HALF_WIDTH_95, agent_name
 from msg_analysis.messages.topics import agent_node_name
 from msg_analysis.model.run_record import RunRecord
-from msg_analysis.report.comparison_text import any_time_text, coverage, error_text
 from msg_analysis.report.look import shorten
 
 if TYPE_CHECKING:
@@ -136,6 +135,8 @@ def _coverage(snapshot: Snapshot, experiment: Experiment) -> Text:
     report = snapshot.report
     if report is None or not report.steps:
         return Text()
+    from msg_analysis.report.comparison_text import coverage  # takes as long to import as a network to start
+
     text = f"simulated time {snapshot.reached * experiment.step_length:g}, errors of {', '.join(coverage(report))}"
     return Text(text, style="dim", no_wrap=True, overflow="ellipsis")
 
@@ -144,6 +145,8 @@ def _system(snapshot: Snapshot, width: int) -> list[RenderableType]:
     report = snapshot.report
     if report is None or report.system.measured is None:
         return [Text(snapshot.note or "system error: no data yet", no_wrap=True, overflow="ellipsis"), Text(), Text()]
+    from msg_analysis.report.comparison_text import any_time_text, error_text
+
     system = report.system
     style = "bold red" if abs(system.z or 0.0) > 4 else ""
     text = Text(f"system error {error_text(system)}", style=style, no_wrap=True, overflow="ellipsis")

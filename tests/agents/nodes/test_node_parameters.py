@@ -17,7 +17,6 @@ pytest.importorskip("rclpy")
 import click
 
 from msg_agents.cli.main import main
-from msg_agents.cli.node_server import MODULES as NODE_MODULES
 from msg_agents.cli.ros_command import RosCommand, split_arguments
 from msg_agents.discovery.rtps import free_domain
 from msg_agents.nodes.parameters import describe, name_of, options_of
@@ -39,10 +38,17 @@ def start(executable: str, *arguments: Any) -> subprocess.CompletedProcess[str]:
     words = [executable, *(str(argument) for argument in arguments)]
     with free_domain() as domain:
         environment = {"NO_COLOR": "1", "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        ((code, stdout, stderr),) = many_commands.outcomes(
-            [["msg-agents", words, "pipe"]], Path.cwd(), NODE_MODULES, **environment
-        )
-    return subprocess.CompletedProcess(words, code, stdout, stderr)
+        ((code, stdout, stderr),) = many_commands.outcomes([("msg-agents", words, "pipe")], Path.cwd(), **environment)
+    return Ended(code, stdout, stderr)
+
+
+def execute(executable: str, *arguments: Any) -> subprocess.CompletedProcess[str]:
+    """From its start to its end."""
+    with free_domain() as domain:
+        environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1", "ROS_DOMAIN_ID": str(domain)}
+        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        command = [str(BIN / "msg-agents"), executable, *(str(argument) for argument in arguments)]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
 
 
 def test_split_arguments() -> None:
