@@ -21,7 +21,7 @@ import numpy as np
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import HALF_WIDTH_95, agent_text, json_text
 from msg_analysis.errors import ExitCode, InputError
-from msg_analysis.experiment.network_spec import is_number
+from msg_analysis.experiment.spec import is_number
 from msg_analysis.experiment.problems import show
 from msg_analysis.inference.statistics import holm
 from msg_analysis.sweeps.grid import Sweep

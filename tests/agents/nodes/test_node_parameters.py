@@ -39,16 +39,7 @@ def start(executable: str, *arguments: Any) -> subprocess.CompletedProcess[str]:
     with free_domain() as domain:
         environment = {"NO_COLOR": "1", "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
         ((code, stdout, stderr),) = many_commands.outcomes([("msg-agents", words, "pipe")], Path.cwd(), **environment)
-    return Ended(code, stdout, stderr)
-
-
-def execute(executable: str, *arguments: Any) -> subprocess.CompletedProcess[str]:
-    """From its start to its end."""
-    with free_domain() as domain:
-        environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "NO_COLOR": "1", "ROS_DOMAIN_ID": str(domain)}
-        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        command = [str(BIN / "msg-agents"), executable, *(str(argument) for argument in arguments)]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    return subprocess.CompletedProcess(words, code, stdout, stderr)
 
 
 def test_split_arguments() -> None:
