@@ -85,9 +85,13 @@ def test_a_run_that_was_to_end_early() -> None:
         assert found.any_time.half_width == pytest.approx(half_width)
 
 
-def test_a_short_run_is_looked_at_20_times() -> None:
+def test_shorter_runs_are_looked_at_less_often() -> None:
+    longer = compare(simulate(line_ring(run={"duration": 250, "replicas": 1})))
+    assert longer.any_time.time == pytest.approx(spaced_steps(5000, 50) * 0.05)
     run = simulate(line_ring())
     found = compare(run)
+    assert (found.verdict, found.causes) == ("agrees", [])
+    assert compare(cut(run, 101)).system_error.measured is not None  # of 100 steps
     assert found.any_time.time == pytest.approx(spaced_steps(400, 20) * 0.05)
     families = sums_of(observed(run), in_detail=True).families()
     for test in found.tests:
@@ -123,5 +127,6 @@ def test_means_of_runs_that_were_computed_in_different_detail() -> None:
         variance = [means.trace @ means.covariance @ means.trace for means in (one, other, merged)]
         assert variance[2] == pytest.approx(0.25**2 * variance[0] + 0.75**2 * variance[1])
         assert merged.expected_moments == pytest.approx(2.5 * one.expected_moments)
+        assert merged.second_moments == pytest.approx(0.25 * one.second_moments + 0.75 * other.second_moments)
         each = [means.nodes @ means.measured for means in (one, other, merged)]
         assert each[2][:left] == pytest.approx(0.25 * each[0][:left] + 0.75 * each[1][:left])
