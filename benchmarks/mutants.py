@@ -35,8 +35,8 @@ TESTS = {
     "tests/analysis/theory/test_moments_precision.py "
     "tests/analysis/theory/test_prediction.py "
     "tests/analysis/theory/test_solvers.py -k 'not test_solvers or converge or dense'",
-    "analysis/msg_analysis/inference/verdict.py": "tests/analysis/inference/test_compare.py "
-    "tests/analysis/inference/test_pool.py "
+    "analysis/msg_analysis/inference/verdict.py": "tests/analysis/inference/test_verdict.py "
+    "tests/analysis/inference/test_compare.py tests/analysis/inference/test_pool.py "
     "-k 'not calibration and not level_holds and not hardly and not common and not rounding and not many_agents'",
     "analysis/msg_analysis/bags/salvage.py": "tests/analysis/bags/test_salvage.py",
     "analysis/msg_analysis/messages/acceptance.py": "tests/analysis/messages/test_acceptance.py",

@@ -80,8 +80,8 @@ class GivenPath:
         """The JSON document."""
         return {
             "expected": self.expected,
-            "system_error": self.system_error,
-            "node_errors": self.node_errors,
+            "system_error": self.system_error.to_json(),
+            "node_errors": [node.to_json() for node in self.node_errors],
             "variance_ratio": self.variance_ratio,
         }
 

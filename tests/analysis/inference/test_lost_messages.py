@@ -109,7 +109,7 @@ def test_late_agents_and_messages(late_timers):
 
 
 def test_document():
-    document = measure_timing(observed(simulate(experiment(loss=0.2, on_loss="hold")))).to_json()["unheard"]
+    document = measure_timing(observed(simulate(experiment(loss=0.2, on_loss="hold")))).lost_messages.to_json()
     assert document["unheard"] == sum(link["unheard"] for link in document["links"])
     assert document["expected"] == pytest.approx(0.2)
     assert document["words"] is None
