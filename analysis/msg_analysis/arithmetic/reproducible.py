@@ -53,8 +53,7 @@ class StepClock:
         return np.asarray(steps * whole + parts + self._shift, dtype=np.int64)
 
 
-STEPS_PER_BLOCK = 256
-"""Steps whose noise is drawn at once. Part of the definition of a run: another value gives other numbers."""
+STEPS_PER_BLOCK = 256  # whose noise is drawn at once; part of the definition of a run: another one gives other numbers
 
 
 class Stream(IntEnum):
@@ -122,8 +121,7 @@ _reused = threading.local()  # ``generator`` of each thread
 
 
 SLICES = 3
-TERMS = 13
-"""Of the Taylor series, at a norm of at most 1/8: the next one is below 1e-22."""
+TERMS = 13  # of the Taylor series, at a norm of at most 1/8: the next one is below 1e-22
 
 
 def exponential(matrix: FloatArray) -> FloatArray:

@@ -66,9 +66,7 @@ class AgentLaw:
     air: AgentAir | None = None  # None where messages have no noise, none is lost, and none is old
 
     def __init__(self, record: RunRecord, model: StepModel, agent: int) -> None:
-        self.agent = agent
-        self.step = 0
-        self.state = to_payload(record.start[agent])
+        self.agent, self.step, self.state = agent, 0, to_payload(record.start[agent])
         # In lockstep, by neighbour, the step of the value used in the step to x(k), or LOST; empty where none was lost.
         self.heard: tuple[int, ...] = ()
         self._noise = ProcessNoise(record.experiment.run.seed, model.noise_gain, record.experiment.run.replicas)
@@ -136,9 +134,7 @@ class ProtocolLaw:
     def __init__(self, record: RunRecord, model: Wiring, agent: int) -> None:
         experiment = record.experiment
         assert experiment.protocol is not None
-        self.agent = agent
-        self.step = 0
-        self.state = to_payload(record.start[agent])
+        self.agent, self.step, self.state = agent, 0, to_payload(record.start[agent])
         self.heard: tuple[int, ...] = ()
         self._protocol = AgentProtocol(experiment.protocol, agent)
         self._shape = (self._protocol.states, experiment.run.replicas)

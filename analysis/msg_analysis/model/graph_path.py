@@ -43,9 +43,7 @@ def _sampled(
     chain: MarkovChain, initial: FloatArray, random: np.random.Generator, steps: int, dt: float
 ) -> Iterator[Sojourn]:
     """The chain at the times 0, dt, ..., (steps - 1) dt."""
-    time = 0.0
-    first = 0
-    sequence = 0
+    time, first, sequence = 0.0, 0, 0
     for mode, held in chain.sojourns(initial, random):
         time += held
         end = steps if math.isinf(time) else min(steps, math.ceil(time / dt))

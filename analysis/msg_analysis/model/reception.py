@@ -121,11 +121,8 @@ class Losses:
             number, distance = number - 1, distance + STEPS_PER_BLOCK
 
 
-LOST = 2**64 - 1
-"""Value in ``heard`` of a state message for a lost message. No step of a run has this number."""
-
-NOTHING = -1
-"""In place of the step of a message: none, so that the agent uses its own value."""
+LOST = 2**64 - 1  # in ``heard`` of a state message, of a lost message; no step of a run has this number
+NOTHING = -1  # in place of the step of a message: none, so that the agent uses its own value
 
 
 class Air:

@@ -35,8 +35,7 @@ from msg_analysis.model.step_model import (
 )
 
 DECIDED = "decided"
-DECIDED_PRECISION = 0.05
-"""Precision at which ``decided`` ends a run that the evidence does not contradict."""
+DECIDED_PRECISION = 0.05  # at which ``decided`` ends a run that the evidence does not contradict
 
 
 @dataclass(frozen=True, slots=True)

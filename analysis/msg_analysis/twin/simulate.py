@@ -105,10 +105,8 @@ def _blocks(noise: ProcessNoise, model: StepModel, modes: IntArray, first: int) 
 
 
 def _rounds(model: StepModel, mode: int, lead: BoolArray, heard: BoolArray | None) -> list[Round]:
-    """The agents in rounds: each in the first one after those that step before it (``lead``) and that it uses.
-
-    ``heard`` (m, m): whom it hears whatever the graph, and must wait for, too.
-    """
+    """The agents in rounds: each in the first one after those that step before it (``lead``) and that it uses."""
+    # heard (m, m): whom it hears whatever the graph, and must wait for, too.
     m, every = model.agents, np.arange(model.agents)
     inputs = [model.inputs(mode, i) for i in range(m)]
     columns = np.zeros((max(len(row) for row in inputs), m), dtype=np.int64)  # the d-th input of every agent
@@ -212,15 +210,10 @@ def _one_by_one(record: RunRecord, modes: IntArray) -> Iterator[_Values]:
         release(published)
 
 
-TOLERANCE = 2.0**-10
-"""A change of x(0) this small, relative to its size, ends the search for a beginning."""
-
-MAX_PAST = 2**16
-MAX_NUMBERS = 2**24
-"""Longest past, in steps and in numbers (steps x agents x replicas): a second or two of computing."""
-
-GRID = 2.0**-12
-"""Unit of x(0), in standard deviations, where the past would be longer: far more than processors differ by."""
+TOLERANCE = 2.0**-10  # a change of x(0) this small, relative to its size, ends the search for a beginning
+MAX_PAST = 2**16  # longest past, in steps,
+MAX_NUMBERS = 2**24  # and in numbers (steps x agents x replicas): a second or two of computing
+GRID = 2.0**-12  # unit of x(0), in standard deviations, where it would be longer: far above what processors differ by
 
 
 def draw_start(experiment: Experiment, model: Wiring, first_mode: int) -> FloatArray:

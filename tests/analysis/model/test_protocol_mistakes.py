@@ -21,22 +21,17 @@ from msg_analysis.experiment.problems import ExperimentError
 from msg_analysis.protocol import Heard, LinearProtocol, Parameters, Protocol
 
 SATURATED, METROPOLIS = {"name": "saturated"}, {"name": "metropolis"}
-MISTAKES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
-    (
-        {"name": "metropolys"},
-        {},
-        [
-            'protocol.name: "metropolys": expected one of integral_action (msg_agents_example_protocols 0.1.0), '
-            "metropolis (msg_agents_example_protocols 0.1.0), saturated (msg_agents_example_protocols 0.1.0): "
-            "did you mean metropolis?"
-        ],
-    ),
+INTEGRAL, ITS_PACKAGE = {"name": "integral_action"}, "(msg_agents_example_protocols 0.1.0)"
+NOT_LINEAR = f"protocol saturated {ITS_PACKAGE} has no prediction to start from: for example start: zero"
+TWO_VALUES = f"protocol integral_action {ITS_PACKAGE}, agent 1: disturbance: 2 values, expected one for each of the 5 "
+UNKNOWN = 'protocol.name: "metropolys": expected one of ' + ", ".join(
+    f"{name} {ITS_PACKAGE}" for name in ("integral_action", "metropolis", "saturated")
+)
+LEADERS: dict[str, Any] = {"problem": "tracking", "leaders": {"agents": [1]}}
+MISTAKES: list[tuple[Any, dict[str, Any], list[str]]] = [
+    ({"name": "metropolys"}, {}, [f"{UNKNOWN}: did you mean metropolis?"]),
     ({"laziness": 0.5}, {}, ["protocol.name: missing: expected the name under which"]),
-    (
-        METROPOLIS | {"lazyness": 0.5},
-        {},
-        ["protocol.lazyness: unknown key: expected one of laziness: did you mean 'laziness'?"],
-    ),
+    (METROPOLIS | {"lazyness": 0.5}, {}, ["protocol.lazyness: unknown key: expected one of laziness: did you mean 'l"]),
     (METROPOLIS | {"laziness": 1}, {}, ["protocol.laziness: 1: expected a number < 1: for example laziness: 0.5"]),
     (
         METROPOLIS | {"laziness": -1},
@@ -45,28 +40,14 @@ MISTAKES: list[tuple[dict[str, Any], dict[str, Any], list[str]]] = [
     ),
     (SATURATED | {"limit": "much"}, {}, ['protocol.limit: "much": ']),
     (SATURATED | {"limit": float("nan")}, {}, ["protocol.limit: .nan: expected a finite number"]),
-    (
-        {"name": "integral_action", "disturbance": [1, 2]},
-        {},
-        [
-            "protocol integral_action (msg_agents_example_protocols 0.1.0), agent 1: disturbance: 2 values, "
-            "expected one for each of the 5 agents: correct the parameters, or tell the authors of the package"
-        ],
-    ),
+    (INTEGRAL | {"disturbance": [1, 2]}, {}, [f"{TWO_VALUES}agents: correct the parameters, or tell the authors of"]),
     (METROPOLIS, {"graphs": DIRECTED}, ["graph a is directed, expected undirected graphs: correct"]),
     (
         SATURATED,
         {"run": {"start": "stationary"}},
-        [
-            "run.start: 'stationary': expected 'zero' or one value per agent, since protocol saturated "
-            "(msg_agents_example_protocols 0.1.0) has no prediction to start from: for example start: zero"
-        ],
+        [f"run.start: 'stationary': expected 'zero' or one value per agent, since {NOT_LINEAR}"],
     ),
-    (
-        SATURATED,
-        {"problem": "tracking", "leaders": {"agents": [1]}},
-        ["problem: 'tracking': expected consensus, since protocol saturated"],
-    ),
+    (SATURATED, LEADERS, ["problem: 'tracking': expected consensus, since protocol saturated"]),
     ("metropolis", {}, ['protocol: "metropolis": expected keys with values: for example protocol: {"name"']),
 ]
 
