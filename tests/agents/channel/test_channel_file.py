@@ -117,16 +117,15 @@ def test_links_of_the_graphs_join_hosts() -> None:
         ({"pairs": [{"sender": "agent_1", "receiver": "agent_1"}]}, "pairs[1]: from agent_1 to agent_1: expected two"),
         ({"pairs": [{"between": ["agent_1", BASE]}], "recorder": "clean"}, "contradicts recorder: clean"),
         ({"default": {"loss": {"to_bad": 0.1, "to_good": 0}}}, "default.loss.to_good: 0: expected a number > 0"),
+        (
+            {"pairs": [{"between": ["agent_1", "agent_2"]}, {"sender": "agent_2", "receiver": "agent_1"}]},
+            "pairs[2]: from agent_2 to agent_1: a pair that is there already: remove one",
+        ),
     ],
 )
 def test_mistakes(document: dict[str, Any], wanted: str) -> None:
     found = problems(**document)
     assert any(wanted in line for line in found), found
-
-
-def test_a_pair_is_given_once() -> None:
-    pairs = [{"between": ["agent_1", "agent_2"]}, {"sender": "agent_2", "receiver": "agent_1"}]
-    assert problems(pairs=pairs) == ["pairs[2]: from agent_2 to agent_1: a pair that is there already: remove one"]
 
 
 def test_all_mistakes_are_reported_together_with_the_file(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -76,13 +77,13 @@ class Running:
         self,
         hosts: dict[str, Host],
         folder: Path,
-        links: dict[tuple[str, str], LinkSettings],
+        links: dict[tuple[str, str], LinkSettings] | None = None,
         joined: Any = None,
         graph: Path | None = None,
     ) -> None:
         self.sockets = {name: on_host(host, bound) for name, host in hosts.items()}
         self.addresses = {name: host.address for name, host in hosts.items()}
-        every = {(a, b): links.get((a, b), LinkSettings()) for a in NAMES for b in NAMES if a != b}
+        every = {(a, b): (links or {}).get((a, b), LinkSettings()) for a in NAMES for b in NAMES if a != b}
         self.counts_file = folder / "counts.json"
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         channel = Channel(5, dict.fromkeys(NAMES, ()), every, graph is not None, 9000)
@@ -108,11 +109,7 @@ class Running:
 def run(hosts: dict[str, Host], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Running]:
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # the channel is in a thread here
     monkeypatch.setattr(os, "setpriority", lambda *_: None)
-
-    def start(links: dict[tuple[str, str], LinkSettings] | None = None, **options: Any) -> Running:
-        return Running(hosts, tmp_path, links or {}, **options)
-
-    return start
+    return partial(Running, hosts, tmp_path)
 
 
 def test_datagrams_reach_their_host_with_their_bytes(run: Callable[..., Running]) -> None:

@@ -139,11 +139,10 @@ def test_the_end() -> None:
 def test_another_value_of_the_newest_step() -> None:
     """One of the two is forged; the first is used."""
     node = newest(Clock())
-    assert node.offer(1, 5, "first") is None
-    assert node.offer(1, 5, "first") == Refusal.REPEATED
-    assert node.offer(1, 5, "second") == Refusal.CONTRADICTION
+    offers = [(5, "first"), (5, "first"), (5, "second"), (4, "older")]
+    found = [None, Refusal.REPEATED, Refusal.CONTRADICTION, Refusal.REPEATED]
+    assert [node.offer(1, *each) for each in offers] == found
     assert node.known(1) == "first"
-    assert node.offer(1, 4, "older") == Refusal.REPEATED
 
 
 @given(

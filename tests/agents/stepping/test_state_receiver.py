@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from networks import experiment
 
-from msg_agents.stepping.state_receiver import CONSECUTIVE, ReceivedSteps, StateReceiver, hashes_of
+from msg_agents.stepping.state_receiver import CONSECUTIVE, Received, ReceivedSteps, StateReceiver, hashes_of
 from msg_agents.stepping.synchronizer import RESEND_LIMIT
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import encode_batch
@@ -40,6 +40,13 @@ def _message(record: RunRecord, agent: int, step: int, value: float = 1.5, **cha
 
 def _receiver(record: RunRecord) -> StateReceiver:
     return StateReceiver(record, STATES, STATE, "/net/")
+
+
+def _taken(record: RunRecord, messages: list[bytes], receiver: StateReceiver | None = None) -> Received:
+    """From a batch with these messages."""
+    receiver = receiver or _receiver(record)
+    receiver.add(encode_batch(record.run.bytes, messages))
+    return receiver.take()
 
 
 def test_a_run_in_batches_of_any_size() -> None:
@@ -73,10 +80,7 @@ def test_a_run_in_batches_of_any_size() -> None:
 def test_repetitions_and_contradictions() -> None:
     """Repeated states are dropped; of two different ones both are recorded, further ones are not."""
     record = _record()
-    receiver = _receiver(record)
-    values = [1.5, 1.5, 2.5, 3.5, 2.5]
-    receiver.add(encode_batch(record.run.bytes, [_message(record, 2, 5, value) for value in values]))
-    received = receiver.take()
+    received = _taken(record, [_message(record, 2, 5, value) for value in (1.5, 1.5, 2.5, 3.5, 2.5)])
     assert received.step.tolist() == [5, 5]
     assert [received.data[start + 68 : start + 76] for start in received.start] == [
         np.float64(value).tobytes() for value in (1.5, 2.5)
@@ -90,18 +94,14 @@ def test_repetitions_and_contradictions() -> None:
 @pytest.mark.parametrize("field", ["stamp", "mode", "state", "heard"])
 def test_any_other_byte_is_a_contradiction(field: str) -> None:
     record = _record(loss=0.5)
-    receiver = _receiver(record)
     others = {"stamp": 1, "mode": 2, "state": np.array([1.5, np.nextafter(-3.0, 0.0)]), "heard": np.array([2], "u8")}
     messages = [_message(record, 1, 3), _message(record, 1, 3, **{field: others[field]})]
-    receiver.add(encode_batch(record.run.bytes, messages))
-    assert receiver.take().refused == [("/net/agent_1/state", Refusal.CONTRADICTION)]
+    assert _taken(record, messages).refused == [("/net/agent_1/state", Refusal.CONTRADICTION)]
 
 
 def test_what_cannot_be() -> None:
     """Every message is refused for its reason; those around it are taken."""
-    record = _record()
-    receiver = _receiver(record)
-    name = "/net/agent_2/state"
+    record, name = _record(), "/net/agent_2/state"
     bad = {
         _message(record, 2, 3, run=bytes(16)): ("states", Refusal.OTHER_RUN),
         _message(record, 0, 3): ("states", Refusal.UNKNOWN_AGENT),
@@ -121,8 +121,7 @@ def test_what_cannot_be() -> None:
     messages = [_message(record, 1, 0)]
     for number, message in enumerate(bad, start=1):
         messages += [message, _message(record, 1, number)]
-    receiver.add(encode_batch(record.run.bytes, messages))
-    received = receiver.take()
+    received = _taken(record, messages)
     assert received.step.tolist() == list(range(len(bad) + 1))
     assert sorted(received.refused) == sorted(bad.values())
 
@@ -135,18 +134,14 @@ def test_batches_that_are_none() -> None:
         receiver.add(batch)
     received = receiver.take()
     assert received.agent.tolist() == [0]
-    assert received.refused == [
-        ("states", Refusal.UNDECODABLE),
-        ("states", Refusal.UNDECODABLE),
-        ("states", Refusal.OTHER_RUN),
-    ]
+    reasons = [Refusal.UNDECODABLE, Refusal.UNDECODABLE, Refusal.OTHER_RUN]
+    assert received.refused == [("states", reason) for reason in reasons]
 
 
 def test_exact_states_beside_noisy_ones() -> None:
     record = _record(broadcast=0.1)
     receiver = StateReceiver(record, TRUTHS, TRUTH, "/")
-    receiver.add(encode_batch(record.run.bytes, [_message(record, 3, 0)]))
-    assert receiver.take().agent.tolist() == [2]
+    assert _taken(record, [_message(record, 3, 0)], receiver).agent.tolist() == [2]
     assert receiver.names[2] == "/agent_3/truth"
 
 
