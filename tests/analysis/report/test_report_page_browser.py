@@ -20,7 +20,7 @@ from msg_analysis.report.page import write_report
 from msg_analysis.report.plot_style import BLUE, DARK
 
 # Not stationary: a run of 100 agents from their stationary law has a long past to be simulated.
-HUNDRED: dict[str, Any] = {"duration": 25, "replicas": 16, "start": "zero"}
+HUNDRED: dict[str, Any] = {"duration": 35, "replicas": 16, "start": "zero"}
 LONG: dict[str, Any] = {"duration": 200, "replicas": 16, "start": "zero"}
 KILLED: dict[str, Any] = {"kind": "killed", "step": 1800, "node": "agent_2", "words": "agent_2: killed"}
 
