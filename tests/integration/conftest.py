@@ -5,8 +5,6 @@ child of a child, and no test ends well while any process of it is left, or anyt
 themselves only: shared memory, the folder of a run.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -28,6 +26,8 @@ from left_processes import describe, last_line
 from many_commands import ForkedCommand, ensure_running
 from networks import assert_equal_to_twin, document, experiment
 from started_processes import started_processes
+from terminal import Terminal
+from waiting import wait_for
 
 pytest.importorskip("rclpy")
 
@@ -255,14 +255,7 @@ class Network:
         """Size of what has been recorded so far."""
         return sum(file.stat().st_size for file in (self.directory / out).glob("*/*.mcap"))
 
-    @staticmethod
-    def wait_for(condition: Callable[[], Any], seconds: float, what: str) -> Any:
-        """Poll until the condition is true; its value."""
-        deadline = time.monotonic() + seconds
-        while not (value := condition()):
-            assert time.monotonic() < deadline, f"not within {seconds:g} s: {what}"
-            time.sleep(0.05)
-        return value
+    wait_for = staticmethod(wait_for)
 
     def wait_until_moving(self, out: str = "runs") -> None:
         """The run is in the middle: what is there of the bag is more than its head.
@@ -327,6 +320,20 @@ def twin_bag(network: Network) -> Path:
     bag = Path(network.directory / "twin")
     write_trajectory(simulate(network.experiment()), bag)
     return bag
+
+
+@pytest.fixture
+def terminal(network: Network) -> Iterator[Callable[..., Terminal]]:
+    """Start a command on a terminal of its own."""
+    opened: list[Terminal] = []
+
+    def start(*command: str | Path, **options: Any) -> Terminal:
+        opened.append(Terminal(*command, **options))
+        return opened[-1]
+
+    yield start
+    for each in opened:
+        each.close()
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """Networks over a channel: hosts as network namespaces, with loss and delay between them."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

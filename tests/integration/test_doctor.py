@@ -1,7 +1,5 @@
 """The doctor on a healthy machine, and on ones that are made ill: it finds what a run then stumbles over."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """A network over three hosts: network namespaces, each with an address of its own, on a bridge in a fourth."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

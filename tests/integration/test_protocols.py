@@ -1,7 +1,5 @@
 """Networks whose agents follow protocols of another package: complete, equal to the twin, judged as far as can be."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

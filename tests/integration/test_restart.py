@@ -1,7 +1,5 @@
 """Killed agents and switchers are started again, rejoin, and change nothing. That is the default."""
 
-from __future__ import annotations
-
 import html
 import random
 import re
@@ -142,7 +140,6 @@ def test_who_comes_back_repeats_only_what_peers_may_lack(network: Any) -> None:
             wait_for_more(network, steps, 300)
             result = network.completed(run)
             listener.terminate()
-            assert listener.stdout is not None
             newest, repeated = map(int, listener.stdout.read().split())
     assert len(result["restarts"]) == 2
     assert newest > 0

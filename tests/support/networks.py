@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """The experiments of the tests of networks: agents on a line and a ring, and run records of them."""
-
-from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
