@@ -46,6 +46,7 @@ Command = ForkedCommand | subprocess.Popen[str]
 MARK = "MSG_AGENTS_TEST"
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 PLAIN_RECORDER = Path(__file__).parents[1] / "support" / "plain_recorder.py"
+ensure_running()  # it imports while tests are collected, and serves all of them
 LOOK = 0.5  # s between two looks at what the processes of a test have made for themselves
 
 
@@ -275,7 +276,6 @@ class Network:
 @pytest.fixture
 def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network]:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
-    ensure_running()  # without the mark: it serves all tests
     mark = uuid.uuid4().hex
     monkeypatch.setenv(MARK, mark)
     for name in list(os.environ):

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 import yaml
+from namespaces import give_up_rights
 from scipy import stats
-from user_namespace import give_up_rights
 
 from msg_agents.channel.process import open_hosts
 from msg_analysis.bags.reading import read_bag
