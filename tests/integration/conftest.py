@@ -5,8 +5,6 @@ child of a child, and no test ends well while any process of it is left, or anyt
 themselves only: shared memory, the folder of a run.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -28,6 +26,8 @@ from left_processes import describe, last_line
 from many_commands import ForkedCommand, ensure_running
 from networks import assert_equal_to_twin, document, experiment
 from started_processes import started_processes
+from terminal import Terminal
+from waiting import wait_for
 
 pytest.importorskip("rclpy")
 
@@ -46,6 +46,7 @@ Command = ForkedCommand | subprocess.Popen[str]
 MARK = "MSG_AGENTS_TEST"
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 PLAIN_RECORDER = Path(__file__).parents[1] / "support" / "plain_recorder.py"
+ensure_running()  # it imports while tests are collected, and serves all of them
 LOOK = 0.5  # s between two looks at what the processes of a test have made for themselves
 
 
@@ -255,14 +256,7 @@ class Network:
         """Size of what has been recorded so far."""
         return sum(file.stat().st_size for file in (self.directory / out).glob("*/*.mcap"))
 
-    @staticmethod
-    def wait_for(condition: Callable[[], Any], seconds: float, what: str) -> Any:
-        """Poll until the condition is true; its value."""
-        deadline = time.monotonic() + seconds
-        while not (value := condition()):
-            assert time.monotonic() < deadline, f"not within {seconds:g} s: {what}"
-            time.sleep(0.05)
-        return value
+    wait_for = staticmethod(wait_for)
 
     def wait_until_moving(self, out: str = "runs") -> None:
         """The run is in the middle: what is there of the bag is more than its head.
@@ -282,7 +276,6 @@ class Network:
 @pytest.fixture
 def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network]:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
-    ensure_running()  # without the mark: it serves all tests
     mark = uuid.uuid4().hex
     monkeypatch.setenv(MARK, mark)
     for name in list(os.environ):
@@ -327,6 +320,20 @@ def twin_bag(network: Network) -> Path:
     bag = Path(network.directory / "twin")
     write_trajectory(simulate(network.experiment()), bag)
     return bag
+
+
+@pytest.fixture
+def terminal(network: Network) -> Iterator[Callable[..., Terminal]]:
+    """Start a command on a terminal of its own."""
+    opened: list[Terminal] = []
+
+    def start(*command: str | Path, **options: Any) -> Terminal:
+        opened.append(Terminal(*command, **options))
+        return opened[-1]
+
+    yield start
+    for each in opened:
+        each.close()
 
 
 @pytest.fixture

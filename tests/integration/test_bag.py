@@ -1,7 +1,5 @@
 """The bag of a run, as programs that know nothing of us see it."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -26,7 +24,6 @@ SMALL = {"processes": 1, "duration": 5}
 def test_any_reader_finds_everything(network: Any) -> None:
     """One run, looked at from all sides: rosbags, the plain MCAP reader, metadata.yaml, the logs; and run again."""
     result: RunResult = network.run(network.experiment(run={"processes": 2}))
-    assert result.bag is not None
     _rosbags(result)
     _mcap(result.bag)
     _metadata(result.bag)
@@ -51,8 +48,6 @@ def _the_seed_is_the_run(network: Any, result: RunResult) -> None:
 
 def _rosbags(result: RunResult) -> None:
     """All messages decoded with the definitions in the bag itself."""
-    assert result.bag is not None
-    assert result.trajectory is not None
     twin = simulate(result.trajectory.record.experiment)
     states = np.full_like(twin.states, np.nan)
     modes = np.full_like(twin.modes, -1)
@@ -96,8 +91,6 @@ def _mcap(bag: Path) -> None:
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
-        assert summary is not None
-        assert summary.statistics is not None
         read = sum(1 for _ in reader.iter_messages())
         assert read == summary.statistics.message_count
         for channel in summary.channels.values():
@@ -153,7 +146,6 @@ def test_compressed_and_split(network: Any) -> None:
         with path.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
             summary = reader.get_summary()
-            assert summary is not None
             assert {index.compression for index in summary.chunk_indexes} == {"lz4"}
             times = [message.log_time for _, _, message in reader.iter_messages()]
         assert min(times) > end

@@ -1,7 +1,5 @@
 """Networks over a channel: hosts as network namespaces, with loss and delay between them."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess
@@ -12,8 +10,8 @@ from typing import Any
 
 import pytest
 import yaml
+from namespaces import give_up_rights
 from scipy import stats
-from user_namespace import give_up_rights
 
 from msg_agents.channel.process import open_hosts
 from msg_analysis.bags.reading import read_bag

@@ -1,7 +1,5 @@
 """Cyclone DDS, another vendor's middleware, beside a run: as a reader, as a foreign node, and as one of its agents."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """Processes that the discovery relay connects, others in their domain, and how agents receive states."""
-
-from __future__ import annotations
 
 import os
 import socket
@@ -68,7 +63,6 @@ def test_others_see_every_process(network: Any, domain: int) -> None:
     with ExitStack() as stack:
         others = joining(stack, "before", domain)
         for other in others.values():
-            assert other.stdout is not None
             assert other.stdout.readline() == "ready\n"
         run = network.record(file, "--domain", str(domain))
         network.wait_until_moving()

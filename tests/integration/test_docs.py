@@ -1,7 +1,5 @@
 """Pages word for word with real processes: every command and every Python block in order, with what they print."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The doctor on a healthy machine, and on ones that are made ill: it finds what a run then stumbles over."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -11,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import ill_machines
+import namespaces
 import pytest
 
 from msg_agents.discovery.rtps import LOOPBACK_PROFILE, free_domain
@@ -72,7 +70,7 @@ def test_many_warnings(plain_shell: Any, monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(other_rclpy(tmp_path).parents[2]))
     with free_domain() as held:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(held))
-        doctor = plain_shell.start("doctor", first=ill_machines.some_descriptors)
+        doctor = plain_shell.start("doctor", first=namespaces.some_descriptors)
         stdout, stderr = doctor.communicate(timeout=60)
     assert (doctor.returncode, stderr) == (0, "")
     *lines, last = stdout.splitlines()
@@ -136,16 +134,16 @@ def need_unshare(*words: str) -> None:
 
 def test_a_full_shared_memory(plain_shell: Any) -> None:
     need_unshare("--mount")
-    refused(plain_shell, "shared_memory", partial(plain_shell.start, first=ill_machines.full_shared_memory))
+    refused(plain_shell, "shared_memory", partial(plain_shell.start, first=namespaces.full_shared_memory))
 
 
 def test_no_loopback(plain_shell: Any) -> None:
     """A new network namespace has an interface that is down."""
     need_unshare("--net")
-    refused(plain_shell, "loopback", partial(plain_shell.start, first=ill_machines.no_loopback))
+    refused(plain_shell, "loopback", partial(plain_shell.start, first=namespaces.no_loopback))
 
 
 def test_few_descriptors(plain_shell: Any) -> None:
     """Too few for two processes: the round trip says so, without a traceback."""
-    code, checks = examined(plain_shell.start("doctor", "--json", first=ill_machines.few_descriptors))
+    code, checks = examined(plain_shell.start("doctor", "--json", first=namespaces.few_descriptors))
     assert (code, checks["round_trip"]["status"]) == (2, "error")

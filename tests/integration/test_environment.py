@@ -1,7 +1,5 @@
 """Surroundings in which a run has the same result as anywhere else."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

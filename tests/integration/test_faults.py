@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """A process that is killed or stopped, a full disk, a user who ends the run: what is there can be read."""
-
-from __future__ import annotations
 
 import json
 import os

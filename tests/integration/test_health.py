@@ -1,7 +1,5 @@
 """A network that stands still says where it waits; and then goes on. Second processes of its agents leave."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal

@@ -1,7 +1,5 @@
 """A network over three hosts: network namespaces, each with an address of its own, on a bridge in a fourth."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -18,10 +16,10 @@ from typing import Any
 
 import pytest
 import yaml
+from namespaces import enter_network
 from networks import assert_equal_to_twin
 from processors import another_processor
 from set_clock import SetClock
-from user_namespace import enter_network
 
 from msg_agents.discovery.rtps import PROFILE_VARIABLES
 from msg_analysis.bags.reading import read_bag

@@ -1,7 +1,5 @@
 """The launch files under the real ``ros2 launch``, with the workspace as colcon has installed it."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

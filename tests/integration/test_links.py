@@ -1,7 +1,5 @@
 """Networks of processes with all that can happen to messages, in both paces: complete, and equal to the twin."""
 
-from __future__ import annotations
-
 import os
 import random
 import re

@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """A network that is watched, running or played, by a process of its own: its errors, and its picture."""
-
-from __future__ import annotations
 
 import json
 import re
@@ -54,7 +49,6 @@ def test_a_replay_gives_the_numbers_of_the_comparison(network: Any, domain: int)
     write_trajectory(trajectory, bag)
     listener = subprocess.Popen([sys.executable, "-P", "-c", LISTENER], stdout=subprocess.PIPE, text=True)
     live = network.start("live", "--reliable", "--json", "--timeout", "60")
-    assert listener.stdout
     assert listener.stdout.readline() == "matched\n"
     network.ended(network.start("play", bag, "--rate", "10", "--await", "live"))
     stdout, _ = network.ended(live)
@@ -123,12 +117,10 @@ def test_a_running_network_is_watched_to_its_end(network: Any, domain: int) -> N
     assert found[1] == f"{error:.6g}"
 
 
-def test_a_run_of_which_no_state_comes_is_over(network: Any, domain: int) -> None:
+def test_a_run_of_which_no_state_comes_is_over(network: Any, domain: int, twin_bag: Path) -> None:
     """It ended before the watcher had found its agents, for example."""
-    bag = network.directory / "bag"
-    write_trajectory(simulate(network.experiment()), bag)
     live = network.start("live", "--timeout", "60")
-    play = network.start("play", bag, "--topics", "/experiment", "--await", "live")
+    play = network.start("play", twin_bag, "--topics", "/experiment", "--await", "live")
     network.ended(play)
     stdout, _ = network.ended(live, code=3)
     assert "no complete step yet" in stdout
@@ -136,13 +128,11 @@ def test_a_run_of_which_no_state_comes_is_over(network: Any, domain: int) -> Non
 
 @pytest.mark.parametrize("options", [(), ("--reliable",)])
 def test_the_player_does_not_wait_for_a_watcher_that_has_left(
-    network: Any, domain: int, options: tuple[str, ...]
+    network: Any, domain: int, twin_bag: Path, options: tuple[str, ...]
 ) -> None:
     """The watcher ends with the run, long before the middleware asks it what it has got."""
-    bag = network.directory / "bag"
-    write_trajectory(simulate(network.experiment()), bag)
     live = network.start("live", *options)
-    _, said = network.ended(network.start("play", bag, "--rate", "max", "--await", "live"))
+    _, said = network.ended(network.start("play", twin_bag, "--rate", "max", "--await", "live"))
     assert "waiting until the readers" not in said
     assert live.wait(60) in (0, 3)  # with best effort it may have missed the last step
 
@@ -167,20 +157,17 @@ def test_a_watcher_that_is_stopped_holds_nobody_up(network: Any, domain: int) ->
 
 def wait_for_steps(live: subprocess.Popen[str]) -> None:
     """Until it has something to say."""
-    assert live.stdout
     while " steps" not in (line := live.stdout.readline()):
         assert line, live.communicate()
 
 
 @pytest.mark.parametrize("reach", ["SUBNET", "LOCALHOST"])
 def test_interrupted_it_says_what_it_has(
-    network: Any, domain: int, monkeypatch: pytest.MonkeyPatch, reach: str
+    network: Any, domain: int, twin_bag: Path, monkeypatch: pytest.MonkeyPatch, reach: str
 ) -> None:
     """Exit code 3: not seen to the end. Without any network too. It uses no shared memory, so it leaves none."""
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", reach)
-    bag = network.directory / "bag"
-    write_trajectory(simulate(network.experiment()), bag)
-    live, play = network.start("live"), network.start("play", bag, "--rate", "0.5", "--await", "live")
+    live, play = network.start("live"), network.start("play", twin_bag, "--rate", "0.5", "--await", "live")
     alone = network.start("live", "--domain", "231")
     wait_for_steps(live)
     assert "/dev/shm/fastrtps_" not in Path(f"/proc/{live.pid}/maps").read_text()
@@ -235,7 +222,6 @@ def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyP
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         script = PICTURES.replace("{LAST}", str(STEPS))
         listener = subprocess.Popen([sys.executable, "-P", "-c", script], stdout=subprocess.PIPE, text=True)
-        assert listener.stdout
         assert listener.stdout.readline() == "ready\n"
         markers = network.start("markers", "--replica", "2", "--frame", "lab")
         assert "waiting for one" in markers.stderr.readline()
@@ -269,12 +255,10 @@ def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyP
     assert [marker["text"] for marker in by_space(pictures[-1], "names")] == list("12345")
 
 
-def test_no_such_replica(network: Any) -> None:
+def test_no_such_replica(network: Any, twin_bag: Path) -> None:
     """Said once the experiment is known, which a bag that is being played keeps there."""
-    bag = network.directory / "bag"
-    write_trajectory(simulate(network.experiment()), bag)
     with free_domain() as domain:
-        play = network.start("play", bag, "--rate", "0.1", "--domain", str(domain))
+        play = network.start("play", twin_bag, "--rate", "0.1", "--domain", str(domain))
         markers = network.start("markers", "--replica", "3", "--domain", str(domain))
         assert "--replica: 3: expected a number from 1 to 2" in network.ended(markers, 2)[1]
         play.terminate()

@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """A network of processes does, to the last bit, what the law and the seed say."""
-
-from __future__ import annotations
 
 import json
 from typing import Any
@@ -65,7 +60,6 @@ def test_equals_the_twin(network: Any, case: str, processes: Any) -> None:
 
 def equals_the_twin(what: Experiment, trajectory: Run | None) -> None:
     """300 steps: more than the window of the lockstep and more than one block of noise."""
-    assert trajectory is not None
     assert_equal_to_twin(trajectory)
     assert trajectory.completeness.expected == 5 * 301
     assert trajectory.completeness.out_of_order == 0
@@ -93,7 +87,6 @@ def test_a_chain_that_jumps_in_nearly_every_step(network: Any, processes: int) -
             run={"dt": 1, "duration": 2500, "start": "zero", "processes": processes},
         )
     )
-    assert result.trajectory is not None
     assert_equal_to_twin(result.trajectory)
 
 
@@ -162,7 +155,6 @@ def test_equals_the_twin_and_the_prediction(network: Any, noise: dict[str, float
     what = network.experiment(noise=noise, run={"duration": 20, "replicas": 16, "processes": 2})
     result = network.run(what)
     trajectory, twin = result.trajectory, simulate(what)
-    assert trajectory is not None
     assert trajectory.completeness == twin.completeness
     assert trajectory.completeness.expected == 5 * 401 * (2 if noise["broadcast"] else 1)
     assert_equal_to_twin(trajectory)

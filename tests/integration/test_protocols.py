@@ -1,7 +1,5 @@
 """Networks whose agents follow protocols of another package: complete, equal to the twin, judged as far as can be."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from other_package import install
 
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.experiment.experiment import Experiment
@@ -21,7 +20,7 @@ LEAVING = """
 import ctypes
 from msg_analysis.protocol import Protocol
 
-class Broken(Protocol):
+class Law(Protocol):
     def step(self, k, mode, state, heard, noise):
         if k == 17 and self.agent == 2:
             ctypes.CDLL(None)._exit(0)  # os._exit would be an error of the protocol
@@ -33,7 +32,7 @@ import threading
 from pathlib import Path
 from msg_analysis.protocol import Protocol
 
-class Broken(Protocol):
+class Law(Protocol):
     def step(self, k, mode, state, heard, noise):
         mark = Path(os.environ["MSG_AGENTS_HANGING"])
         if k == 1000 and self.agent == 2 and not mark.exists():
@@ -46,7 +45,7 @@ class Broken(Protocol):
 BROKEN = """
 from msg_analysis.protocol import Protocol
 
-class Broken(Protocol):
+class Law(Protocol):
     def step(self, k, mode, state, heard, noise):
         return state / (k < 17 or self.agent != 2 or int(0) / 0)
 """
@@ -86,35 +85,22 @@ def test_noise_and_loss_and_killed_agents(network: Any) -> None:
     assert check(trajectory).difference is None
 
 
-def _install(network: Any, code: str) -> Path:
-    """A package with a protocol named "broken"; where it is."""
-    packages: Path = network.directory / "packages"
-    info = packages / "broken_package-0.3.dist-info"
-    info.mkdir(parents=True)
-    (packages / "broken_module.py").write_text(code)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken_package\nVersion: 0.3\n")
-    (info / "entry_points.txt").write_text("[msg_agents.protocols]\nbroken = broken_module:Broken\n")
-    return packages
-
-
 def test_a_protocol_that_ends_its_process(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the exit code of success: the others do not wait for its agents for ever."""
-    packages = _install(network, LEAVING)
-    file = network.file(protocol={"name": "broken"}, run={"duration": 60, "start": "zero", "processes": 2})
-    monkeypatch.setenv("PYTHONPATH", str(packages))
-    process = network.record(file)
-    _, stderr = network.ended(process, 3)
+    broken = install("broken", LEAVING, network.directory, monkeypatch)
+    file = network.file(protocol=broken, run={"duration": 60, "start": "zero", "processes": 2})
+    _, stderr = network.ended(network.record(file), 3)
     assert "failed: agents_3_to_5: exit code 0 before its last step" in stderr
 
 
 @pytest.mark.parametrize("restarts", [3, 0])
 def test_a_protocol_that_hangs(network: Any, monkeypatch: pytest.MonkeyPatch, restarts: int) -> None:
     """Once: its process is ended and comes back. Without restarts the run ends. Nobody waits for ever."""
-    packages = _install(network, HANGING)
-    monkeypatch.syspath_prepend(packages)
-    what = network.experiment(protocol={"name": "broken"}, run={"duration": 60, "start": "zero", "processes": 2})
-    environment = {"PYTHONPATH": str(packages), "MSG_AGENTS_HANGING": str(network.directory / "mark")}
-    result = network.run(what, restarts=restarts, environment=environment, hung_timeout=3.0, fails=not restarts)
+    broken = install("broken", HANGING, network.directory, monkeypatch)
+    monkeypatch.syspath_prepend(network.directory / "packages")
+    monkeypatch.setenv("MSG_AGENTS_HANGING", str(network.directory / "mark"))
+    what = network.experiment(protocol=broken, run={"duration": 60, "start": "zero", "processes": 2})
+    result = network.run(what, restarts=restarts, hung_timeout=3.0, fails=not restarts)
     words = "agents_3_to_5: hung, its main thread has not run for 3 s (stacks in log/agents_3_to_5.log)"
     assert [line.startswith(words) for line in result.restarts] == ([True] if restarts else [])
     assert (words in result.failures) == (not restarts)
@@ -125,12 +111,9 @@ def test_a_protocol_that_hangs(network: Any, monkeypatch: pytest.MonkeyPatch, re
 
 def test_a_protocol_that_fails(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Said in a line with protocol, package, agent and step; in full in the log."""
-    packages = _install(network, BROKEN)
-    run = {"duration": 60, "start": "zero", "processes": 2}
-    file = network.file(protocol={"name": "broken"}, run=run)
-    monkeypatch.setenv("PYTHONPATH", str(packages))
-    process = network.record(file)
-    _, stderr = network.ended(process, 3)
+    broken = install("broken", BROKEN, network.directory, monkeypatch)
+    file = network.file(protocol=broken, run={"duration": 60, "start": "zero", "processes": 2})
+    _, stderr = network.ended(network.record(file), 3)
     wanted = "protocol broken (broken_package 0.3), agent 3, step 17: ZeroDivisionError: division by zero"
     assert f"failed: agents_3_to_5: exit code 2: error: {wanted}" in stderr
     assert "last recorded step: agent 1: " in stderr

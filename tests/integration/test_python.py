@@ -1,7 +1,5 @@
 """The test of docs/python.md, several runs in one program, and `play --json`."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

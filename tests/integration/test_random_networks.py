@@ -1,7 +1,5 @@
 """Random networks with random faults: equal to their twins. One whose checkpoint is made wrong is found."""
 
-from __future__ import annotations
-
 import re
 import signal
 from pathlib import Path

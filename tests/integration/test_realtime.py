@@ -4,8 +4,6 @@ What depends on timing is not asserted; what the log says of it must be possible
 makes of it, to the last bit.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random

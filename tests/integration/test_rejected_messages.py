@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """Other publishers on the topics of a run: their messages are refused, counted, and have no effect on the result."""
-
-from __future__ import annotations
 
 import dataclasses
 import html
@@ -198,9 +193,9 @@ time.sleep(600)
 
 def test_a_foreign_node_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:
     """Everything that cannot be, in any order, sent to a run that is under way; the foreign node is killed at last."""
-    # 25,000 steps: in time, the last one is more than 6,000 ahead, and the recorder refuses it as impossible.
+    # 20,000 steps: in time, the last one is more than 6,000 ahead, and the recorder refuses it as impossible.
     graphs = {"line": {"path": [1, 2, 3, 4]}, "ring": {"cycle": [1, 2, 3, 4]}}
-    file = network.file(graphs=graphs, run={"duration": 1250, "processes": 2})
+    file = network.file(graphs=graphs, run={"duration": 1000, "processes": 2})
     with free_domain() as domain:
         options = ("--out", network.directory / "runs", "--domain", str(domain), "--await", "foreign", "--json")
         run = network.start("run", file, *options)
@@ -212,8 +207,7 @@ def test_a_foreign_node_in_the_middle(network: Any, repetition: int, rng: random
             text=True,
         )
         try:
-            assert foreign.stdout is not None
-            assert int(foreign.stdout.readline()) < 17_000  # it was in time
+            assert int(foreign.stdout.readline()) < 13_500  # it was in time
             result = network.completed(run)
         finally:
             foreign.kill()

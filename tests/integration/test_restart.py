@@ -1,7 +1,5 @@
 """Killed agents and switchers are started again, rejoin, and change nothing. That is the default."""
 
-from __future__ import annotations
-
 import html
 import random
 import re
@@ -12,13 +10,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+import pytest
+from other_package import SLOW, install
+
 from msg_agents.discovery.rtps import free_domain
 from msg_agents.environment import node_environment
 from msg_agents.run.result import read_steps
 from msg_agents.run.supervisor import STEPS
 
 FAULTS = [["agent"], ["agent"] * 3, ["switcher"], ["agent", "switcher"]]
-RUN = {"duration": 1000, "replicas": 16, "processes": 3}  # long enough to be killed in the middle, of each fault
+RUN = {"duration": 250, "start": "zero", "processes": 3}  # 20 s, in the middle of which each fault happens
 KILLED = r"(agents?_\w+|switcher): killed by SIGKILL.*, started again$"
 LISTENER = """
 import os, signal, struct, sys, rclpy
@@ -59,13 +60,16 @@ def wait_for_more(network: Any, steps: Path, more: int) -> None:
     network.wait_for(lambda: min(read_steps(steps), default=0) > reached + more, 60, "steps of all")
 
 
-def test_killed_and_back(network: Any, repetition: int, rng: random.Random) -> None:
+@pytest.mark.timeout(300)
+def test_killed_and_back(network: Any, repetition: int, rng: random.Random, monkeypatch: pytest.MonkeyPatch) -> None:
     """At any moment from the birth of the processes on: all of a fault at once, or also who has just come back.
 
     The faults happen in any order, each when all are back from the one before it. The fork server is killed at last:
     what it has forked goes on; an agent is started without it.
     """
-    file, kills = network.file(run=RUN), sum(map(len, FAULTS)) + 1
+    protocol = install("slow", SLOW, network.directory, monkeypatch)
+    monkeypatch.syspath_prepend(network.directory / "packages")
+    file, kills = network.file(protocol=protocol, run=RUN), sum(map(len, FAULTS)) + 1
     run = network.start("run", file, "--out", network.directory / "runs", "--json", "--restarts", str(kills))
     wait_for_all(network)
     steps = network.run_file().with_name(STEPS)
@@ -73,7 +77,7 @@ def test_killed_and_back(network: Any, repetition: int, rng: random.Random) -> N
         early, again = number == 0 and repetition > 0 and rng.random() < 0.3, rng.random() < 0.5
         if early:
             time.sleep(rng.uniform(0.0, 0.3))
-        else:  # of 20,000, however fast they come
+        else:
             wait_for_more(network, steps, rng.randrange(50, 400))
         for kill, kind in enumerate(kinds):
             if again and kill:
@@ -142,7 +146,6 @@ def test_who_comes_back_repeats_only_what_peers_may_lack(network: Any) -> None:
             wait_for_more(network, steps, 300)
             result = network.completed(run)
             listener.terminate()
-            assert listener.stdout is not None
             newest, repeated = map(int, listener.stdout.read().split())
     assert len(result["restarts"]) == 2
     assert newest > 0

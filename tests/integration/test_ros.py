@@ -1,7 +1,5 @@
 """The nodes as ROS 2 users start them: parameters, namespaces, remapping, launch; a node that knows nothing of ours."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

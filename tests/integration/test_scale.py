@@ -1,7 +1,5 @@
 """Large networks: many processes, and many agents in a few."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """Sweeps on a real cluster whose worker is killed, and of real networks."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

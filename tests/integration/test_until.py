@@ -1,7 +1,5 @@
 """Runs that end before their duration, in order: each is complete, equal to its twin, and says how it ended."""
 
-from __future__ import annotations
-
 import json
 import math
 import random
@@ -46,7 +44,6 @@ def ended(result: dict[str, Any], planned: int = PLANNED) -> int:
 
 def complete(result: RunResult) -> None:
     """The run of a test in this process is complete, and equal to its twin."""
-    assert result.trajectory is not None
     assert_equal_to_twin(result.trajectory)
 
 

@@ -1,7 +1,5 @@
 """What people see of a running network: the panel on a terminal, lines elsewhere, the page in a browser."""
 
-from __future__ import annotations
-
 import json
 import re
 import signal
@@ -17,19 +15,6 @@ from terminal import Terminal
 
 PAGE = re.compile(r"live page at (http://127\.0\.0\.1:\d+/)")
 HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
-
-
-@pytest.fixture
-def terminal(network: Any) -> Iterator[Any]:
-    opened: list[Terminal] = []
-
-    def start(*command: str | Path, **options: Any) -> Terminal:
-        opened.append(Terminal(*command, **options))
-        return opened[-1]
-
-    yield start
-    for each in opened:
-        each.close()
 
 
 def _long(network: Any, **run: Any) -> Path:
@@ -74,7 +59,6 @@ def page(browser: Any) -> Iterator[Any]:
 
 
 def _address(process: subprocess.Popen[str]) -> str:
-    assert process.stderr is not None
     for line in process.stderr:
         if found := PAGE.search(line):
             return found[1]

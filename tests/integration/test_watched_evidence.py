@@ -1,7 +1,5 @@
 """Evidence while a real network runs: that of the comparison, for all laws; a wrong network is ended and named."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

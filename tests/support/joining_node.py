@@ -30,8 +30,6 @@ def watched_endpoints(readers: Endpoints, writers: Endpoints, domain: int) -> It
                 command, env=node_environment(domain), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
             )
         )
-        assert joining.stdout is not None
-        assert joining.stderr is not None
         assert joining.stdout.readline() == "ready\n"
         yield
         found = json.loads(joining.stdout.readline())

@@ -32,9 +32,9 @@ FORKING.set_forkserver_preload(
         *PROGRAMS.values(),
         *MODULES,
         *("msg_agents.nodes.live", "msg_agents.nodes.markers", "msg_agents.nodes.player", "msg_agents.run.runner"),
-        *("msg_analysis.report.documents", "msg_analysis.report.page", "msg_analysis.report.tables"),
-        *("msg_analysis.report.theory_text", "msg_analysis.sweeps.results"),
-        *("networkx", "rich._emoji_codes", "rich.progress", "scipy.stats", "threadpoolctl"),
+        *("msg_agents.watch.panel", "msg_analysis.inference.pool", "msg_analysis.report.documents"),
+        *("msg_analysis.report.page", "msg_analysis.report.tables", "msg_analysis.report.theory_text"),
+        *("networkx", "rich._emoji_codes", "rich.progress"),
     ]
 )
 ensure_running = forkserver.ensure_running

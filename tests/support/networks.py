@@ -1,13 +1,9 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """The experiments of the tests of networks: agents on a line and a ring, and run records of them."""
-
-from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import experiments
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run import Run
 from msg_analysis.twin.check import check
@@ -16,17 +12,8 @@ from msg_analysis.twin.simulate import new_record
 
 def document(agents: int = 5, /, **changes: Any) -> dict[str, Any]:
     """300 steps; ``run`` is merged, other keys are replaced."""
-    run = {"dt": 0.05, "duration": 15, "replicas": 2, "seed": 7} | changes.pop("run", {})
-    numbers = list(range(1, agents + 1))
-    return {
-        "name": "net",
-        "problem": "consensus",
-        "time": "continuous",
-        "graphs": {"line": {"path": numbers}, "ring": {"cycle": numbers}},
-        "switching": {"generator": [[-1, 1], [1, -1]]},
-        **changes,
-        "run": run,
-    }
+    run = {"duration": 15, "seed": 7} | changes.pop("run", {})
+    return experiments.document(agents, **changes, run=run)
 
 
 def experiment(agents: int = 5, /, **changes: Any) -> Experiment:

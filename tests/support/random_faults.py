@@ -1,7 +1,5 @@
 """Random faults for the networks of ``random_networks``: killed and stopped processes, and what the run may do then."""
 
-from __future__ import annotations
-
 import random
 import re
 import signal

@@ -1,7 +1,5 @@
 """Random experiments: valid, of every kind that runs in lockstep, and the same for a seed on every machine."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Sequence
 from decimal import Decimal

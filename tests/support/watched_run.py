@@ -32,7 +32,6 @@ def watch(
         elif kind in ("state", "truth"):
             published = kind == "state" and experiment.truth
             found = (said if published else whole).unwrap(data)
-            assert found is not None
             if not published or live.needs_published:
                 states.append((found[1] + disorder * rng.random(), found, data, published))
     for number, (_, found, data, published) in enumerate(sorted(states, key=lambda state: state[0])):
