@@ -103,7 +103,7 @@ def write(text: str, page: Path, marks: str) -> None:
 
 def main() -> None:
     """Run everything, print the tables, and write them where wanted."""
-    parser = argparse.ArgumentParser(description="Coverage, false alarms, power and blame of the comparison.")
+    parser = argparse.ArgumentParser(description="Coverage, false alarms, power and causes of the comparison.")
     parser.add_argument("--runs", type=int, default=1000, help="of each law that is right; 1000 by default")
     parser.add_argument("--wrong-runs", type=int, default=100, help="of each law that is wrong; 100 by default")
     parser.add_argument("--any-time-runs", type=int, default=2000, help="watched all the time; 2000 by default")

@@ -79,7 +79,7 @@ def line_pairs(
 
 
 def short(duration: float) -> dict[str, Mapping[str, Any]]:
-    """Laws under which a few sojourns, or the start, decide the errors of a short run."""
+    """Laws under which a few holding periods, or the start, decide the errors of a short run."""
     leader: dict[str, Any] = {"problem": "tracking", "leaders": {"agents": [1], "gain": 1.0}}
     three: dict[str, Any] = {"graphs": {"line": {"path": [1, 2, 3]}, "pair": {"edges": [[1, 2]]}}, "agents": 3}
     return {

@@ -97,7 +97,7 @@ def message_tables(results: Mapping[str, list[dict[str, Any]]]) -> str:
 
 
 def complaints(results: Mapping[str, list[dict[str, Any]]]) -> list[str]:
-    """What is not as it must be: coverage 93.5 to 96.5 %, false alarms at most 1.9 %, 80 % of the blame right.
+    """What is not as it must be: coverage 93.5 to 96.5 %, false alarms at most 1.9 %, 80 % of the cause right.
 
     With noise and losses, of which there are fewer runs: coverage 93 to 97 %, false alarms 0.3 to 2 %.
 
@@ -127,5 +127,5 @@ def complaints(results: Mapping[str, list[dict[str, Any]]]) -> list[str]:
     for case in FALSE.keys() & results.keys():
         rejected = [one for one in results[case] if one["disagrees"]]
         if rejected and np.mean([one["right"] for one in rejected]) < 0.8:
-            found.append(f"{case}: blame right in {100 * np.mean([one['right'] for one in rejected]):.0f} %")
+            found.append(f"{case}: cause right in {100 * np.mean([one['right'] for one in rejected]):.0f} %")
     return found

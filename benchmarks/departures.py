@@ -1,4 +1,4 @@
-"""What is found of faults that sums over a whole run hide: standing still, noise over time, sojourns, stale values.
+"""What is found of faults that sums over a run hide: constant states, noise over time, holding periods, stale values.
 
 Simulates line/ring (``calibration_laws.line_ring``: 400 units, dt = 0.1, 16 replicas) step by step with one thing
 wrong, and compares each run with the prediction without it. Runs without a fault say how often "disagrees" is a false
@@ -75,8 +75,8 @@ def _correlated(lag: int, share: float, ways: Ways, random: Random) -> None:
         ways.noise[k] = share * before + (1.0 - share**2) ** 0.5 * fresh[k]
 
 
-def _sojourns(shape: float, ways: Ways, random: Random) -> None:
-    """Gamma sojourns of the same mean as those of the chain, 21 steps, rounded up."""
+def _holding_periods(shape: float, ways: Ways, random: Random) -> None:
+    """Gamma holding periods of the same mean as those of the chain, 21 steps, rounded up."""
     leaving = (1.0 - np.exp(-0.1)) / 2.0
     lengths = np.ceil(random.gamma(shape, (1.0 / leaving - 0.5) / shape, len(ways.graphs))).astype(int)
     ways.graphs[:] = np.repeat(np.arange(len(lengths)) % 2, lengths)[: len(ways.graphs)]
@@ -102,9 +102,9 @@ FAULTS: dict[str, tuple[Fault, str]] = {  # and the kind of the cause
     "noise variance 1.1 in one graph, 0.9 in the other": (_by_graph, "noise"),
     "correlation 0.05 of each agent's noise at lag 20": (partial(_correlated, 20, 0.05), "lag"),
     "correlation 0.02 at lag 20": (partial(_correlated, 20, 0.02), "lag"),
-    "gamma sojourns of shape 2": (partial(_sojourns, 2.0), "sojourns"),
-    "gamma sojourns of shape 10": (partial(_sojourns, 10.0), "sojourns"),
-    "gamma sojourns of shape 0.5": (partial(_sojourns, 0.5), "sojourns"),
+    "gamma holding periods of shape 2": (partial(_holding_periods, 2.0), "holding times"),
+    "gamma holding periods of shape 10": (partial(_holding_periods, 10.0), "holding times"),
+    "gamma holding periods of shape 0.5": (partial(_holding_periods, 0.5), "holding times"),
     "one innovation of 8 standard deviations": (partial(_outlier, 8.0), "outlier"),
     "stale values in one message of five": (partial(_stale, 0.2), "stale"),
     "stale values in one message of ten": (partial(_stale, 0.1), "stale"),

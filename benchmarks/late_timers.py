@@ -74,7 +74,7 @@ def run(
     senders = [[model.neighbours(g, i).tolist() for i in range(m)] for g in range(model.modes)]
 
     switches = [0, *np.flatnonzero(np.diff(modes) != 0) + 1]
-    # What agent i has of agent j, and the newest sojourn that it has.
+    # What agent i has of agent j, and the newest holding period that it has.
     has = [[-1] * m for _ in range(m)]
     graph = [int(modes[0])] * m
     newest_switch, done = [0] * m, [0] * m

@@ -44,7 +44,7 @@ from msg_analysis.twin.simulate import new_record
 
 POINTS = 5
 AGENTS, STEPS_IN_AN_HOUR = 1000, 210_000  # at 58 steps a second, docs/performance.md
-TOGETHER = 25  # sojourns after which made-up agents tell their steps
+TOGETHER = 25  # holding periods after which made-up agents tell their steps
 
 
 def ring(agents: int, steps: int, *, noise: dict[str, Any] | None = None, **run: Any) -> dict[str, Any]:
@@ -142,7 +142,7 @@ class MadeUpAgents(NetworkNode):
 
     def __init__(self, record: RunRecord) -> None:
         super().__init__(agent_node_name(0), record=record)
-        self.reached, self._sojourns = 0, 0
+        self.reached, self._holding_periods = 0, 0
         self._progress = self.publisher_of(PROGRESS)
         self.subscribe(GRAPH, self._receive)
         self.finish_at_end()
@@ -153,9 +153,9 @@ class MadeUpAgents(NetworkNode):
 
     def _receive(self, data: bytes) -> None:
         graph = self.accepted(self.rules.graph(data), GRAPH)
-        self._sojourns += 1
+        self._holding_periods += 1
         last = self.record.experiment.steps
-        if graph and (self._sojourns % TOGETHER == 0 or graph.last_step == last - 1):
+        if graph and (self._holding_periods % TOGETHER == 0 or graph.last_step == last - 1):
             self._tell(graph.last_step + 1)
 
     def _tell(self, step: int) -> None:

@@ -1,9 +1,9 @@
-"""Which errors to trust: coverage over all paths and given the path, in runs with few sojourns or heavy tails.
+"""Which errors to trust: coverage over all paths and given the path, in runs with few holding periods or heavy tails.
 
     python benchmarks/trust.py
 
-Few sojourns: 400 units, 16 replicas, with ever slower switching. Heavy tails: laws with infinite fourth moments, 2,000
-steps, one replica, twice as many runs. Every run of a law has its own seed.
+Few holding periods: 400 units, 16 replicas, with ever slower switching. Heavy tails: laws with infinite fourth moments,
+2,000 steps, one replica, twice as many runs. Every run of a law has its own seed.
 """
 
 from __future__ import annotations

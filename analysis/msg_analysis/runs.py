@@ -23,6 +23,7 @@ from msg_analysis.common.text import HALF_WIDTH_95, agent_name, with_names
 from msg_analysis.errors import BagError, InputError
 
 _WANTED = "expected what `msg-analysis compare --json` or `msg-agents run` wrote"
+_RENAMED = {"blame": "causes", "strangers": "rejected_messages"}  # keys of results of before
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +44,7 @@ class Result:
     predicted: float | None
     z: float | None
     least_p: float | None  # least adjusted p of the tests
-    blame: str  # causes, separated by "; "; empty where nothing is wrong
+    causes: str  # causes, separated by "; "; empty where nothing is wrong
     identity: str | None  # equal for runs of the same law
 
 
@@ -63,7 +64,7 @@ def read_document(path: Path) -> dict[str, Any]:
         raise InputError(f"{file}: not JSON ({error}): {_WANTED}") from error
     if not isinstance(document, dict):
         raise InputError(f"{file}: not a JSON object: {_WANTED}")
-    return document
+    return {_RENAMED.get(key) or key: value for key, value in document.items()}
 
 
 def _file(path: Path) -> Path:
@@ -82,7 +83,7 @@ def result_row(path: Path, document: dict[str, Any]) -> Result:
     tests = [_number(test, "p_adjusted", file) for test in _parts(document, "tests", file)]
     given = document.get("names")
     names = list(map(str, given)) if isinstance(given, list) else None
-    blame = [with_names(str(cause.get("words")), names) for cause in _parts(document, "blame", file)]
+    causes = [with_names(str(cause.get("words")), names) for cause in _parts(document, "causes", file)]
     leaders = document["leaders"] if isinstance(document.get("leaders"), list) else ()
     identity = document.get("experiment_identity")
     return Result(
@@ -102,7 +103,7 @@ def result_row(path: Path, document: dict[str, Any]) -> Result:
         predicted=_number(total, "predicted", file),
         z=_number(total, "z", file),
         least_p=min((p for p in tests if p is not None), default=None),
-        blame="; ".join(blame),
+        causes="; ".join(causes),
         identity=identity if isinstance(identity, str) else None,
     )
 

@@ -49,8 +49,8 @@ class CycloneAgent:
         self._peers = [int(j) for j in np.flatnonzero(hears | heard_by) if j != self._me]
         self._states: dict[int, dict[int, bytes]] = {j: {} for j in self._peers}  # by agent and step
         self._newest = dict.fromkeys(self._peers, -1)
-        self._graphs: deque[tuple[int, int]] = deque()  # mode and last step of the sojourns to come
-        self._next_sojourn = 0
+        self._graphs: deque[tuple[int, int]] = deque()  # mode and last step of the holding periods to come
+        self._next_holding = 0
         self._sent: deque[tuple[int, bytes]] = deque(maxlen=KEPT)  # step and mode of what can be asked for again
         self._reported, self._reported_at = -1, float("-inf")
         self._ended = False
@@ -94,8 +94,8 @@ class CycloneAgent:
     def _take_all(self) -> None:
         readers = self._node.readers
         for graph in self._valid(readers["graph"]):
-            if graph.sequence == self._next_sojourn:
-                self._next_sojourn += 1
+            if graph.sequence == self._next_holding:
+                self._next_holding += 1
                 self._graphs.append((graph.mode - 1, graph.last_step))
         for j in self._peers:
             for state in self._valid(readers[state_topic(j + 1)]):

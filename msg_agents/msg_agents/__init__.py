@@ -38,7 +38,7 @@ def run_network(experiment: str | Path | Experiment, out: str | Path = "runs", *
     -------
     Run
         as ``read_bag`` gives it; ``run.network`` has what only the network knows: ``bag``, ``restarts``, ``failures``,
-        ``wall_time``, ``rate``, ``strangers`` and more. A process that failed leaves states that are missing
+        ``wall_time``, ``rate``, ``rejected_messages`` and more. A process that failed leaves states that are missing
 
     Raises
     ------

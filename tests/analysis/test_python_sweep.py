@@ -45,8 +45,8 @@ def test_runs_are_those_of_the_command(experiment: Experiment, tmp_path: Path) -
     result = CliRunner().invoke(main, ["sweep", str(file), "--out", str(tmp_path / "out"), "--workers", "1", "--json"])
     rows = json.loads(result.stdout)["points"]
     for mine, theirs in zip(found.rows, rows, strict=True):
-        assert {key: mine[key] for key in ("seed", "p_holm", "system_error.measured", "verdict")} == {
-            key: theirs[key] for key in ("seed", "p_holm", "system_error.measured", "verdict")
+        assert {key: mine[key] for key in ("seed", "p_adjusted", "system_error.measured", "verdict")} == {
+            key: theirs[key] for key in ("seed", "p_adjusted", "system_error.measured", "verdict")
         }
     assert found.judgement.verdict == "agrees"
 

@@ -1,4 +1,4 @@
-"""Names in files of strangers cannot give orders to the terminal: no command prints their control characters."""
+"""Names in foreign files cannot give orders to the terminal: no command prints their control characters."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ def _rosbags(result: RunResult) -> None:
     assert np.array_equal(states, twin.states)
     assert np.array_equal(modes, twin.modes)
     assert [experiment["run"] for experiment in experiments] == [str(result.trajectory.record.run)]
-    # A sojourn too short for any step to see is left out: two of the same graph may follow each other.
+    # A holding period too short for any step to see is left out: two of the same graph may follow each other.
     assert len(sequences) >= 1 + int((np.diff(twin.modes) != 0).sum())
     assert sequences == list(range(len(sequences)))
     expected = {f"/agent_{i}/state": STEPS + 1 for i in range(1, AGENTS + 1)}

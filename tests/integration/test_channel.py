@@ -177,7 +177,7 @@ def test_a_killed_agent_comes_back_on_its_host(network: Any, hosts: set[int]) ->
 
 @pytest.mark.parametrize("pace", ["lockstep", "realtime"])
 def test_a_killed_agent_finds_those_to_which_the_graph_cuts_its_link(network: Any, pace: str) -> None:
-    """Agent 1 hears one of the others in each graph; sojourns are longer than the window of the lockstep."""
+    """Agent 1 hears one of the others in each graph; holding periods are longer than the window of the lockstep."""
     graphs = {"first": {"path": [1, 2, 3]}, "second": {"path": [2, 3, 1]}}
     rare = {"generator": [[-0.2, 0.2], [0.2, -0.2]]}
     changes = {"graphs": graphs, "switching": rare, "run": {"duration": 10, "pace": pace}}

@@ -78,7 +78,7 @@ def test_readers_that_were_there_first_get_everything(network: Any) -> None:
         }
         result = network.run(what, domain=domain, readers=list(readers))
         came_to = {name: came(reader) for name, reader in readers.items()}
-    assert result.strangers == []
+    assert result.rejected_messages == []
     assert_equal_to_twin(result.trajectory)
     asked = any("no step for" in log.read_text() for log in (result.bag / "log").iterdir())
     for found in came_to.values():
@@ -94,7 +94,7 @@ def test_readers_that_were_there_first_get_everything(network: Any) -> None:
 
 
 def test_a_reader_comes_late_and_another_one_is_killed(network: Any) -> None:
-    """The late one gets every sojourn from the first one on, in the middle of a run, which the first reader holds back.
+    """The late one gets every holding period from the first on, in the middle of a run that the first one holds back.
 
     Then that one is killed: the writers keep what it has not read until its lease ends, and the run goes on.
     """
@@ -122,7 +122,7 @@ def test_a_foreign_node_is_refused(network: Any) -> None:
         result = network.run(what, domain=domain, readers=["cyclone_reader"])
         came(reader)
     assert_equal_to_twin(result.trajectory)
-    refused = {(entry["topic"].lstrip("/"), entry["reason"]) for entry in result.strangers}
+    refused = {(entry["topic"].lstrip("/"), entry["reason"]) for entry in result.rejected_messages}
     assert {topic for topic, _ in refused} >= {"graph", "end", "progress", "agent_1/state"}
 
 

@@ -94,9 +94,9 @@ def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
     assert result["restarts"] == []
     left = {"node": "switcher", "reason": "duplicate node name", "count": 1}
     names_taken = [left | {"topic": f"agent_{agent}"} for agent in doubles]
-    assert all(entry in result["strangers"] for entry in names_taken)
+    assert all(entry in result["rejected_messages"] for entry in names_taken)
     # On a busy machine that of the other run may have begun before it finds its name taken.
-    assert all(entry["reason"] == "other run" for entry in result["strangers"] if entry not in names_taken)
+    assert all(entry["reason"] == "other run" for entry in result["rejected_messages"] if entry not in names_taken)
     ((step, words),) = complaint
     assert words in (f"step {step} of agent 2", "too far behind: agent 2")
     assert reports.read_text().splitlines().count(f"1 {step}") >= 3  # it goes on saying where it stands

@@ -91,6 +91,6 @@ def test_play_json(tmp_path: Path) -> None:
         process = subprocess.run([BIN / "msg-agents", *words], capture_output=True, text=True, timeout=60)
     assert process.returncode == 0, process.stderr
     document = json.loads(process.stdout)
-    assert document["messages"] == 2 * 11 + 2  # states, one sojourn, the experiment
+    assert document["messages"] == 2 * 11 + 2  # states, one holding period, the experiment
     assert document.keys() == {"messages", "seconds", "held_back"}
     assert "24 messages played" in process.stderr

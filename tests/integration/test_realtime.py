@@ -114,7 +114,7 @@ def test_sojourns_of_one_step(network: Any) -> None:
     """
     fast = {"switching": {"generator": [[-20.0, 20.0], [20.0, -20.0]]}}
     result = network.run(network.experiment(**fast, run={**UNDISTURBED, "speed": 10, "duration": 20, "processes": 2}))
-    assert result.strangers == []
+    assert result.rejected_messages == []
     assert_possible(result.trajectory)
     assert compare(result.trajectory, level=1e-4).verdict == "agrees"
     changes = np.diff(result.trajectory.agent_modes[1:], axis=0) != 0

@@ -21,7 +21,7 @@ from msg_agents.environment import node_environment
 from msg_analysis.inference.pool import compare
 from msg_analysis.messages.cdr import encode_batch
 from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, encode_string
-from msg_analysis.model.graph_path import sojourns
+from msg_analysis.model.graph_path import holding_periods
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import first_graph
 from msg_analysis.twin.simulate import new_record
@@ -213,7 +213,7 @@ def test_a_foreign_node_in_the_middle(network: Any, repetition: int, rng: random
             foreign.kill()
             foreign.wait()
             foreign.stdout.close()
-    refused = {(entry["topic"].lstrip("/"), entry["reason"]): entry for entry in result["strangers"]}
+    refused = {(entry["topic"].lstrip("/"), entry["reason"]): entry for entry in result["rejected_messages"]}
     for reason in (
         "other run",
         "unknown agent",
@@ -228,7 +228,7 @@ def test_a_foreign_node_in_the_middle(network: Any, repetition: int, rng: random
     for topic in ("graph", "progress", "end"):
         assert refused[topic, "other run"]["count"] > 0
     report = html.unescape(Path(result["report"]).read_text())
-    assert all(f"<td>{entry['reason']}</td>" in report for entry in result["strangers"])
+    assert all(f"<td>{entry['reason']}</td>" in report for entry in result["rejected_messages"])
 
 
 PACES = {"lockstep": {}, "realtime": {"pace": "realtime", "speed": 5}}
@@ -251,7 +251,7 @@ def steering(record: RunRecord) -> list[Forgery]:
     """A record with other noise, the other graph, the last step of everybody, the end and another epoch."""
     run = record.run.bytes
     noisy = record.experiment.parse(record.experiment.to_document() | {"noise": {"process": 3.0}})
-    first = next(sojourns(record.experiment, first_graph(record.experiment)))
+    first = next(holding_periods(record.experiment, first_graph(record.experiment)))
     other = graph(run, mode=2 - first.mode, name=["ring", "line"][first.mode], last_step=first.last_step)
     forged: list[Forgery] = [
         ("experiment", encode_string(dataclasses.replace(record, experiment=noisy).to_json())),

@@ -169,7 +169,7 @@ def test_a_node_of_your_own(network: Any, domain: int) -> None:
     network.wait_for(lambda: participants(domain), 60, "the watcher has a node")  # later it would wait for ever
     file = network.file(run={"pace": "realtime", "speed": 2.5, "processes": 2})  # 6 s
     result = network.completed(network.record(file, "--domain", str(domain), "--json"))
-    assert result["strangers"] == []
+    assert result["rejected_messages"] == []
     printed, _ = network.ended(watching)
     graphs = re.findall(r"^steps (\d+) to (\d+): (line|ring), (\d+) arcs$", printed, re.M)
     assert (graphs[0][0], graphs[-1][1]) == ("0", "299")

@@ -94,7 +94,7 @@ def test_processes_of_one_agent_that_hear_all_others(network: Any) -> None:
     network.wait_for(lambda: min(read_steps(steps)) > before, 60, "steps of all after that")
     process.send_signal(signal.SIGINT)
     result = network.result(process, 3)
-    assert (len(result["restarts"]), result["strangers"]) == (1, [])
+    assert (len(result["restarts"]), result["rejected_messages"]) == (1, [])
     assert check(read_bag(result["bag"])).difference is None
 
 
@@ -131,4 +131,4 @@ def test_processes_that_hear_most_of_a_network(
     victim = network.processes("agent")[-1]
     back_on(network, victim, kept[victim.agent])
     result = network.completed(process)
-    assert (len(result["restarts"]), result["strangers"]) == (1, [])
+    assert (len(result["restarts"]), result["rejected_messages"]) == (1, [])

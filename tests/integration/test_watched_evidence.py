@@ -83,9 +83,9 @@ def test_a_wrong_network_is_ended(network: Any, law: str, monkeypatch: pytest.Mo
     assert (result["verdict"], result["failures"]) == ("disagrees", [])
     assert result["until"]["ended_early"]
     assert result["until"]["reason"].startswith("evidence against the prediction passed 100 at step ")
-    assert result["any_time"]["disagrees"]
+    assert result["any_time"]["exceeded"]
     assert result["any_time"]["questions"][0]["about"] == "noise of agent 3"
-    cause = result["blame"][0]  # over the whole run, or in a stretch that is clearer
+    cause = result["causes"][0]  # over the whole run, or in a stretch that is clearer
     assert (cause["kind"], cause["agent"]) == ("noise", 3), cause
     assert 1.0 < cause["estimate"] < 2.0, cause
     trajectory = read_bag(result["bag"])

@@ -8,7 +8,7 @@ from typing import Any
 MOST_AGENTS, MOST_GRAPHS = 12, 4
 STATES = (15_000, 45_000)  # of all agents together: a few seconds
 SHARE_OF_LIMIT = (0.05, 0.9)  # dt, relative to a lower bound of the stability limit
-EVENTS_PER_STEP = (-3.0, 0.3)  # exponents of 10: sojourns from a thousand steps down to half of one
+EVENTS_PER_STEP = (-3.0, 0.3)  # exponents of 10: holding periods from a thousand steps down to half of one
 GRAPH_NAMES = ("north", "line_2", "at night", "β")
 
 Document = dict[str, Any]

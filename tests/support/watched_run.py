@@ -28,7 +28,7 @@ def watch(
         kind = topic.rsplit("/", 1)[1]
         if kind == "graph":
             graph = ActiveGraph.decode(data)
-            live.add_sojourn(graph.first_step, graph.last_step, graph.mode - 1)
+            live.add_holding_period(graph.first_step, graph.last_step, graph.mode - 1)
         elif kind in ("state", "truth"):
             published = kind == "state" and experiment.truth
             found = (said if published else whole).unwrap(data)

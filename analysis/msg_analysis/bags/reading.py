@@ -301,18 +301,18 @@ def _end(contents: _Contents, record: RunRecord) -> int | None:
 
 
 def _modes(contents: _Contents, run: bytes, steps: int, planned: int, graphs: int) -> IntArray:
-    """(N,) graph of every step, from 0; -1: no sojourn, or more than one. They may go on up to the planned steps."""
-    sojourns: set[tuple[int, int, int, int]] = set()
+    """(N,) graph of every step, from 0; -1: of no holding period, or two. They may go on up to the planned steps."""
+    holding_periods: set[tuple[int, int, int, int]] = set()
     for graph in contents.graphs.values():
         if graph.run != run:
             contents.refused[Refusal.OTHER_RUN] += 1
         elif not (1 <= graph.mode <= graphs and graph.first_step <= graph.last_step < planned):
             contents.refused[Refusal.GRAPH_OUT_OF_RANGE] += 1
         else:
-            sojourns.add((graph.sequence, graph.mode, graph.first_step, graph.last_step))
+            holding_periods.add((graph.sequence, graph.mode, graph.first_step, graph.last_step))
     modes = np.full(steps, -1, dtype=np.int64)
     claims = np.zeros(steps, dtype=np.int64)
-    for _, mode, first, last in sojourns:
+    for _, mode, first, last in holding_periods:
         modes[first : last + 1] = mode - 1
         claims[first : last + 1] += 1
     modes[claims != 1] = -1

@@ -29,10 +29,10 @@ from msg_analysis.bags.stored_file import DEFAULT_STORAGE, Storage
 from msg_analysis.common.arrays import BLOCK_NUMBERS, IntArray, release
 from msg_analysis.common.files import require_utf8
 from msg_analysis.errors import BagError
-from msg_analysis.messages.acceptance import sojourn_message
+from msg_analysis.messages.acceptance import graph_message
 from msg_analysis.messages.messages import StateCodec, encode_string
 from msg_analysis.messages.topics import EXPERIMENT, GRAPH, STATE, TRUTH, Topic, network_topics
-from msg_analysis.model.graph_path import Sojourn
+from msg_analysis.model.graph_path import HoldingPeriod
 from msg_analysis.model.reception import LOST
 from msg_analysis.model.run import Run
 
@@ -41,7 +41,7 @@ RECORDING_MARKER = ".recording"
 # comes back, are in a later file.
 MOST_OPEN = 3
 AT_ONCE = 4096  # messages
-# Topic, CDR bytes, time [ns], and of a sojourn the time of the first state behind it [ns].
+# Topic, CDR bytes, time [ns], and of a holding period the time of the first state behind it [ns].
 _Message = tuple[str, bytes, int, int | None]
 
 
@@ -282,7 +282,7 @@ def write_trajectory(
 
 
 def _write(bag: BagWriter, names: Sequence[str], messages: Iterator[_Message]) -> None:
-    """Write many messages at once: a fraction of the time of writing each. Sojourns come a little early."""
+    """Write many messages at once: a fraction of the time of writing each. Holding periods come a little early."""
     number = {name: index for index, name in enumerate(names)}
     while part := list(islice(messages, AT_ONCE)):
         for topic, content, stamp, until in part:
@@ -308,8 +308,8 @@ def _messages(trajectory: Run, block_numbers: int) -> Iterator[_Message]:
     names = [[f"/{topic.of(i)}" for i in agents] for topic, _ in streams]
     codecs = [[StateCodec(run, i + 1, states.shape[2], dt) for i in agents] for _, states in streams]
     heard = _heard(trajectory)
-    sojourns = _sojourns(trajectory)
-    sojourn = next(sojourns, None)
+    holding_periods = _holding_periods(trajectory)
+    holding = next(holding_periods, None)
     for steps, of, times in _in_order(trajectory, block_numbers):
         if trajectory.agent_modes is not None:
             graphs = trajectory.agent_modes[steps, of]
@@ -319,17 +319,17 @@ def _messages(trajectory: Run, block_numbers: int) -> Iterator[_Message]:
         there = [np.asarray(~np.isnan(each).any(axis=1)).tolist() for each in values]
         cells = zip(steps.tolist(), of.tolist(), times.tolist(), graphs.tolist(), strict=True)
         for place, (k, i, now, graph) in enumerate(cells):
-            while sojourn is not None and sojourn[2] <= now:
-                yield sojourn
-                sojourn = next(sojourns, None)
+            while holding is not None and holding[2] <= now:
+                yield holding
+                holding = next(holding_periods, None)
             for topics, codec, is_there, value in zip(names, codecs, there, values, strict=True):
                 if is_there[place]:
                     payload = to_payload(value[place])
                     yield topics[i], codec[i].wrap(k, graph + 1, payload, heard(k, i, graph), now), now, None
         trajectory.release()
-    if sojourn is not None:
-        yield sojourn
-        yield from sojourns
+    if holding is not None:
+        yield holding
+        yield from holding_periods
 
 
 def _in_order(trajectory: Run, block_numbers: int) -> Iterator[tuple[IntArray, IntArray, IntArray]]:
@@ -387,7 +387,7 @@ def _heard(trajectory: Run) -> Callable[[int, int, int], list[int]]:
     return listed
 
 
-def _sojourns(trajectory: Run) -> Iterator[_Message]:
+def _holding_periods(trajectory: Run) -> Iterator[_Message]:
     """The stretches of equal graph, without those whose graph is not known."""
     record, modes = trajectory.record, trajectory.modes
     time = StepClock(record.experiment.step_length).nanoseconds
@@ -395,5 +395,5 @@ def _sojourns(trajectory: Run) -> Iterator[_Message]:
     last = np.append(first[1:], len(modes)) - 1
     known = modes[first] >= 0
     for sequence, (start, end) in enumerate(zip(first[known].tolist(), last[known].tolist(), strict=True)):
-        message = sojourn_message(record, Sojourn(sequence, int(modes[start]), start, end))
+        message = graph_message(record, HoldingPeriod(sequence, int(modes[start]), start, end))
         yield f"/{GRAPH.name}", message.encode(), message.stamp, time(end + 1)

@@ -93,7 +93,7 @@ class MarkovChain:
         transition = np.clip(np.asarray(scipy.linalg.expm(self.matrix * dt), dtype=float), 0.0, None)
         return np.asarray(transition / transition.sum(axis=1, keepdims=True))
 
-    def sojourns(self, initial: FloatArray, random: np.random.Generator) -> Iterator[tuple[int, float]]:
+    def holding_periods(self, initial: FloatArray, random: np.random.Generator) -> Iterator[tuple[int, float]]:
         """Exact path of the chain, without end: (mode from 0, time spent in it); ``initial`` (n,): law of the first."""
         # Holding times are exponential, or geometric in steps; the next graph is drawn from the jump chain.
         off_diagonal = self.matrix - np.diag(np.diag(self.matrix))

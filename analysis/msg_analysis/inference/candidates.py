@@ -162,7 +162,7 @@ MAX_PARAMETERS = 600  # most parameters whose information is inverted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Parameters:
+class ParameterGroup:
     """A group of parameters that may be wrong."""
 
     score: FloatArray  # (K,)
@@ -178,7 +178,7 @@ def frozen(sums: ResidualSums) -> list[tuple[int, int, int]]:
     return [(i, int(still[i]), int(steps[i])) for i in np.flatnonzero(still >= 3).tolist()]
 
 
-def gains(sums: ResidualSums, excluded: Iterable[int]) -> Parameters | None:
+def gains(sums: ResidualSums, excluded: Iterable[int]) -> ParameterGroup | None:
     """Of the regression on received values, without the ``excluded`` agents; None where it is not available."""
     if sums.gram is None or len(sums.terms) > MAX_PARAMETERS:
         return None
@@ -193,7 +193,7 @@ def gains(sums: ResidualSums, excluded: Iterable[int]) -> Parameters | None:
     back = sums.gram[square] @ inverse
     score, information = np.zeros(len(sums.terms)), np.zeros_like(sums.gram)
     score[kept], information[square] = back @ sums.score[kept], back @ sums.gram[square]
-    return Parameters(score, information, _gain_classes(sums.terms))
+    return ParameterGroup(score, information, _gain_classes(sums.terms))
 
 
 def _gain_classes(terms: Sequence[Term]) -> list[list[Candidate]]:
@@ -242,7 +242,7 @@ def _reference(terms: Sequence[Term]) -> FloatArray:
     )
 
 
-def noise(sums: ResidualSums, excluded: Iterable[int], change: FloatArray) -> Parameters | None:
+def noise(sums: ResidualSums, excluded: Iterable[int], change: FloatArray) -> ParameterGroup | None:
     """Log noise variances by graph and agent, less what the ``change`` (K,) of gains explains; None without any."""
     n, m = sums.still.shape
     out = np.zeros(m, np.bool_)
@@ -267,20 +267,20 @@ def noise(sums: ResidualSums, excluded: Iterable[int], change: FloatArray) -> Pa
         [Candidate("graph", int(g), (graph == g) * 1.0) for g in np.unique(graph)],
         [Candidate("all", None, np.ones(len(cells)))],
     ]
-    return Parameters(information @ ratios, information, classes if n > 1 else [classes[0], classes[3]])
+    return ParameterGroup(information @ ratios, information, classes if n > 1 else [classes[0], classes[3]])
 
 
-def variances(squares: FloatArray, samples: int) -> Parameters:
+def variances(squares: FloatArray, samples: int) -> ParameterGroup:
     """Logarithms of variances, nominally 1, from sums of squares (m,) of so many normal ``samples`` each."""
     information = np.eye(len(squares)) * samples / 2.0
     classes = [
         [Candidate("agent", i, row) for i, row in enumerate(np.eye(len(squares)))],
         [Candidate("all", None, np.ones(len(squares)))],
     ]
-    return Parameters(information @ np.log(np.maximum(squares, 1e-300) / samples), information, classes)
+    return ParameterGroup(information @ np.log(np.maximum(squares, 1e-300) / samples), information, classes)
 
 
-def losses(tally: LossTally) -> Parameters:
+def losses(tally: LossTally) -> ParameterGroup:
     """Log-odds of losing a message, link by link."""
     pairs = tally.pairs
     score, information = tally.score()
@@ -294,7 +294,7 @@ def losses(tally: LossTally) -> Parameters:
         [Candidate("sender", int(j), (pairs[:, 1] == j) * usable.astype(float)) for j in np.unique(pairs[usable, 1])],
         [Candidate("all", None, usable.astype(float))],
     ]
-    return Parameters(np.asarray(score), np.diag(information), classes)
+    return ParameterGroup(np.asarray(score), np.diag(information), classes)
 
 
 def _explained(sums: ResidualSums, change: FloatArray) -> FloatArray:

@@ -85,7 +85,7 @@ def flat(document: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-Reason = Literal["heavy_tails", "kept_values", "short_run", "few_sojourns"]
+Reason = Literal["heavy_tails", "kept_values", "short_run", "few_switches"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +123,9 @@ def _doubt(prediction: Prediction, means: TimeMeans) -> tuple[Reason, str] | Non
         )
     if not means.long_enough:
         return "short_run", "The run is too short for intervals of the errors over all paths of the graphs."
-    if not means.few_sojourns:
+    if not means.few_switches:
         return None
-    return "few_sojourns", (
+    return "few_switches", (
         f"This run has few switches (some graph is left {number_text(means.switches, 3)} times on "
         "average), so the errors over all paths of the graphs depend on a few random lengths: they are far from "
         "normal, and their intervals are too wide."
@@ -151,7 +151,7 @@ EXIT_CODES: dict[Verdict, ExitCode] = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Member:
+class PooledRun:
     """One of the runs."""
 
     name: str  # of its bag
@@ -183,7 +183,7 @@ class Member:
 class Pool:
     """The runs of a comparison, and Cochran's Q test of whether their system errors differ; None without."""
 
-    members: tuple[Member, ...]
+    members: tuple[PooledRun, ...]
     chi2: float | None = None
     dof: int | None = None
     p: float | None = None
@@ -369,7 +369,7 @@ class Comparison:
             "laws": self.laws,
             "given_path": self.given,
             "order": self.order,
-            "blame": self.causes,
+            "causes": self.causes,
             "continuous": {"system_error": self.continuous_error},
             "batch_means": {"interval": self.batch or (None, None)},
             "tests": self.tests,

@@ -401,7 +401,7 @@ class AnyTimeEvidence:
             "evidence": math.exp(self.log_evidence) if small else None,
             "log_evidence": self.log_evidence,
             "threshold": self.threshold,
-            "disagrees": self.exceeded,
+            "exceeded": self.exceeded,
             "crossed_at": self.crossed,
             "questions": [{"about": words, "log_evidence": log} for words, log in self.questions],
             "half_width": self.half_width,

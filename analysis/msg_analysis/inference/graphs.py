@@ -122,7 +122,7 @@ class HoldingTimes(SummedDiagnostic):
 
     name = "holding times"
     meaning = "the time for which a graph stays depends on how long it has stayed: the chain is not Markov"
-    kind = "sojourns"
+    kind = "holding times"
     about_chain = True
 
     def __init__(self, law: Law) -> None:

@@ -20,7 +20,7 @@ from msg_analysis.inference.question import Block, Finding, Law, Question, Runni
 from msg_analysis.inference.statistics import binomial_interval, log_normal_tail
 
 
-class Losses(Question):
+class MessageLosses(Question):
     """Whether messages are lost as often as the experiment says."""
 
     name = "loss"

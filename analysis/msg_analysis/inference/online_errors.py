@@ -145,9 +145,9 @@ class LiveEstimate:
         if self._received is not None:
             self._received.add(logged)
 
-    def add_sojourn(self, first: int, last: int, graph: int) -> bool:
+    def add_holding_period(self, first: int, last: int, graph: int) -> bool:
         """In real time: take steps in which the network has a graph, from 0; False: they contradict earlier ones."""
-        return self._received is None or self._received.add_sojourn(first, last, graph)
+        return self._received is None or self._received.add_holding_period(first, last, graph)
 
     def add_whole(self, steps: IntArray, modes: IntArray, states: FloatArray, after: FloatArray) -> None:
         """Add whole steps k (b,), each only once: graphs of k -> k+1 from 0 (b,), x(k) and x(k+1) (b, m, width)."""

@@ -53,7 +53,7 @@ class AnyTime:
             "evidence": math.exp(self.log_evidence) if known and self.log_evidence is not None else None,
             "log_evidence": self.log_evidence,
             "threshold": self.threshold,
-            "disagrees": self.exceeded,
+            "exceeded": self.exceeded,
             "strongest": self.strongest,
             "half_width": self.half_width,
         }
@@ -203,7 +203,7 @@ class ReceivedEvidence(EvidenceWatch):
             self._keep(part)
             self._add_ready(int(part.steps[-1]))
 
-    def add_sojourn(self, first: int, last: int, graph: int) -> bool:
+    def add_holding_period(self, first: int, last: int, graph: int) -> bool:
         """In real time: take steps in which the network has a graph, from 0; False: they contradict earlier ones."""
         return self._path.add(first, last, graph)
 
@@ -279,7 +279,7 @@ class NetworkPath:
         self._now: tuple[int, int, int] | None = None  # first step that is not counted, last step, graph
 
     def add(self, first: int, last: int, graph: int) -> bool:
-        """See ``ReceivedEvidence.add_sojourn``."""
+        """See ``ReceivedEvidence.add_holding_period``."""
         if self._now is not None and first <= self._now[1]:
             return True  # it comes again
         return self._ahead.setdefault(first, (last, graph)) == (last, graph)

@@ -16,7 +16,7 @@ import numpy as np
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.validation import unpredictable
-from msg_analysis.inference.comparison import Comparison, Member, Pool, first_difference
+from msg_analysis.inference.comparison import Comparison, Pool, PooledRun, first_difference
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.statistics import chi2_tail
@@ -71,7 +71,7 @@ def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> C
     total: Evidence | None = None
     prediction: Prediction | None = None
     trajectory: Run | None = None
-    members: list[Member] = []
+    members: list[PooledRun] = []
     for name, run in runs:
         _require_another(members, name, run.record)
         experiment = run.record.experiment
@@ -96,20 +96,20 @@ def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> C
     return dataclasses.replace(comparison, pool=pool)
 
 
-def _examine(name: str, run: Run, prediction: Prediction, level: float) -> tuple[Member, Evidence | None]:
+def _examine(name: str, run: Run, prediction: Prediction, level: float) -> tuple[PooledRun, Evidence | None]:
     """One run by itself, with its prediction; no evidence where too little of it arrived."""
     observation = Observation.of(run, prediction)
     if observation.steps < MIN_STEPS and not run.completeness.complete:
         missing = Estimate(predicted=prediction.emulated.system_error)
-        return Member(name, run.record, 0, run.completeness, missing, missing, "incomplete"), None
+        return PooledRun(name, run.record, 0, run.completeness, missing, missing, "incomplete"), None
     evidence = Evidence.of(observation, level)
     alone = evaluate(run, prediction, evidence, level)
     tested = alone.given.system_error if alone.given else alone.system_error
-    member = Member(name, run.record, evidence.steps, run.completeness, alone.system_error, tested, alone.verdict)
+    member = PooledRun(name, run.record, evidence.steps, run.completeness, alone.system_error, tested, alone.verdict)
     return member, evidence
 
 
-def _require_another(members: list[Member], name: str, record: RunRecord) -> None:
+def _require_another(members: list[PooledRun], name: str, record: RunRecord) -> None:
     """InputError unless it is another run of the same experiment, independent of the others."""
     for other in members:
         if record.run == other.record.run:
@@ -150,7 +150,7 @@ def _sum(counts: list[Completeness]) -> Completeness:
     return Completeness(**total, refused=dict(refused))
 
 
-def _pool(members: list[Member]) -> Pool:
+def _pool(members: list[PooledRun]) -> Pool:
     """Test whether measured - expected is the same in all runs: Cochran's Q."""
     tested = [member.tested for member in members]
     usable = [(error.z, error.standard_error) for error in tested if error.z is not None and error.standard_error]

@@ -18,7 +18,7 @@ import numpy as np
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import candidates
-from msg_analysis.inference.candidates import Cause, Parameters, Selected, numbers_text, select
+from msg_analysis.inference.candidates import Cause, ParameterGroup, Selected, numbers_text, select
 from msg_analysis.inference.e_values import Analyses
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.received_values import ReceivedValues
@@ -147,7 +147,7 @@ class Search:
         self.frozen = candidates.frozen(residuals)
         # Agents whose states are constant are no evidence on gains and noise.
         self.excluded = [agent for agent, _, _ in self.frozen]
-        self.parameters: dict[str, Parameters | None] = {
+        self.parameters: dict[str, ParameterGroup | None] = {
             "gains": candidates.gains(residuals, self.excluded),
             "noise": candidates.noise(residuals, self.excluded, np.zeros(len(residuals.terms))),
             "loss": candidates.losses(loss) if loss else None,
@@ -166,7 +166,7 @@ class Search:
         found = self.noise if group == "noise" else self.parameters.get(group)
         return self._select(found)[0] if found else []
 
-    def _select(self, group: Parameters) -> tuple[list[Selected], FloatArray]:
+    def _select(self, group: ParameterGroup) -> tuple[list[Selected], FloatArray]:
         return select(group.score, group.information, group.classes, self.families, self.level)
 
     @cached_property
@@ -176,7 +176,7 @@ class Search:
         return self._select(group) if group else ([], np.zeros(len(self.residuals.terms)))
 
     @cached_property
-    def noise(self) -> Parameters | None:
+    def noise(self) -> ParameterGroup | None:
         """The noise variances, without what wrong gains explain."""
         return candidates.noise(self.residuals, self.excluded, self.selected_gains[1])
 

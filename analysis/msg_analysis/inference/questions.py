@@ -14,7 +14,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.dependence import ConstantState, LongLags, Whiteness
 from msg_analysis.inference.graphs import HoldingTimes, SwappedGraphs, Switching
-from msg_analysis.inference.messages import Broadcast, CommonGain, Gains, Losses, StaleValues
+from msg_analysis.inference.messages import Broadcast, CommonGain, Gains, MessageLosses, StaleValues
 from msg_analysis.inference.noise import LargestResidual, Noise, NoiseByGraph, NoiseOverTime
 from msg_analysis.inference.question import Diagnostic, Question, Search, Statistics, Test
 from msg_analysis.inference.statistics import holm
@@ -37,7 +37,7 @@ QUESTIONS: tuple[type[Question], ...] = (
     LongLags,
     StaleValues,
     SwappedGraphs,
-    Losses,
+    MessageLosses,
     Broadcast,
     RunsAlike,
 )
@@ -83,7 +83,7 @@ def causes_of(search: Search, rejected: Sequence[str]) -> list[Cause]:
     return sorted(found, key=lambda cause: (cause.kind != "frozen", cause.p or 0.0))
 
 
-ABOUT_THE_CHAIN = ("switching", "sojourns")  # kinds of causes
+ABOUT_THE_CHAIN = ("switching", "holding times")  # kinds of causes
 
 
 def _clearest(search: Search, others: Sequence[Cause], *, about_chain: bool) -> list[Cause]:

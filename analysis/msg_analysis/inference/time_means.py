@@ -92,7 +92,7 @@ class TimeMeans:
         return total > 0.0 and float((parts / total).std(ddof=1)) * math.sqrt(PARTS) <= MAX_SPREAD
 
     @property
-    def few_sojourns(self) -> bool:
+    def few_switches(self) -> bool:
         """Whether some graph is left so seldom that intervals over all paths are much too wide (calibration.md)."""
         return self.switches < FEW_SWITCHES
 

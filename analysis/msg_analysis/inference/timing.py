@@ -102,7 +102,7 @@ class Timing:
     staleness_steps: dict[str, float | None]  # step of the new state - step of the value; 0 or 1 with ideal timers
     uses: int  # neighbours' values that steps needed, those never received or lost included
     ideal_uses: int  # uses of the value that ideal timers would have used, the own one for a lost one included
-    never_heard: int  # uses in which nothing had been received yet of the neighbour
+    never_received: int  # uses in which nothing had been received yet of the neighbour
     lost_messages: LostMessages
     outdated_graphs: int  # steps made with another graph than the network's at that time
     histogram: tuple[FloatArray, AnyArray]  # of lateness: edges [ms] (BINS + 1,) and counts (BINS,); covers all values
@@ -134,8 +134,8 @@ class Timing:
             "staleness_ms": self.staleness_ms,
             "staleness_steps": self.staleness_steps,
             "ideal_uses": {"uses": self.uses, "ideal": self.ideal_uses, "share": self.ideal_share},
-            "never_heard": self.never_heard,
-            "unheard": self.lost_messages,
+            "never_received": self.never_received,
+            "lost_messages": self.lost_messages,
             "outdated_graph": {"steps": self.outdated_graphs, "share": self.outdated_share},
             "histogram": {"lateness_ms": edges, "steps": counts, "staleness_ms": age_edges, "uses": age_counts},
         }
@@ -147,7 +147,7 @@ def measure_timing(observation: Observation) -> Timing:
     counts = np.zeros(5, dtype=np.int64)
     for first, last in log.blocks():
         counts += log.counts(first, last)
-    missed, uses, ideal_uses, never_heard, outdated = counts.tolist()
+    missed, uses, ideal_uses, never_received, outdated = counts.tolist()
     steps, m = observation.steps, observation.step.agents
     return Timing(
         period_ms=log.period * log.milliseconds,
@@ -159,7 +159,7 @@ def measure_timing(observation: Observation) -> Timing:
         staleness_steps=shown_quantiles(log.pieces(log.ages_in_steps)),
         uses=uses,
         ideal_uses=ideal_uses,
-        never_heard=never_heard,
+        never_received=never_received,
         lost_messages=lost_messages(observation),
         outdated_graphs=outdated,
         histogram=_histogram(log.pieces(log.lateness)),
@@ -310,11 +310,11 @@ class LostMessages:
             found, around, should = self.share(place)
             receiver, sender = self.links[place].tolist()
             row = {"sender": sender + 1, "receiver": receiver + 1, "messages": int(self.messages[place])}
-            row |= {"unheard": int(self.lost[place]), "share": found, "interval": list(around), "expected": should}
+            row |= {"lost": int(self.lost[place]), "share": found, "interval": list(around), "expected": should}
             rows.append(row)
         return {
             "messages": int(self.messages.sum()),
-            "unheard": int(self.lost.sum()),
+            "lost": int(self.lost.sum()),
             "share": share,
             "interval": list(interval),
             "expected": expected,

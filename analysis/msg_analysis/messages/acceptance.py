@@ -21,7 +21,7 @@ from msg_analysis.arithmetic.update_law import all_finite
 from msg_analysis.messages.cdr import CdrError
 from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, StateFrame, decode_string, encode_string
 from msg_analysis.messages.topics import END, EPOCH, STOP, Topic
-from msg_analysis.model.graph_path import PathWindow, Sojourn
+from msg_analysis.model.graph_path import HoldingPeriod, PathWindow
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import first_graph
 
@@ -55,9 +55,9 @@ class Refusal:
     TOO_NEW = "a step that a peer cannot have reached"
     TOO_LATE = "too late"
 
-    # Sojourns of the graph
-    OUT_OF_SEQUENCE = "a sojourn out of sequence"
-    TOO_EARLY = "a sojourn before its time"
+    # Holding periods of the graph
+    OUT_OF_SEQUENCE = "a holding period out of sequence"
+    TOO_EARLY = "a holding period before its time"
     GRAPH_OUT_OF_RANGE = "graph out of range"
     OTHER_GRAPH = "graph of a step that its states contradict"
 
@@ -111,11 +111,11 @@ class RunRules:
         return Refusal.NOT_OF_RECORD if run == str(self._record.run) else Refusal.OTHER_RUN
 
     def forget(self, step: int) -> None:
-        """From now on, sojourns that end before a step are refused as repeated."""
+        """From now on, holding periods that end before a step are refused as repeated."""
         self._path.forget(step)
 
     def graph(self, data: bytes) -> ActiveGraph | str:
-        """A sojourn of the graph, or a ``Refusal``."""
+        """A holding period of the graph, or a ``Refusal``."""
         message = decode_of_run(ActiveGraph, data, self._record.run.bytes)
         if isinstance(message, str):
             return message
@@ -123,10 +123,10 @@ class RunRules:
             return Refusal.REPEATED
         if message.sequence > self._path.first + self._path.MOST_AHEAD:
             return Refusal.TOO_EARLY
-        sojourn = self._path.sojourn(message.sequence)
-        if sojourn is None:
+        holding = self._path.holding(message.sequence)
+        if holding is None:
             return Refusal.GRAPH_OUT_OF_RANGE
-        true = sojourn_message(self._record, sojourn)
+        true = graph_message(self._record, holding)
         same = all(getattr(message, field.name) == getattr(true, field.name) for field in fields(ActiveGraph))
         return message if same else Refusal.NOT_OF_RECORD
 
@@ -142,17 +142,17 @@ class RunRules:
         return message if genuine(message, topic, self._record.key) else Refusal.NOT_SIGNED
 
 
-def sojourn_message(record: RunRecord, sojourn: Sojourn) -> ActiveGraph:
-    """What the switcher publishes of a sojourn."""
-    graph = record.experiment.graph_list[sojourn.mode]
+def graph_message(record: RunRecord, holding: HoldingPeriod) -> ActiveGraph:
+    """What the switcher publishes of a holding period."""
+    graph = record.experiment.graph_list[holding.mode]
     return ActiveGraph(
-        stamp=StepClock(record.experiment.step_length).nanoseconds(sojourn.first_step),
+        stamp=StepClock(record.experiment.step_length).nanoseconds(holding.first_step),
         run=record.run.bytes,
-        sequence=sojourn.sequence,
-        mode=sojourn.mode + 1,
+        sequence=holding.sequence,
+        mode=holding.mode + 1,
         name=graph.name,
-        first_step=sojourn.first_step,
-        last_step=sojourn.last_step,
+        first_step=holding.first_step,
+        last_step=holding.last_step,
         arcs=tuple(graph.arcs),
     )
 

@@ -196,11 +196,11 @@ class AgentState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActiveGraph:
-    """msg_agents_interfaces/msg/ActiveGraph: one sojourn of the switching graph."""
+    """msg_agents_interfaces/msg/ActiveGraph: one holding period of the switching graph."""
 
     stamp: int  # simulated time at which it begins [ns]
     run: bytes  # 16 bytes
-    sequence: int  # number of the sojourn, from 0
+    sequence: int  # number of the holding period, from 0
     mode: int  # from 1
     name: str
     first_step: int  # the steps k -> k+1 with first_step <= k <= last_step use this graph

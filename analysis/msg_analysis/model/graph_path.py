@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Sojourn:
+class HoldingPeriod:
     """A stretch of steps with one graph."""
 
     sequence: int  # its number, from 0
@@ -31,24 +31,24 @@ class Sojourn:
     last_step: int
 
 
-def sojourns(experiment: Experiment, initial: FloatArray) -> Iterator[Sojourn]:
+def holding_periods(experiment: Experiment, initial: FloatArray) -> Iterator[HoldingPeriod]:
     """The graph path of a run, drawn from the experiment's seed; ``initial`` (n,) is the law of g(0)."""
     # Step k uses the graph of the chain at time k dt, so successive graphs are a Markov chain with P = expm(Gamma dt),
-    # exactly. A sojourn between two sampling times, which no step uses, is left out.
+    # exactly. A holding period between two sampling times, which no step uses, is left out.
     random = generator(experiment.run.seed, Stream.SWITCHING)
     return _sampled(experiment.chain, initial, random, experiment.steps, experiment.step_length)
 
 
 def _sampled(
     chain: MarkovChain, initial: FloatArray, random: np.random.Generator, steps: int, dt: float
-) -> Iterator[Sojourn]:
+) -> Iterator[HoldingPeriod]:
     """The chain at the times 0, dt, ..., (steps - 1) dt."""
     time, first, sequence = 0.0, 0, 0
-    for mode, held in chain.sojourns(initial, random):
+    for mode, held in chain.holding_periods(initial, random):
         time += held
         end = steps if math.isinf(time) else min(steps, math.ceil(time / dt))
         if end > first:
-            yield Sojourn(sequence, mode, first, end - 1)
+            yield HoldingPeriod(sequence, mode, first, end - 1)
             sequence += 1
             first = end
         if end >= steps:
@@ -56,23 +56,23 @@ def _sampled(
 
 
 class PathWindow:
-    """The sojourns of a graph path by number, drawn as far as they are asked for, without those that are forgotten."""
+    """The holding periods of a graph path by number, drawn as far as they are asked for; old ones are forgotten."""
 
-    MOST_AHEAD = 10_000  # sojourns beyond the first one that is kept; more are never published ahead
+    MOST_AHEAD = 10_000  # holding periods beyond the first one that is kept; more are never published ahead
 
     def __init__(self, experiment: Experiment, initial: FloatArray) -> None:
-        self._path = sojourns(experiment, initial)
-        self._kept: deque[Sojourn] = deque()
-        self.first = 0  # number of the first sojourn that is kept
+        self._path = holding_periods(experiment, initial)
+        self._kept: deque[HoldingPeriod] = deque()
+        self.first = 0  # number of the first holding period that is kept
 
     def forget(self, step: int) -> None:
-        """Keep only the sojourns that end at a step or later."""
+        """Keep only the holding periods that end at a step or later."""
         while (self._kept or self._draw()) and self._kept[0].last_step < step:
             self._kept.popleft()
             self.first += 1
 
-    def sojourn(self, number: int) -> Sojourn | None:
-        """A sojourn; None for one that is not there, not kept any more, or too far ahead."""
+    def holding(self, number: int) -> HoldingPeriod | None:
+        """A holding period; None for one that is not there, not kept any more, or too far ahead."""
         index = number - self.first
         if not 0 <= index <= self.MOST_AHEAD:
             return None
@@ -82,15 +82,15 @@ class PathWindow:
         return self._kept[index]
 
     def _draw(self) -> bool:
-        sojourn = next(self._path, None)
-        if sojourn is not None:
-            self._kept.append(sojourn)
-        return sojourn is not None
+        holding = next(self._path, None)
+        if holding is not None:
+            self._kept.append(holding)
+        return holding is not None
 
 
 def mode_path(experiment: Experiment, initial: FloatArray) -> IntArray:
     """(N,) index of the graph of each step k -> k+1; ``initial`` (n,) is the law of g(0)."""
-    return _modes(sojourns(experiment, initial), experiment.steps)
+    return _modes(holding_periods(experiment, initial), experiment.steps)
 
 
 def past_modes(experiment: Experiment, first_mode: int, steps: int) -> IntArray:
@@ -104,8 +104,8 @@ def past_modes(experiment: Experiment, first_mode: int, steps: int) -> IntArray:
     return backwards[:0:-1]
 
 
-def _modes(path: Iterator[Sojourn], steps: int) -> IntArray:
+def _modes(path: Iterator[HoldingPeriod], steps: int) -> IntArray:
     modes = np.empty(steps, dtype=np.int64)
-    for sojourn in path:
-        modes[sojourn.first_step : sojourn.last_step + 1] = sojourn.mode
+    for holding in path:
+        modes[holding.first_step : holding.last_step + 1] = holding.mode
     return modes

@@ -42,7 +42,7 @@ def _three_graphs(r12: float, r21: float) -> list[list[float]]:
 
 
 @dataclass(frozen=True, eq=False)
-class Network:
+class GraphFamily:
     """Graphs that switch: q_ij = epsilon r_ij."""
 
     name: str
@@ -98,10 +98,10 @@ _LINES = {"line_1": {"path": [2, 3, 4, 5, 1]}, "line_2": {"path": [1, 2, 3, 4, 5
 _KNIFE_EDGE = {"first": _edges("12 13 15 34 45"), "second": _edges("13 15 23 24 34 45")}
 _SMALLEST = {"first": _edges("12 13 14 35"), "second": _edges("12 13 34 35 45")}
 NETWORKS = {
-    "line_ring": Network("line_ring", {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}}),
-    "three_lines": Network("three_lines", _LINES, _three_graphs),
-    "knife_edge": Network("knife_edge", _KNIFE_EDGE),
-    "smallest": Network("smallest", _SMALLEST),
+    "line_ring": GraphFamily("line_ring", {"line": {"path": [1, 2, 3, 4, 5]}, "ring": {"cycle": [1, 2, 3, 4, 5]}}),
+    "three_lines": GraphFamily("three_lines", _LINES, _three_graphs),
+    "knife_edge": GraphFamily("knife_edge", _KNIFE_EDGE),
+    "smallest": GraphFamily("smallest", _SMALLEST),
 }
 
 

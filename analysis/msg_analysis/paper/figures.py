@@ -39,7 +39,7 @@ LEVEL = 0.01  # probability that any point is said to disagree although all netw
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class PlannedRun:
     """One run of a network, in lockstep, with ``REPLICAS`` replicas."""
 
     example: int  # 1, 2 or 3
@@ -79,20 +79,22 @@ class Run:
         return [(SYSTEM, None), *(nodes if drawn else [])]
 
 
-def runs_of(example: int) -> list[Run]:
+def runs_of(example: int) -> list[PlannedRun]:
     """The runs for an example (1, 2 or 3), at rates that the paper's curves go through."""
     if example == 1:
         # Each of these is on one curve over r12 and on one over r21.
         levels = [level for level in examples.LEVELS if level >= 0.5]
         pairs = [(r12, r21) for r12 in levels for r21 in levels] + [(0.1, 1.0), (1.0, 0.1)]
-        return [Run(1, "line_ring", 0.5, *pair) for pair in pairs]
+        return [PlannedRun(1, "line_ring", 0.5, *pair) for pair in pairs]
     if example == 2:
         swept = {0.5: (0.25, 0.55, 0.9), 1.0: (0.4, 0.8), 5.0: (0.2, 0.6), 10.0: (0.16, 0.5, 0.9)}
-        return [Run(2, "three_lines", scale, r12, examples.R2J) for scale, values in swept.items() for r12 in values]
+        return [
+            PlannedRun(2, "three_lines", scale, r12, examples.R2J) for scale, values in swept.items() for r12 in values
+        ]
     runs = []
     for network in ("knife_edge", "smallest"):
-        runs += [Run(3, network, epsilon, 1.0, 1.0, agent) for epsilon in (0.5, 5.0) for agent in range(5)]
-        runs += [Run(3, network, epsilon, 1.0, 1.0) for epsilon in (0.1, 0.5, 2.0, 10.0, 50.0)]
+        runs += [PlannedRun(3, network, epsilon, 1.0, 1.0, agent) for epsilon in (0.5, 5.0) for agent in range(5)]
+        runs += [PlannedRun(3, network, epsilon, 1.0, 1.0) for epsilon in (0.1, 0.5, 2.0, 10.0, 50.0)]
     return runs
 
 
@@ -100,7 +102,7 @@ def runs_of(example: int) -> list[Run]:
 class Measured:
     """A measured certainty next to its prediction."""
 
-    run: Run
+    run: PlannedRun
     quantity: str  # SYSTEM, NODE or CENTRALITY
     agent: int | None  # from 0; None: the system
     value: float  # 1 / E [1 / variance]
@@ -109,10 +111,10 @@ class Measured:
     predicted: float  # exact for the steps of the run
     z: float  # of the error E, like p
     p: float
-    p_holm: float = 1.0  # adjusted over all points that were measured together
+    p_adjusted: float = 1.0  # adjusted over all points that were measured together
 
 
-def measured(runs: Sequence[Run], outcomes: Sequence[Outcome]) -> list[Measured]:
+def measured(runs: Sequence[PlannedRun], outcomes: Sequence[Outcome]) -> list[Measured]:
     """The points that are drawn, of all runs that did not fail; Holm's adjustment is over all of them."""
     found = []
     for run, outcome in zip(runs, outcomes, strict=True):
@@ -127,10 +129,10 @@ def measured(runs: Sequence[Run], outcomes: Sequence[Outcome]) -> list[Measured]
     if not found:
         return []
     adjusted = holm(np.array([point.p for point in found]))
-    return [dataclasses.replace(point, p_holm=float(p)) for point, p in zip(found, adjusted, strict=True)]
+    return [dataclasses.replace(point, p_adjusted=float(p)) for point, p in zip(found, adjusted, strict=True)]
 
 
-COLUMNS = (*examples.RATES, "value [1/variance]", "low", "high", "predicted", "z", "p", "p_holm")
+COLUMNS = (*examples.RATES, "value [1/variance]", "low", "high", "predicted", "z", "p", "p_adjusted")
 
 
 def csv_text(number: int, points: Sequence[Measured]) -> str:
@@ -142,7 +144,7 @@ def csv_text(number: int, points: Sequence[Measured]) -> str:
     rows = []
     for point in points:
         run, agent = point.run, 0 if point.agent is None else point.agent + 1
-        numbers = (point.value, point.low, point.high, point.predicted, point.z, point.p, point.p_holm)
+        numbers = (point.value, point.low, point.high, point.predicted, point.z, point.p, point.p_adjusted)
         if run.example == number:
             rows.append((run.network, point.quantity, agent, run.epsilon, run.r12, run.r21, *numbers))
     return examples.commented_csv(comments, COLUMNS, rows)
@@ -152,7 +154,7 @@ def summary(points: Sequence[Measured], runs: int) -> str:
     """One sentence: whether all points agree with theory; ``runs`` is the number of networks."""
     apart = disagreeing(points)
     within = np.mean([point.low <= point.predicted <= point.high for point in points])
-    least = min(point.p_holm for point in points)
+    least = min(point.p_adjusted for point in points)
     verdict = f"{len(apart)} disagree with theory" if apart else "all agree with theory"
     return (
         f"{len(points)} points of {runs} networks: {verdict} (Holm over all points, level {LEVEL:g}; smallest adjusted "
@@ -162,7 +164,7 @@ def summary(points: Sequence[Measured], runs: int) -> str:
 
 def disagreeing(points: Sequence[Measured]) -> list[Measured]:
     """The points whose adjusted p is below ``LEVEL``."""
-    return [point for point in points if point.p_holm < LEVEL]
+    return [point for point in points if point.p_adjusted < LEVEL]
 
 
 FORMATS = ("png", "svg", "pdf")

@@ -54,19 +54,19 @@ def print_comparison(document: dict[str, Any], console: Console, *, verbose: boo
 
     console.print(verdict_line(document), style=_STYLES[document["verdict"]])
     say(*_facts(document))
-    for cause in document.get("blame") or []:
+    for cause in document.get("causes") or []:
         console.print(Text(with_names(sentence(cause["words"]), document.get("names"))), style="bold red")
     say(*trust_words(document))
     _print_bags(document.get("bags") or [], console)
     _print_tests(document, console, verbose)
     _print_errors(document, console, verbose)
-    if verbose or (document.get("any_time") or {}).get("disagrees"):
+    if verbose or (document.get("any_time") or {}).get("exceeded"):
         say(*any_time_words(document))
     if document.get("laws"):
         if verbose:
             _print_timing(document["timing"], document["laws"], console)
         say(with_names(document["laws"]["why"], document.get("names")), *lost_words(document))
-    _print_rejected(document.get("strangers") or [], console)
+    _print_rejected(document.get("rejected_messages") or [], console)
     if verbose:
         say(*_details(document))
 
@@ -224,18 +224,18 @@ def timing_facts(timing: dict[str, Any]) -> list[tuple[str, str]]:
         ("neighbour values as recent as with ideal timers", percent(uses["share"])),
         ("steps with an outdated graph", f"{graphs['steps']} of {deadlines['steps']} ({percent(graphs['share'])})"),
     ]
-    if timing["never_heard"]:
-        facts.append(("uses of neighbours before their first message", str(timing["never_heard"])))
-    lost = timing.get("unheard")  # results of older versions have none
+    if timing["never_received"]:
+        facts.append(("uses of neighbours before their first message", str(timing["never_received"])))
+    lost = timing.get("lost_messages")  # results of older versions have none
     if lost:
-        numbers = f"{lost['unheard']} of {lost['messages']} ({percent(lost['share'])})"
+        numbers = f"{lost['lost']} of {lost['messages']} ({percent(lost['share'])})"
         facts.append(("late or lost messages", f"{numbers}; simulated loss {percent(lost['expected'])}"))
     return facts
 
 
 def lost_words(document: dict[str, Any]) -> list[str]:
     """That messages between agents were lost or late, in a sentence; empty where the experiment says so."""
-    words = ((document.get("timing") or {}).get("unheard") or {}).get("words")
+    words = ((document.get("timing") or {}).get("lost_messages") or {}).get("words")
     return [with_names(sentence(words), document.get("names"))] if words else []
 
 
@@ -260,7 +260,7 @@ def any_time_words(document: dict[str, Any]) -> list[str]:
     evidence, limit = seen["evidence"], f"threshold {seen['threshold']:g}"
     shown = number_text(evidence, 2) if evidence is not None else "more than 1e300"
     line = f"Sequential test: evidence {shown} against the prediction"
-    if not seen["disagrees"]:
+    if not seen["exceeded"]:
         return [f"{line} ({limit}, not exceeded). Valid at any stopping time."]
     when = f" at t = {number_text(seen['crossed_at'])}" if seen["crossed_at"] is not None else ""
     strongest = f"; strongest for: {seen['questions'][0]['about']}" if seen["questions"] else ""
@@ -271,7 +271,7 @@ def any_time_words(document: dict[str, Any]) -> list[str]:
 def trust_words(document: dict[str, Any]) -> list[str]:
     """Which errors to trust, where that is not obvious: with heavy tails, and in runs with few holding times."""
     trust = document.get("trust")
-    return [trust["words"]] if trust and trust["reason"] in ("heavy_tails", "few_sojourns") else []
+    return [trust["words"]] if trust and trust["reason"] in ("heavy_tails", "few_switches") else []
 
 
 def agent_order(document: dict[str, Any]) -> list[str]:

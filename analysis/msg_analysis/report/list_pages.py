@@ -25,7 +25,7 @@ from msg_analysis.inference.comparison import flat
 from msg_analysis.report import plot_style, sweep_plots
 from msg_analysis.report.page import SYMBOLS, minus_sign, pack, page_template
 from msg_analysis.runs import RunEntry
-from msg_analysis.sweeps.grid import Sweep
+from msg_analysis.sweeps.grid import SweepGrid
 from msg_analysis.sweeps.results import (
     Picture,
     Row,
@@ -41,7 +41,7 @@ _OPEN_TABLE = 30  # most rows with which the table is open at first
 
 
 def render_sweep(
-    sweep: Sweep,
+    sweep: SweepGrid,
     rows: Sequence[Row],  # of ``rows_of``
     column: str | None,  # what is drawn, as in ``picture``
     summary: str,  # how many points, and what came of them

@@ -159,7 +159,7 @@ def write_report(
     file: str | Path,
     *,
     restarts: Sequence[str] = (),
-    strangers: Sequence[Mapping[str, Any]] = (),
+    rejected_messages: Sequence[Mapping[str, Any]] = (),
     events: Sequence[Mapping[str, Any]] = (),
     wall_time: float | None = None,
     channel: Mapping[str, Any] | None = None,
@@ -174,7 +174,7 @@ def write_report(
         path of the page; replaced if it exists
     restarts
         what the network reported: a line per process that was restarted
-    strangers
+    rejected_messages
         ``node``, ``topic``, ``reason`` and ``count`` per kind of refused message
     events
         ``kind`` ("killed", "back" or "refused"), ``step`` and ``words`` per event
@@ -194,7 +194,12 @@ def write_report(
         the file cannot be written
     """
     path = Path(file)
-    network: dict[str, Any] = {"restarts": restarts, "strangers": strangers, "events": events, "channel": channel}
+    network: dict[str, Any] = {
+        "restarts": restarts,
+        "rejected_messages": rejected_messages,
+        "events": events,
+        "channel": channel,
+    }
     html = render(comparison, wall_time=wall_time, **network)
     try:
         write_whole(path, html.encode())
@@ -207,7 +212,7 @@ def render(
     comparison: Comparison,
     *,
     restarts: Sequence[str] = (),
-    strangers: Sequence[Mapping[str, Any]] = (),
+    rejected_messages: Sequence[Mapping[str, Any]] = (),
     events: Sequence[Mapping[str, Any]] = (),
     wall_time: float | None = None,
     channel: Mapping[str, Any] | None = None,
@@ -218,7 +223,7 @@ def render(
     document, trajectory = comparison.to_json(), comparison.trajectory
     experiment = trajectory.record.experiment
     names = [graph.name for graph in experiment.graph_list]
-    candidates = Candidates.of(document["blame"])
+    candidates = Candidates.of(document["causes"])
     happened, more_events = run_events(trajectory, events)
     models, drawn = _models(document, comparison, candidates, happened)
     places, packed = pack(models)
@@ -232,7 +237,7 @@ def render(
         run_facts=run_facts(comparison, wall_time),
         symbol=SYMBOLS[document["verdict"]],
         restarts=restarts,
-        rejected_messages=strangers,
+        rejected_messages=rejected_messages,
         channel=channel,
         headline=verdict_line(document),
         timing_facts=timing_facts(timing) if timing else [],
@@ -244,8 +249,8 @@ def render(
         law_name=LAW_NAMES["emulated" if document["law"] == "synchronous" else document["law"]],
         support=SUPPORT,
         explanation=_explanation(document),
-        blame=[with_names(sentence(cause["words"]), experiment.names) for cause in document["blame"]],
-        cause_known=bool(document["blame"]) and document["blame"][0]["kind"] != "unknown",
+        causes=[with_names(sentence(cause["words"]), experiment.names) for cause in document["causes"]],
+        cause_known=bool(document["causes"]) and document["causes"][0]["kind"] != "unknown",
         plus_minus=plus_minus,
         interval_bars=interval_bars,
         heat_maps=[name for name in models if name.startswith("covariance_")],

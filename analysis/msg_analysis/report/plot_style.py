@@ -28,16 +28,16 @@ class Candidates:
     jumps: tuple[tuple[str, str | None], ...] = ()  # from a graph to another, None: to any
 
     @classmethod
-    def of(cls, blame: Sequence[Mapping[str, Any]]) -> Candidates:
+    def of(cls, causes: Sequence[Mapping[str, Any]]) -> Candidates:
         """Of the causes of a comparison's document."""
-        links = [(cause, tuple(cause["link"])) for cause in blame if cause["link"]]
+        links = [(cause, tuple(cause["link"])) for cause in causes if cause["link"]]
         return cls(
-            tuple(dict.fromkeys(cause["agent"] for cause in blame if cause["agent"] is not None)),
+            tuple(dict.fromkeys(cause["agent"] for cause in causes if cause["agent"] is not None)),
             tuple((*ends, cause["graph"]) for cause, ends in links if cause["kind"] != "correlation"),
             tuple(ends for cause, ends in links if cause["kind"] == "correlation"),
             tuple(
                 (cause["graph"][0], cause["graph"][1] if len(cause["graph"]) > 1 else None)
-                for cause in blame
+                for cause in causes
                 if cause["kind"] == "switching" and cause["graph"]
             ),
         )

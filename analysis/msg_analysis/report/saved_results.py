@@ -118,8 +118,8 @@ def print_results(rows: Sequence[Result], level: float, console: Console) -> Non
         table.add_row(*map(Text, line))
     print_table(console, table)
     for row in rows:
-        if row.blame:
-            console.print(Text(f"{row.file}: {row.blame}."))
+        if row.causes:
+            console.print(Text(f"{row.file}: {row.causes}."))
     for one in merge_results(rows):
         error = Estimate(one["measured"], standard_error=one["standard_error"])
         merged = f"{len(one['files'])} results merged ({number_text(one['simulated_time'])} units of time)"

@@ -36,7 +36,7 @@ from msg_analysis.experiment.problems import show
 from msg_analysis.report.figures import STYLE, NotebookFigure, plain, rendered
 from msg_analysis.report.look import DARK_GREY, MODE_COLOURS, shifted, shorten
 from msg_analysis.report.plot_style import BLACK, DARK_SCALE, GREY, INK, LINES, SANS, SCALE, new_figure, show_values
-from msg_analysis.sweeps.results import Picture, Place, Series, axis_name, column_words, key_words, value_text
+from msg_analysis.sweeps.results import Picture, PlotPoint, Series, axis_name, column_words, key_words, value_text
 from msg_analysis.theory.prediction import LAW_NAMES
 
 MOST_LINES = 8  # series of one figure; of more values, some
@@ -277,7 +277,7 @@ def _add_focus(plot: Any, points: dict[str, list[Any]], name: str) -> None:
     plot.scatter("x", "value", source=ring, size=18, fill_color=None, line_color=BLACK, line_width=2.5)
 
 
-def _column(places: Sequence[Place], key: str) -> FloatArray:
+def _column(places: Sequence[PlotPoint], key: str) -> FloatArray:
     return np.array([getattr(place, key) for place in places], dtype=float)  # None: nan
 
 
@@ -285,14 +285,14 @@ def _result_words(picture: Picture) -> str:
     return "measured" if picture.measured else column_words(picture.y, picture.names)
 
 
-def _value_words(place: Place) -> str:
+def _value_words(place: PlotPoint) -> str:
     """A result with its interval, or why there is none."""
     if place.value is None:
         return f"no result: {place.reason or 'not done'}"
     return measured_text(place.value, (place.low, place.high))
 
 
-def _place_words(picture: Picture, series: Series, place: Place) -> str:
+def _place_words(picture: Picture, series: Series, place: PlotPoint) -> str:
     """All of a point in one line."""
     text = f"{picture.words([(picture.x, place.x), *series.values])}: {_value_words(place)}"
     if picture.measured and place.predicted is not None:

@@ -29,7 +29,7 @@ from msg_analysis.common.text import (
 )
 from msg_analysis.experiment.loading import amount
 from msg_analysis.runs import RunEntry
-from msg_analysis.sweeps.grid import Sweep
+from msg_analysis.sweeps.grid import SweepGrid
 from msg_analysis.sweeps.points import FAILED, JobResults
 from msg_analysis.sweeps.results import Picture, SweepVerdict, value_text
 from msg_analysis.sweeps.results import Row as SweepRow
@@ -377,7 +377,9 @@ def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Cons
             console.print(Text(f"damaged: {run.problem}", style="yellow"))
 
 
-def describe_sweep(sweep: Sweep, done: JobResults, judgement: SweepVerdict, rows: Sequence[SweepRow]) -> dict[str, Any]:
+def describe_sweep(
+    sweep: SweepGrid, done: JobResults, judgement: SweepVerdict, rows: Sequence[SweepRow]
+) -> dict[str, Any]:
     """The document of ``msg-analysis sweep --json``, without the names of the files; ``rows`` of ``rows_of``."""
     failed = sum(outcome.status == FAILED for outcome in done.outcomes)
     return {
@@ -394,7 +396,7 @@ def describe_sweep(sweep: Sweep, done: JobResults, judgement: SweepVerdict, rows
     }
 
 
-def print_sweep(sweep: Sweep, document: dict[str, Any], picture: Picture, console: Console) -> None:
+def print_sweep(sweep: SweepGrid, document: dict[str, Any], picture: Picture, console: Console) -> None:
     """Print a table of what the figure shows, what failed, and the verdict; ``document`` of ``describe_sweep``."""
     heads = ["measured", "± (95 %)", "predicted"] if picture.measured else [picture.y, "in continuous time"]
     several = len(picture.series) > 1
@@ -408,8 +410,10 @@ def print_sweep(sweep: Sweep, document: dict[str, Any], picture: Picture, consol
     for row in [row for row in document["points"] if row["status"] == FAILED][:ROWS]:
         console.print(Text(f"point {row['point']}: no result: {row['reason']}"))
     for row in [row for row in document["points"] if row.get("verdict") == "disagrees"][:ROWS]:
-        why = row.get("blame") or row.get("least")
-        console.print(Text(f"point {row['point']} disagrees with its prediction (p = {p_text(row['p_holm'])}): {why}"))
+        why = row.get("causes") or row.get("least")
+        console.print(
+            Text(f"point {row['point']} disagrees with its prediction (p = {p_text(row['p_adjusted'])}): {why}")
+        )
     console.print(Text(summary(document)))
 
 
@@ -422,7 +426,7 @@ def summary(document: dict[str, Any]) -> str:
         text += f", {document['kept']} of them from an earlier sweep"
     if document["failed"]:
         text += f"; {document['failed']} without a result"
-    tested = [row["p_holm"] for row in document["points"] if row.get("p_holm") is not None]
+    tested = [row["p_adjusted"] for row in document["points"] if row.get("p_adjusted") is not None]
     if tested:
         apart = sum(row.get("verdict") == "disagrees" for row in document["points"])
         text += f". {apart or 'None'} of {len(tested)} {'disagree' if apart > 1 else 'disagrees'} with its prediction"

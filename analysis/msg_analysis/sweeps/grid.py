@@ -246,7 +246,7 @@ class Point:
 
 
 @dataclass(frozen=True, slots=True)
-class Sweep:
+class SweepGrid:
     """A sweep whose points are all valid."""
 
     name: str  # of the file, without its ending
@@ -266,7 +266,7 @@ class Sweep:
         return tuple(self.spec.over)
 
 
-def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) -> Sweep:
+def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) -> SweepGrid:
     """Read a sweep file in YAML or JSON. InputError: a file cannot be read; ExperimentError: all mistakes."""
     path = Path(path)
     mapping = read_yaml(path)
@@ -312,7 +312,7 @@ def _spec_problems(spec: SweepSpec) -> list[str]:
     return found
 
 
-def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> Sweep:
+def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: Path, checked: Checked) -> SweepGrid:
     """The sweep of a document; every point is checked. ExperimentError: all mistakes, with their points."""
     if lines := _spec_problems(spec):
         raise ExperimentError(str(path), lines)
@@ -343,7 +343,7 @@ def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: P
     if wrong:
         raise ExperimentError(str(path), _grouped(wrong, combinations))
     (names,) = named if len(named) == 1 else [()]
-    return Sweep(path.stem, spec, name, tuple(points), names or None)
+    return SweepGrid(path.stem, spec, name, tuple(points), names or None)
 
 
 def _runs(spec: SweepSpec, values: Mapping[str, Any], experiment: Experiment) -> Iterator[Point]:

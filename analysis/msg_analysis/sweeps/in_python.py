@@ -41,10 +41,10 @@ class Sweep:
     rows
         a mapping for each point, with the columns of ``results.csv`` of the command
     judgement
-        what the runs say together: ``verdict``, ``verdicts`` and ``p_holm`` (None for predictions)
+        what the runs say together: ``verdict``, ``verdicts`` and ``p_adjusted`` (None for predictions)
     """
 
-    points: grid.Sweep
+    points: grid.SweepGrid
     rows: list[Row]
     judgement: SweepVerdict
 

@@ -297,11 +297,11 @@ def of_comparison(document: Mapping[str, Any]) -> dict[str, Any]:
     # As the p-values are adjusted, the least one is a p-value of the hypothesis that the run follows its law.
     least = min(document.get("tests") or [], key=lambda test: test["p_adjusted"], default=None)
     keys = ("verdict", "unpredicted", "steps", "simulated_time", "law", "system_error", "node_errors", "bag", "rate")
-    causes = document.get("blame") or []
+    causes = document.get("causes") or []
     return {key: document.get(key) for key in keys} | {
         "p": least["p_adjusted"] if least else None,
         "least": least["name"] if least else None,
-        "blame": "; ".join(cause["words"] for cause in causes) or None,
+        "causes": "; ".join(cause["words"] for cause in causes) or None,
         "continuous": document.get("continuous"),
         "failure": "; ".join(document.get("failures") or []) or "data incomplete",
     }

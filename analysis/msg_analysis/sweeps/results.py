@@ -21,10 +21,10 @@ import numpy as np
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import HALF_WIDTH_95, agent_text, json_text
 from msg_analysis.errors import ExitCode, InputError
-from msg_analysis.experiment.spec import is_number
 from msg_analysis.experiment.problems import show
+from msg_analysis.experiment.spec import is_number
 from msg_analysis.inference.statistics import holm
-from msg_analysis.sweeps.grid import Sweep
+from msg_analysis.sweeps.grid import SweepGrid
 from msg_analysis.sweeps.points import DONE, FAILED, Outcome
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ _FIELDS = {field.name for field in fields(Outcome)}
 
 Row = dict[str, Any]
 _LEFT_OUT = {"agents", "stationary", "failure", "bag", "verdict"}
-_ESTIMATE = ("measured", "predicted", "standard_error", "z", "p", "p_holm")
+_ESTIMATE = ("measured", "predicted", "standard_error", "z", "p", "p_adjusted")
 
 _KEYS = {
     "agents": "number of agents",
@@ -148,7 +148,7 @@ def _read(path: Path) -> tuple[dict[str, Outcome], int, int]:
 class SweepVerdict:
     """What the runs of a sweep say together; the tuples are in the order of the outcomes."""
 
-    p_holm: tuple[float | None, ...]  # p-values, adjusted over all of them (Holm); None where there is none
+    p_adjusted: tuple[float | None, ...]  # p-values, adjusted over all of them (Holm); None where there is none
     verdicts: tuple[str | None, ...]  # "agrees", "disagrees", "unpredicted"; None for predictions and failures
     # "disagrees" if any run does; else "incomplete" if anything failed; else "agrees", or None for predictions. Runs
     # that are all "unpredicted" count as "agrees".
@@ -180,7 +180,7 @@ def evaluate_sweep(outcomes: Sequence[Outcome], level: float) -> SweepVerdict:
     return SweepVerdict(tuple(adjusted), tuple(verdicts), "disagrees" if "disagrees" in verdicts else whole)
 
 
-def rows_of(sweep: Sweep, outcomes: Sequence[Outcome], verdict: SweepVerdict) -> list[Row]:
+def rows_of(sweep: SweepGrid, outcomes: Sequence[Outcome], verdict: SweepVerdict) -> list[Row]:
     """One row for each point, by name of the column; without columns that are empty in all."""
     rows = []
     for number, (point, outcome) in enumerate(zip(sweep.points, outcomes, strict=True)):
@@ -189,7 +189,7 @@ def rows_of(sweep: Sweep, outcomes: Sequence[Outcome], verdict: SweepVerdict) ->
             row |= {"repetition": point.repetition + 1, "seed": point.seed}
         row |= {"status": outcome.status, "reason": outcome.reason}
         if sweep.kind != "predict":
-            row |= {"verdict": verdict.verdicts[number], "p_holm": verdict.p_holm[number]}
+            row |= {"verdict": verdict.verdicts[number], "p_adjusted": verdict.p_adjusted[number]}
         for key, value in outcome.result.items():
             if key not in _LEFT_OUT:
                 row |= _columns(key, value)
@@ -254,7 +254,7 @@ def write_tables(rows: Sequence[Row], document: Mapping[str, Any], directory: Pa
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class PlotPoint:
     """The rows of one combination of values, repetitions taken together."""
 
     x: Any  # value of the key along the axis
@@ -271,7 +271,7 @@ class Series:
     """Places along the axis."""
 
     values: tuple[tuple[str, Any], ...]  # of the other keys that have several
-    places: tuple[Place, ...]  # in the order of the axis
+    places: tuple[PlotPoint, ...]  # in the order of the axis
 
     @property
     def label(self) -> str:
@@ -295,7 +295,7 @@ class Picture:
         return ", ".join(f"{key_words(key, self.names)} = {value_text(value)}" for key, value in values)
 
     @property
-    def places(self) -> list[Place]:
+    def places(self) -> list[PlotPoint]:
         """Those of all series."""
         return [place for series in self.series for place in series.places]
 
@@ -310,12 +310,12 @@ class Picture:
         return all(is_number(place.x) for place in self.places)
 
 
-def several_values(sweep: Sweep) -> list[str]:
+def several_values(sweep: SweepGrid) -> list[str]:
     """The keys with several values, in the order of the file."""
     return [key for key, values in sweep.spec.over.items() if len(values) > 1]
 
 
-def picture(sweep: Sweep, rows: Sequence[Row], column: str | None = None, along: str | None = None) -> Picture:
+def picture(sweep: SweepGrid, rows: Sequence[Row], column: str | None = None, along: str | None = None) -> Picture:
     """What to draw of ``rows_of``: a column over the key ``along``. InputError: it is not a column of numbers."""
     wanted = column or "system_error"  # stands for what is measured or predicted of it
     names = _drawn_columns(rows, wanted)
@@ -362,7 +362,7 @@ def _numeric(rows: Sequence[Row]) -> set[str]:
     return {name for name, values in given.items() if values and all(map(is_number, values))}
 
 
-def _place(along: str, rows: Sequence[Row], names: Mapping[str, str | None]) -> Place:
+def _place(along: str, rows: Sequence[Row], names: Mapping[str, str | None]) -> PlotPoint:
     """The mean of repetitions, and the 95 % interval of the mean."""
     numbers = {
         key: [float(row[name]) for row in rows if row.get(name) is not None] if name else []
@@ -377,10 +377,10 @@ def _place(along: str, rows: Sequence[Row], names: Mapping[str, str | None]) -> 
     known = value is not None and half is not None
     low, high = (value - half, value + half) if known else (None, None)  # type: ignore[operator]
     reason = next((row["reason"] for row in rows if row.get("reason")), None) if value is None else None
-    return Place(rows[0][along], value, low, high, predicted, reference, reason)
+    return PlotPoint(rows[0][along], value, low, high, predicted, reference, reason)
 
 
-def _logarithmic(sweep: Sweep, along: str) -> bool:
+def _logarithmic(sweep: SweepGrid, along: str) -> bool:
     """As the file says; else whether all values are numbers > 0 that span a factor of 50 or more."""
     axis = sweep.spec.over[along]
     if axis.logarithmic is not None:

@@ -24,7 +24,7 @@ from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.propagator import Flow, Power
 from msg_analysis.theory.rational_krylov import RationalFlow, slowest_rate
 from msg_analysis.theory.solvers import IterativeSolver, homogeneous_propagator, mean_propagator
-from msg_analysis.theory.transient import MAX_UNKNOWNS, Snapshot, advance, distance, joint_flow, joint_stack, unknowns
+from msg_analysis.theory.transient import MAX_UNKNOWNS, MomentsAt, advance, distance, joint_flow, joint_stack, unknowns
 
 CERTAIN = 1e-6  # largest relative change of a rate by changes of the matrices of relative size ``components.CHANGE``
 MAX_ARNOLDI = 10_000  # unknowns in continuous time: each of some 50 iterations solves the coupled equations
@@ -97,7 +97,7 @@ def _by_rational_krylov(system: JumpSystem, rng: np.random.Generator | None) -> 
         steady = MomentSolver(replace(system, noise=np.stack([np.diag(sizes)] * system.modes))).steady()
     except InputError:
         return None
-    stack = joint_stack(Snapshot(np.zeros(system.modes), np.zeros(0), steady))
+    stack = joint_stack(MomentsAt(np.zeros(system.modes), np.zeros(0), steady))
     return RationalFlow(system, stack, slowest_rate(system, steady), decays=True).slowest
 
 
@@ -141,7 +141,7 @@ MAX_STEPS = 1_000_000
 def settling_time(
     system: JumpSystem,
     steady: FloatArray,
-    start: Snapshot,
+    start: MomentsAt,
     fraction: float = FRACTION,
     *,
     most_unknowns: int = MAX_UNKNOWNS,
@@ -242,7 +242,7 @@ def _searched(flow: Flow, judge: _Judge, start: FloatArray, time: Time) -> float
     return ticks * tick + float(brentq(excess, 0.0, tick, xtol=1e-9 * tick))
 
 
-def _stepped(system: JumpSystem, judge: _Judge, away: Snapshot) -> float:
+def _stepped(system: JumpSystem, judge: _Judge, away: MomentsAt) -> float:
     """The same by single steps. Discrete time."""
     last = -1
     for step in range(MAX_STEPS):

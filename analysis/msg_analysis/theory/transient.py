@@ -40,7 +40,7 @@ MAX_STEPS = 10_000_000  # most single steps (discrete time, beyond MAX_UNKNOWNS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Snapshot:
+class MomentsAt:
     """The paper's pi, nu and c at one time, in reduced coordinates."""
 
     law: FloatArray  # (n,) pi_i = P(g = i)
@@ -110,20 +110,20 @@ class Transient:
         return self.system.lifted(self.moments)
 
 
-def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | None = None) -> Snapshot:
+def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | None = None) -> MomentsAt:
     """Agents at a known place (m,), x(0) or its deviation from the reference; ``law``: (n,) of g(0), or stationary."""
     law = system.stationary if law is None else law
-    return Snapshot(law, np.multiply.outer(law, system.reduced(deviation)), system.started(deviation[None], law))
+    return MomentsAt(law, np.multiply.outer(law, system.reduced(deviation)), system.started(deviation[None], law))
 
 
-def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray) -> Snapshot:
+def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray) -> MomentsAt:
     """The start that the experiment defines, for one of its laws; ``stationary``: (n, d, d) steady second moments."""
     law = system.stationary
     if experiment.switching.initial != "stationary":
         law = system.of_modes(first_graph(experiment))
     start = experiment.run.start
     if start == "stationary":
-        return Snapshot(law, np.zeros((system.modes, system.dimension)), system.started_steady(stationary, law))
+        return MomentsAt(law, np.zeros((system.modes, system.dimension)), system.started_steady(stationary, law))
     place = np.zeros(experiment.agents) if start == "zero" else np.array(start, dtype=float)
     return point_start(system, place - experiment.reference, law)
 
@@ -185,7 +185,7 @@ def unreduced_consensus(experiment: Experiment) -> JumpSystem:
 
 def transient(
     system: JumpSystem,
-    start: Snapshot,
+    start: MomentsAt,
     times: FloatArray,
     steady: FloatArray | None = None,
     *,
@@ -224,7 +224,7 @@ def joint_flow(
 
 
 def _powered(
-    system: JumpSystem, start: Snapshot, times: FloatArray, steady: FloatArray | None, most_unknowns: int
+    system: JumpSystem, start: MomentsAt, times: FloatArray, steady: FloatArray | None, most_unknowns: int
 ) -> Transient:
     """By powers of matrices."""
     longest = float(times[-1]) or 1.0
@@ -232,7 +232,7 @@ def _powered(
     def slow() -> float:
         return 1.0 / longest if steady is None else max(1.0 / longest, slowest_rate(system, steady))
 
-    def course(snapshot: Snapshot, when: FloatArray, *, decays: bool) -> tuple[FloatArray, FloatArray]:
+    def course(snapshot: MomentsAt, when: FloatArray, *, decays: bool) -> tuple[FloatArray, FloatArray]:
         stack = joint_stack(snapshot)
         joint = joint_flow(system, stack, slow, decays=decays, most_unknowns=most_unknowns).grid(stack, when)
         return joint[:, :, :-1], joint[:, :, -1]
@@ -256,24 +256,24 @@ def _powered(
     return Transient(system, times, laws, means, packed_symmetric.unpack(packed, system.dimension))
 
 
-def distance(system: JumpSystem, snapshot: Snapshot, steady: FloatArray) -> Snapshot:
+def distance(system: JumpSystem, snapshot: MomentsAt, steady: FloatArray) -> MomentsAt:
     """The distance of the snapshot from the steady state, which obeys the same equations."""
-    return Snapshot(snapshot.law - system.stationary, snapshot.means, snapshot.moments - steady)
+    return MomentsAt(snapshot.law - system.stationary, snapshot.means, snapshot.moments - steady)
 
 
-def joint_stack(snapshot: Snapshot) -> FloatArray:
+def joint_stack(snapshot: MomentsAt) -> FloatArray:
     """(n, p + 1) packed second moments and probability of every mode."""
     return np.concatenate([packed_symmetric.pack(snapshot.moments), snapshot.law[:, None]], axis=1)
 
 
-def advance(system: JumpSystem, snapshot: Snapshot) -> Snapshot:
+def advance(system: JumpSystem, snapshot: MomentsAt) -> MomentsAt:
     """One step, of a snapshot or of its distance from the steady state. Discrete time."""
     moments, law = system.advance(snapshot.moments, snapshot.law)
     moved = np.einsum("nab,nb->na", system.matrices, snapshot.means)
-    return Snapshot(law, system.chain.T @ moved, moments)
+    return MomentsAt(law, system.chain.T @ moved, moments)
 
 
-def _stepped(system: JumpSystem, start: Snapshot, times: FloatArray, steady: FloatArray | None) -> Transient:
+def _stepped(system: JumpSystem, start: MomentsAt, times: FloatArray, steady: FloatArray | None) -> Transient:
     """By single steps, which need no matrix of the whole. Discrete time."""
     n, d = system.modes, system.dimension
     now = start if steady is None else distance(system, start, steady)

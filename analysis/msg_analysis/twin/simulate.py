@@ -25,7 +25,7 @@ from msg_analysis.experiment.problems import problem
 from msg_analysis.experiment.protocols import AgentProtocol
 from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.model.agent_law import ProcessNoise, ProtocolLaw
-from msg_analysis.model.graph_path import mode_path, past_modes, sojourns
+from msg_analysis.model.graph_path import holding_periods, mode_path, past_modes
 from msg_analysis.model.reception import Air, AirReception, MessagesUsed, add_broadcast_noise, ahead
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
@@ -288,7 +288,7 @@ KEY_SIZE = 32  # bytes
 def new_record(experiment: Experiment, run: uuid.UUID | None = None) -> RunRecord:
     """Everything that a new run of an experiment starts from; ``run``: its id, a new random one if not given."""
     model = build_model(experiment)
-    start = draw_start(experiment, model, next(sojourns(experiment, model.initial)).mode)
+    start = draw_start(experiment, model, next(holding_periods(experiment, model.initial)).mode)
     if experiment.protocol and not isinstance(model, StepModel):
         start = np.array([AgentProtocol(experiment.protocol, i).start(x).ravel() for i, x in enumerate(start)])
     matrices = None

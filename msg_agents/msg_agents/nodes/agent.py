@@ -267,7 +267,7 @@ class Agent(NetworkNode):
         raise NotImplementedError
 
     def learn(self, graph: ActiveGraph) -> str | None:
-        """Take a sojourn of the graph; the reason if it is refused, else None."""
+        """Take a holding period of the graph; the reason if it is refused, else None."""
         raise NotImplementedError
 
     def end_at(self, step: int) -> None:

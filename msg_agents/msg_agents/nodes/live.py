@@ -102,7 +102,7 @@ class Live(Watcher):
             self._estimate.add(agent, step, mode, value, published=True)
 
     def _receive_graph(self, data: bytes) -> None:
-        """Take a sojourn of the network's graph, as the reader of bags does."""
+        """Take a holding period of the network's graph, as the reader of bags does."""
         assert self.record is not None
         assert self._estimate is not None
         found, experiment = decode_of_run(ActiveGraph, data, self.record.run.bytes), self.record.experiment
@@ -110,7 +110,7 @@ class Live(Watcher):
             self._refuse(found)
         elif not (1 <= found.mode <= len(experiment.graph_list) and found.first_step <= found.last_step):
             self._refuse(Refusal.GRAPH_OUT_OF_RANGE)
-        elif not self._estimate.add_sojourn(found.first_step, found.last_step, found.mode - 1):
+        elif not self._estimate.add_holding_period(found.first_step, found.last_step, found.mode - 1):
             self._refuse(Refusal.CONTRADICTION)
 
     def _ends(self) -> None:

@@ -104,7 +104,7 @@ class LockstepAgent(Agent):
             self._publish_state(mode + 1)
             if time.monotonic() >= self._next_progress or synchronizer.finished:
                 self._report()
-        # It may have used up all published sojourns since its last report, and the switcher waits for the next one.
+        # It may have used all published holding periods since its last report, for whose successor the switcher waits.
         if synchronizer.awaits_graph and law.step > self._reported and not self._will_report:
             self._will_report = True
             after(self, max(0.0, self._next_progress - time.monotonic()), self._report_later)

@@ -51,10 +51,10 @@ class Recorder(NetworkNode):
         if experiment.truth:
             self._kinds.append(StateReceiver(record, topics.TRUTHS, topics.TRUTH, self._root))
         self._newest = [np.full(experiment.agents, -1) for _ in self._kinds]  # steps of each kind that have come
-        self._known_graph = -1  # last step of the newest sojourn that has come
-        self._next_sojourn = 0  # the first one that has not been written
-        self._sojourns: dict[int, int] = {}  # of those written after it: last step by number
-        # Topics whose last message (last state, last sojourn, experiment) has not arrived.
+        self._known_graph = -1  # last step of the newest holding period that has come
+        self._next_holding = 0  # the first one that has not been written
+        self._holding_periods: dict[int, int] = {}  # of those written after it: last step by number
+        # Topics whose last message (last state, last holding period, experiment) has not arrived.
         self._awaiting = {topic.name for topic in recorded} - {self._root + topics.STOP.name}
         self._stopped = False  # whether it is known that the run ends early
         if record.until:
@@ -126,13 +126,13 @@ class Recorder(NetworkNode):
         graph = self.accepted(self.rules.graph(data), topics.GRAPH)
         if graph is None:
             return
-        if graph.sequence in self._sojourns:
+        if graph.sequence in self._holding_periods:
             self.refuse(Refusal.REPEATED, topics.GRAPH.name)
             return
-        self._sojourns[graph.sequence] = graph.last_step
-        while self._next_sojourn in self._sojourns:
-            self.rules.forget(self._sojourns.pop(self._next_sojourn) + 1)
-            self._next_sojourn += 1
+        self._holding_periods[graph.sequence] = graph.last_step
+        while self._next_holding in self._holding_periods:
+            self.rules.forget(self._holding_periods.pop(self._next_holding) + 1)
+            self._next_holding += 1
         until = self._step_clock.nanoseconds(graph.last_step + 1)
         self._known_graph = max(self._known_graph, graph.last_step)
         self._write(topics.GRAPH, data, graph.stamp, until, last=graph.last_step >= self._last - 1)

@@ -25,19 +25,19 @@ from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.common.files import write_whole
 from msg_analysis.messages import topics
-from msg_analysis.messages.acceptance import Refusal, sojourn_message
+from msg_analysis.messages.acceptance import Refusal, graph_message
 from msg_analysis.messages.messages import encode_string
 from msg_analysis.messages.topics import agent_node_name
-from msg_analysis.model.graph_path import Sojourn, sojourns
+from msg_analysis.model.graph_path import HoldingPeriod, holding_periods
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import Wiring
 
-# Sojourns that are published before the slowest agent reaches them: enough that no agent waits for one; bounded, so
+# Holding periods that are published before the slowest agent reaches them: enough that no agent waits; bounded, so
 # that a long run takes little memory, and below the 5,000 messages that a late reader gets.
 MOST_AHEAD = 1000
 # Graphs of many agents are large messages, and their agents are slow: only as many as fit BYTES_AHEAD.
 LEAST_AHEAD, BYTES_AHEAD = 50, 1 << 22
-MOST_BEHIND = 5000  # sojourns that a reader may be behind: the messages that the middleware keeps of a writer
+MOST_BEHIND = 5000  # holding periods that a reader may be behind: the messages that the middleware keeps of a writer
 REPORT_PERIOD = 0.1  # s
 STOP_NOTICE = 1.0  # s in real time between the news of an early end and that end: time for all nodes to receive it
 EPOCH_DELAY = SECOND // 2  # ns of the clock from its publication to the epoch: time for all nodes to receive it
@@ -60,7 +60,7 @@ class Switcher(NetworkNode):
     ) -> None:
         super().__init__("switcher", record=record)
         self._ack_timeout = ack_timeout
-        self._path = sojourns(record.experiment, model.initial)
+        self._path = holding_periods(record.experiment, model.initial)
         self._steps = record.experiment.steps
         self._reached = [-1] * model.agents
         self._slowest = -1
@@ -164,26 +164,26 @@ class Switcher(NetworkNode):
             self._new_progress = False
             self._on_progress(self._reached)
 
-    def _publish_sojourn(self, sojourn: Sojourn) -> int:
-        """Publish a sojourn; the size of its message [bytes]."""
-        message = sojourn_message(self.record, sojourn).encode()
+    def _publish_graph(self, holding: HoldingPeriod) -> int:
+        """Publish a holding period; the size of its message [bytes]."""
+        message = graph_message(self.record, holding).encode()
         self.publish(self._graph, message)
         return len(message)
 
 
 class LockstepSwitcher(Switcher):
-    """Keeps a bounded number of sojourns ahead of the agents; parameters as in ``Switcher``."""
+    """Keeps a bounded number of holding periods ahead of the agents; parameters as in ``Switcher``."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         # A state file means that part of the path has been published; how much is not known.
         self._behind = bool(self._state_file and self._state_file.exists())
-        self._ahead: deque[Sojourn] = deque()  # published sojourns that the slowest agent has not reached
+        self._ahead: deque[HoldingPeriod] = deque()  # published holding periods that the slowest agent has not reached
         self._most_ahead = MOST_AHEAD
 
     def _health(self, values: dict[str, str]) -> Health:
-        values["sojourns ahead of it"] = str(len(self._ahead))
-        return Health(f"{len(self._ahead)} sojourns ahead of step {self._slowest}", values=values)
+        values["holding periods ahead of it"] = str(len(self._ahead))
+        return Health(f"{len(self._ahead)} holding periods ahead of step {self._slowest}", values=values)
 
     def begin(self) -> None:
         """Publish the experiment and the beginning of the path."""
@@ -201,30 +201,30 @@ class LockstepSwitcher(Switcher):
         while self._ahead and self._ahead[0].first_step <= slowest:
             self._on_graph(self._ahead.popleft().mode)
         while len(self._ahead) < self._most_ahead:
-            sojourn = next(self._path, None)
-            if sojourn is None:
+            holding = next(self._path, None)
+            if holding is None:
                 return
-            self._go_ahead(sojourn)
+            self._go_ahead(holding)
 
     def _catch_up(self, slowest: int) -> None:
         """Publish again what may not have been delivered when the process before this one ended."""
-        recent: deque[Sojourn] = deque(maxlen=MOST_BEHIND)
-        for sojourn in self._path:
-            recent.append(sojourn)
-            if sojourn.last_step >= slowest:
+        recent: deque[HoldingPeriod] = deque(maxlen=MOST_BEHIND)
+        for holding in self._path:
+            recent.append(holding)
+            if holding.last_step >= slowest:
                 break
-        for sojourn in recent:
-            self._go_ahead(sojourn)
+        for holding in recent:
+            self._go_ahead(holding)
         self._behind = False
 
-    def _go_ahead(self, sojourn: Sojourn) -> None:
-        size = self._publish_sojourn(sojourn)
+    def _go_ahead(self, holding: HoldingPeriod) -> None:
+        size = self._publish_graph(holding)
         self._most_ahead = min(self._most_ahead, max(LEAST_AHEAD, BYTES_AHEAD // size))
-        self._ahead.append(sojourn)
+        self._ahead.append(holding)
 
 
 class RealtimeSwitcher(Switcher):
-    """Sets the epoch of simulated time, and publishes each sojourn when it begins; parameters as in ``Switcher``."""
+    """Sets the epoch of simulated time, publishes each holding period when it begins; parameters as in ``Switcher``."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
@@ -294,16 +294,16 @@ class RealtimeSwitcher(Switcher):
         self._keep_up()
 
     def _keep_up(self) -> None:
-        """Publish every sojourn that has begun; the first one before the epoch."""
+        """Publish every holding period that has begun; the first one before the epoch."""
         assert self._schedule is not None
         simulated = self._schedule.simulated(self._timer.now())
-        begun: deque[Sojourn] = deque(maxlen=MOST_BEHIND)
+        begun: deque[HoldingPeriod] = deque(maxlen=MOST_BEHIND)
         while self._next and (self._next.first_step == 0 or self._schedule.due(self._next.first_step) <= simulated):
             begun.append(self._next)
             self._next = next(self._path, None)
-        for sojourn in begun:
-            self._publish_sojourn(sojourn)
-            self._on_graph(sojourn.mode)
+        for holding in begun:
+            self._publish_graph(holding)
+            self._on_graph(holding.mode)
         if self._next:
             self._timer.set(self._schedule.clock_time(self._next.first_step))
 

@@ -32,7 +32,7 @@ class StatusSummary:
     waiting: dict[str, str] = field(default_factory=dict)  # by node, what it waits for; only nodes that wait
 
     def rejected_messages(self) -> list[dict[str, Any]]:
-        """Key ``strangers`` of result.json: refused messages by node, topic and reason, with their counts."""
+        """Key ``rejected_messages`` of result.json: refused messages by node, topic and reason, with their counts."""
         return [
             {"node": node, "topic": topic, "reason": reason, "count": count}
             for (node, topic, reason), count in sorted(self.refused.items())
@@ -129,7 +129,7 @@ class RunResult:
         steps of the slowest agent per second of wall time
     restarts
         processes that were killed, or crashed, and were started again, one line each
-    strangers
+    rejected_messages
         messages that the nodes refused: dictionaries with "node", "topic", "reason", "count"
     events
         when processes were killed and back, and messages first refused: see ``EventLog``
@@ -158,7 +158,7 @@ class RunResult:
     wall_time: float = 0.0
     rate: float = 0.0
     restarts: list[str] = field(default_factory=list)
-    strangers: list[dict[str, Any]] = field(default_factory=list)
+    rejected_messages: list[dict[str, Any]] = field(default_factory=list)
     events: list[dict[str, Any]] = field(default_factory=list)
     reached: int = -1
     until: dict[str, Any] | None = None
@@ -199,7 +199,7 @@ class RunResult:
             "wall_time": self.wall_time,
             "restarts": self.restarts,
             "events": self.events,
-            "strangers": self.strangers,
+            "rejected_messages": self.rejected_messages,
             "failures": self.failures,
             "clocks": self.clocks,
             "channel": self.channel,
@@ -259,7 +259,7 @@ def conclude(result: RunResult, report: ReportWhen = "always") -> None:
             comparison,
             file,
             restarts=result.restarts,
-            strangers=result.strangers,
+            rejected_messages=result.rejected_messages,
             events=result.events,
             wall_time=result.wall_time,
             channel=result.channel,

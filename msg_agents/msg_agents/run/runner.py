@@ -203,7 +203,7 @@ def run_network(
                     result.until = ending.to_json() if ending else None
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
                     _collect_failures(supervisor, result, signals, restarts)
-            result.strangers = supervisor.status().rejected_messages()
+            result.rejected_messages = supervisor.status().rejected_messages()
             result.clocks, _ = supervisor.clocks()
             if linked:
                 result.channel = linked.to_json(supervisor, experiment)

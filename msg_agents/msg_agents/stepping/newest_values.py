@@ -64,10 +64,10 @@ class NewestValues(AgentInputs[Value]):
         self._reached = NOTHING  # what ``reach`` gave when it was asked last: a clock is not read for every message
         self._values: dict[int, Value] = {}
         self._mode: int | None = None
-        self._first_step = NOTHING  # of the newest sojourn
+        self._first_step = NOTHING  # of the newest holding period
 
     def learn(self, mode: int, first_step: int) -> str | None:
-        """Take a sojourn of the run's path as the newest; None if taken, else a ``Refusal``."""
+        """Take a holding period of the run's path as the newest; None if taken, else a ``Refusal``."""
         if first_step <= self._first_step:  # one that is missing before it was over before it arrived here
             return Refusal.REPEATED
         if not self._within_reach(first_step):

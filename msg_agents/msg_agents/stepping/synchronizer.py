@@ -152,7 +152,7 @@ class Synchronizer(AgentInputs[Value]):
         self._uses = [_Uses.of([self._places[j] for j in row], len(self._places)) for row in self._inputs]
         self._limit = NOTHING if self._newest else self.steps  # no step up to this one is too far ahead of a peer
         self._known: deque[tuple[int, int]] = deque()  # mode, and the last step with it
-        # Number of the next sojourn; None: any, since a process that takes over starts in the middle.
+        # Number of the next holding period; None: any, since a process that takes over starts in the middle.
         self._sequence: int | None = 0 if self.step == 0 else None
         self._unplanned = self.step  # first step whose graph is not known
         self._needed: _Uses | None  # by the next step, if its graph is known
@@ -161,7 +161,7 @@ class Synchronizer(AgentInputs[Value]):
         self._prepare()
 
     def learn(self, sequence: int, mode: int, first_step: int, last_step: int) -> str | None:
-        """Take the next sojourn (steps ``first_step`` to ``last_step``); None if taken, else a ``Refusal``."""
+        """Take the next holding period (steps ``first_step`` to ``last_step``); None if taken, else a ``Refusal``."""
         if self._sequence is None:
             if last_step < self.step:
                 return Refusal.REPEATED

@@ -24,7 +24,7 @@ from msg_analysis.common.resources import one_blas_thread
 from msg_analysis.errors import InputError
 from msg_analysis.messages.messages import STATE_HEAD, STATE_MODE
 from msg_analysis.messages.topics import agent_node_name
-from msg_analysis.model.graph_path import Sojourn, sojourns
+from msg_analysis.model.graph_path import HoldingPeriod, holding_periods
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import first_graph
 
@@ -154,10 +154,10 @@ class RunObserver:
         self._record, self._reader = record, CheckpointReader(record, checkpoints)
         self._newest = -1
         self._last: int | None = None  # last step, where the run ends early
-        self._path: Iterator[Sojourn] | None = None
+        self._path: Iterator[HoldingPeriod] | None = None
         if record.experiment.run.pace == "realtime":
-            self._path = sojourns(record.experiment, first_graph(record.experiment))
-        self._sojourns_until = 0
+            self._path = holding_periods(record.experiment, first_graph(record.experiment))
+        self._path_until = 0
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="observer", daemon=True)
         self._thread.start()
@@ -199,7 +199,7 @@ class RunObserver:
         while time.monotonic() < deadline and not (deadline == math.inf and self._over.is_set()):
             found = self._reader.take(self._newest if self._last is None else min(self._newest, self._last))
             if (logged := self._reader.logged) is not None:
-                self._add_sojourns(estimate, int(logged.steps.max(initial=0)))
+                self._add_path(estimate, int(logged.steps.max(initial=0)))
                 estimate.add_logged(logged)
             if not len(found[0]):
                 break
@@ -214,14 +214,14 @@ class RunObserver:
 
             self.reached = reached(self._record.until, report)
 
-    def _add_sojourns(self, estimate: LiveEstimate, newest: int) -> None:
+    def _add_path(self, estimate: LiveEstimate, newest: int) -> None:
         """In real time: the graph of the network up to a step, as the nodes know it; they refuse any other."""
-        while self._path is not None and newest >= self._sojourns_until:
-            sojourn = next(self._path, None)
-            if sojourn is None:
+        while self._path is not None and newest >= self._path_until:
+            holding = next(self._path, None)
+            if holding is None:
                 break
-            estimate.add_sojourn(sojourn.first_step, sojourn.last_step, sojourn.mode)
-            self._sojourns_until = sojourn.last_step + 1
+            estimate.add_holding_period(holding.first_step, holding.last_step, holding.mode)
+            self._path_until = holding.last_step + 1
 
     def _add_stamps(self, estimate: LiveEstimate, steps: IntArray) -> None:
         from msg_analysis.inference.online_steps import WINDOW

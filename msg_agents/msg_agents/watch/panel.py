@@ -90,7 +90,7 @@ def panel_of(snapshot: Snapshot, experiment: Experiment, *, width: int, height: 
 
 def plain_line(snapshot: Snapshot, experiment: Experiment) -> str:
     """The same as one line of text."""
-    graph = "" if snapshot.sojourn is None else f"graph {experiment.graph_list[snapshot.sojourn.mode].name}"
+    graph = "" if snapshot.holding is None else f"graph {experiment.graph_list[snapshot.holding.mode].name}"
     return ", ".join(_parts(snapshot, experiment, graph))
 
 
@@ -118,16 +118,16 @@ def _progress(snapshot: Snapshot, experiment: Experiment, width: int) -> Rendera
 
 def _graph(snapshot: Snapshot, experiment: Experiment) -> Text:
     text = Text("graph ", no_wrap=True, overflow="ellipsis")
-    sojourn = snapshot.sojourn
-    if sojourn is None:
+    holding = snapshot.holding
+    if holding is None:
         return text + Text("-")
-    graph = experiment.graph_list[sojourn.mode]
-    text.append(graph.name, style=f"bold {COLOURS[sojourn.mode % len(COLOURS)]}")
+    graph = experiment.graph_list[holding.mode]
+    text.append(graph.name, style=f"bold {COLOURS[holding.mode % len(COLOURS)]}")
     now, dt = snapshot.reached, experiment.step_length
-    # The end of the run cuts the last sojourn short.
-    end = "the end" if sojourn.last_step >= (snapshot.last or experiment.steps) - 1 else f"{sojourn.last_step + 1}"
-    held = (now - sojourn.first_step) * dt
-    text.append(f"  for {held:.3g} units of time, steps {sojourn.first_step} to {end}, after {sojourn.sequence} jumps")
+    # The end of the run cuts the last holding period short.
+    end = "the end" if holding.last_step >= (snapshot.last or experiment.steps) - 1 else f"{holding.last_step + 1}"
+    held = (now - holding.first_step) * dt
+    text.append(f"  for {held:.3g} units of time, steps {holding.first_step} to {end}, after {holding.sequence} jumps")
     return text
 
 

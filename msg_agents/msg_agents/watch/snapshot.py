@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from msg_analysis.common.text import agent_text
-from msg_analysis.model.graph_path import Sojourn, sojourns
+from msg_analysis.model.graph_path import HoldingPeriod, holding_periods
 from msg_analysis.model.step_model import first_graph
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 WINDOW = 3.0  # s over which speeds are measured
 GRAIN = 0.25  # s; least time between two measurements
-MOST_SOJOURNS = 500  # that are shown beside the states
+MOST_HOLDING_PERIODS = 500  # that are shown beside the states
 MOST_EVENTS = 50  # the newest, which a page gets
 MOST_TRACED = 20  # agents whose states a page gets
 SILENT = 1.0  # s without a new step after which a page shows an agent as silent; five periods where that is longer
@@ -82,16 +82,16 @@ class Presence:
         return [now - moved for moved in self._moved]
 
 
-class SojournFinder:
-    """Finds the sojourn of a step of a run."""
+class HoldingPeriods:
+    """Finds the holding period of a step of a run."""
 
     def __init__(self, experiment: Experiment) -> None:
-        self._rest: Iterator[Sojourn] = sojourns(experiment, first_graph(experiment))
+        self._rest: Iterator[HoldingPeriod] = holding_periods(experiment, first_graph(experiment))
         self._now = next(self._rest, None)
-        self._before: deque[Sojourn] = deque(maxlen=MOST_SOJOURNS)
+        self._before: deque[HoldingPeriod] = deque(maxlen=MOST_HOLDING_PERIODS)
 
-    def at(self, step: int) -> Sojourn | None:
-        """The sojourn of the step k -> k+1; steps must not decrease from call to call."""
+    def at(self, step: int) -> HoldingPeriod | None:
+        """The holding period of the step k -> k+1; steps must not decrease from call to call."""
         while self._now is not None and step > self._now.last_step:
             following = next(self._rest, None)
             if following is None:  # the end of the run
@@ -100,10 +100,10 @@ class SojournFinder:
             self._now = following
         return self._now
 
-    def since(self, step: int) -> list[Sojourn]:
-        """The sojourns from that of a step to the present one, the last ``MOST_SOJOURNS`` of them."""
+    def since(self, step: int) -> list[HoldingPeriod]:
+        """The holding periods from that of a step to the present one, the last ``MOST_HOLDING_PERIODS`` of them."""
         known = [*self._before, *([self._now] if self._now else [])]
-        return [sojourn for sojourn in known if sojourn.last_step >= step]
+        return [holding for holding in known if holding.last_step >= step]
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,13 +114,13 @@ class Snapshot:
     steps: list[int]
     rates: list[float] = field(default_factory=list)  # steps per second, as ``steps``; empty where not known
     rate: float | None = None  # steps per second of all agents together; None where not known
-    sojourn: Sojourn | None = None  # of the slowest agent's next step; None before the start
+    holding: HoldingPeriod | None = None  # of the slowest agent's next step; None before the start
     left: float | None = None  # s until the end at this ``rate``; None where not known
     report: LiveReport | None = None  # the errors up to now
     note: str | None = None  # about the errors
     ages: list[float] = field(default_factory=list)  # s since each agent has made its newest step
     gone: frozenset[int] = frozenset()  # agents (from 0) without a process, or with one that has made no step yet
-    path: list[Sojourn] = field(default_factory=list)  # sojourns from the oldest of ``report.recent`` on
+    path: list[HoldingPeriod] = field(default_factory=list)  # holding periods from the oldest of ``report.recent`` on
     events: tuple[tuple[int, str], ...] = ()  # the newest ``MOST_EVENTS``: step that all had reached, text
     last: int | None = None  # last step of a run that ends before its planned end; None: not known to do so
 
@@ -137,7 +137,7 @@ class SnapshotSource:
     def __init__(self, experiment: Experiment, clock: Callable[[], float] = time.monotonic) -> None:
         self._steps = experiment.steps
         self._last: int | None = None  # where the run ends early
-        self._sojourns, self._rates = SojournFinder(experiment), StepRates(clock)
+        self._holding_periods, self._rates = HoldingPeriods(experiment), StepRates(clock)
         self._presence = Presence(experiment.names, clock)
         self._events: deque[tuple[int, str]] = deque(maxlen=MOST_EVENTS)
         self._refused: dict[str, int] = {}
@@ -169,10 +169,10 @@ class SnapshotSource:
         self._rates.add(steps)
         rates, rate = self._rates.rates()
         left = (self._steps - now.reached) / rate if rate else None
-        sojourn = self._sojourns.at(min(now.reached, self._steps - 1))
-        now = replace(now, rates=rates, rate=rate, left=left, sojourn=sojourn)
+        holding = self._holding_periods.at(min(now.reached, self._steps - 1))
+        now = replace(now, rates=rates, rate=rate, left=left, holding=holding)
         recent = report.recent if report else None
-        return now if recent is None else replace(now, path=self._sojourns.since(int(recent.steps[0])))
+        return now if recent is None else replace(now, path=self._holding_periods.since(int(recent.steps[0])))
 
 
 def run_description(experiment: Experiment) -> dict[str, Any]:
@@ -204,8 +204,8 @@ def run_description(experiment: Experiment) -> dict[str, Any]:
 
 
 def snapshot_document(snapshot: Snapshot, before: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """A snapshot for a page; unknown numbers are None, the graph counts from 0 and the sojourn from 1."""
-    report, sojourn = snapshot.report, snapshot.sojourn
+    """A snapshot for a page; unknown numbers are None, the graph counts from 0 and the holding period from 1."""
+    report, holding = snapshot.report, snapshot.holding
     recent = report.recent if report else None
     return {
         "steps": snapshot.steps if len(snapshot.steps) > 1 else [],
@@ -213,8 +213,8 @@ def snapshot_document(snapshot: Snapshot, before: Mapping[str, Any] | None = Non
         "last": snapshot.last,
         "rate": snapshot.rate or 0.0,
         "left": snapshot.left,
-        "graph": None if sojourn is None else sojourn.mode,
-        "sojourn": None if sojourn is None else [sojourn.sequence + 1, sojourn.first_step, sojourn.last_step],
+        "graph": None if holding is None else holding.mode,
+        "holding": None if holding is None else [holding.sequence + 1, holding.first_step, holding.last_step],
         "system": report.system.to_json() if report else None,
         "nodes": [node.to_json() for node in report.nodes] if report else None,
         "any_time": report.any_time.to_json() if report else None,
@@ -237,5 +237,5 @@ def _trace(snapshot: Snapshot, recent: Recent, before: Mapping[str, Any] | None)
     return {
         "steps": steps,
         "agents": [[float(f"{x:.4g}") for x in column] for column in recent.states.T[:MOST_TRACED].tolist()],
-        "sojourns": [[each.mode, each.first_step, each.last_step] for each in snapshot.path],
+        "path": [[each.mode, each.first_step, each.last_step] for each in snapshot.path],
     }

@@ -24,10 +24,10 @@ from msg_agents.environment import node_environment
 from msg_agents.nodes.recorder import Recorder, write_size
 from msg_agents.stepping.state_receiver import ReceivedSteps, StateReceiver
 from msg_agents.stepping.synchronizer import RESEND_LIMIT
-from msg_analysis.messages.acceptance import Refusal, sojourn_message
+from msg_analysis.messages.acceptance import Refusal, graph_message
 from msg_analysis.messages.cdr import encode_batch
 from msg_analysis.messages.messages import StateCodec
-from msg_analysis.model.graph_path import Sojourn
+from msg_analysis.model.graph_path import HoldingPeriod
 from msg_analysis.twin.simulate import new_record
 
 pytestmark = pytest.mark.filterwarnings("ignore:module .sre_:DeprecationWarning")  # of a package that rclpy imports
@@ -95,8 +95,8 @@ def test_memory_is_bounded_and_repeats_are_recorded_once(recorder: Recorder) -> 
 def test_sojourns_are_recorded_once(recorder: Recorder) -> None:
     """Of the record's path only; however often, and whatever else comes."""
     (receive,) = (s.callback for s in recorder.subscriptions if s.topic_name == "/graph")
-    sojourn = Sojourn(0, 0, 0, STEPS - 1)
-    true = sojourn_message(recorder.record, sojourn)
+    holding = HoldingPeriod(0, 0, 0, STEPS - 1)
+    true = graph_message(recorder.record, holding)
     for forged in (replace(true, mode=0), replace(true, last_step=10**9), replace(true, sequence=5)):
         receive(forged.encode())
     for _ in range(3):

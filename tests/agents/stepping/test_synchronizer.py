@@ -23,7 +23,7 @@ from msg_agents.stepping.synchronizer import HISTORY_STEPS, Synchronizer, _Uses
 from msg_analysis.messages.acceptance import Refusal
 
 PRIME = 2**61 - 1
-Sojourn = tuple[int, int, int, int]  # sequence, mode, first step, last step
+HoldingPeriod = tuple[int, int, int, int]  # sequence, mode, first step, last step
 Inputs = list[list[list[int]]]  # [mode][agent]: whom the agent uses
 
 
@@ -35,7 +35,7 @@ class Case:
     steps: int
     window: int
     inputs: Inputs
-    path: list[Sojourn]
+    path: list[HoldingPeriod]
     delay: int = 0
     lost: frozenset[tuple[int, int, int]] = frozenset()  # receiver, sender, step of the value
 
@@ -82,7 +82,7 @@ class Network:
     nodes: list[Synchronizer[int]] = field(init=False)
     states: list[list[int]] = field(init=False)  # [agent][step]
     links: dict[tuple[int, int], deque[tuple[int, int]]] = field(init=False)
-    graphs: list[deque[Sojourn]] = field(init=False)
+    graphs: list[deque[HoldingPeriod]] = field(init=False)
     unasked: set[tuple[int, int]] = field(default_factory=set)  # links over which a new process has not asked yet
     killed: bool = False
 
@@ -321,7 +321,7 @@ def explore(case: Case) -> Iterator[Network]:
     ],
     ids=["pair that parts and meets", "directed pair that turns round", "three of whom one is always alone"],
 )
-def test_every_order_of_a_small_network(agents: int, inputs: Inputs, path: list[Sojourn], window: int) -> None:
+def test_every_order_of_a_small_network(agents: int, inputs: Inputs, path: list[HoldingPeriod], window: int) -> None:
     case = Case(agents, path[-1][3] + 1, window, inputs, path)
     expected = serial(case)
     ends = 0

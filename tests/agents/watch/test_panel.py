@@ -17,9 +17,9 @@ from rich.console import Console
 
 from msg_agents.watch.panel import gauge, panel_of, plain_line
 from msg_agents.watch.snapshot import (
+    HoldingPeriods,
     Snapshot,
     SnapshotSource,
-    SojournFinder,
     StepRates,
     run_description,
     snapshot_document,
@@ -28,7 +28,7 @@ from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.online_errors import LiveEstimate, LiveReport
 from msg_analysis.inference.online_steps import WINDOW
-from msg_analysis.model.graph_path import Sojourn
+from msg_analysis.model.graph_path import HoldingPeriod
 from msg_analysis.twin.simulate import simulate
 
 
@@ -49,7 +49,7 @@ def _snapshot(agents: int, **changes: object) -> Snapshot:
         "steps": [4000 + i % 7 for i in range(agents)],
         "rates": [500.0 + i for i in range(agents)],
         "rate": 500.0,
-        "sojourn": Sojourn(41, 1, 3990, 4010),
+        "holding": HoldingPeriod(41, 1, 3990, 4010),
         "left": 61.2,
         "report": _report(agents),
     }
@@ -138,12 +138,12 @@ def test_the_sojourns_are_those_of_the_run() -> None:
     """Beside the path of the offline twin."""
     experiment = _experiment()
     modes = simulate(experiment).modes
-    path = SojournFinder(experiment)
+    path = HoldingPeriods(experiment)
     for step in range(0, 8000, 37):
-        sojourn = path.at(step)
-        assert sojourn is not None
-        assert sojourn.first_step <= step <= sojourn.last_step
-        assert (modes[sojourn.first_step : sojourn.last_step + 1] == sojourn.mode).all()
+        holding = path.at(step)
+        assert holding is not None
+        assert holding.first_step <= step <= holding.last_step
+        assert (modes[holding.first_step : holding.last_step + 1] == holding.mode).all()
     assert path.at(8000) is not None
 
 
@@ -155,7 +155,7 @@ def test_documents_for_the_page() -> None:
     assert len(found["places"]) == 5
     found = snapshot_document(_snapshot(5))
     assert found["system"]["measured"] == 1.45
-    assert found["sojourn"] == [42, 3990, 4010]
+    assert found["holding"] == [42, 3990, 4010]
     assert SnapshotSource(experiment).snapshot([]).reached == -1
 
 
@@ -173,7 +173,7 @@ def test_the_speed_of_agents_that_step_in_bursts() -> None:
 def test_a_run_that_ends_before_its_planned_end() -> None:
     """The steps are those that it has; what some agents did after its end does not count."""
     experiment = _experiment()
-    snapshot = _snapshot(5, last=4000, sojourn=Sojourn(41, 1, 3990, 4010), left=0.0)
+    snapshot = _snapshot(5, last=4000, holding=HoldingPeriod(41, 1, 3990, 4010), left=0.0)
     shown = _lines(snapshot, experiment, 120, 24)
     assert "step 4000 of 4000  100 %" in shown[1]
     assert "steps 3990 to the end" in shown[2]
@@ -216,7 +216,7 @@ def test_the_states_for_the_page_have_the_graphs_of_their_steps() -> None:
     trace = snapshot_document(source.snapshot([901] * 5, estimate.report()))["trace"]
     assert trace["steps"] == [*range(900 - WINDOW, 900)]
     assert trace["agents"] == pytest.approx(trajectory.states[900 - WINDOW : 900, :, 0].T, rel=1e-3)
-    graph = {step: mode for mode, first, last in trace["sojourns"] for step in range(first, last + 1)}
+    graph = {step: mode for mode, first, last in trace["holding times"] for step in range(first, last + 1)}
     assert [graph[step] for step in trace["steps"]] == trajectory.modes[900 - WINDOW : 900].tolist()
 
 

@@ -82,8 +82,8 @@ def test_extra_topics_in_a_namespace(run: Run, record: Record) -> None:
 
     def everything(messages: list[Message]) -> list[Message]:
         text = b"\x00\x01\x00\x00\x06\x00\x00\x00hello\x00"
-        strangers = [(f"/{name}", string, text) for name in ("chatter", "experiment", "agent_1/state", "camera/state")]
-        return strangers + [("/lab" + topic, kind, data) for topic, kind, data in messages] + strangers
+        others = [(f"/{name}", string, text) for name in ("chatter", "experiment", "agent_1/state", "camera/state")]
+        return others + [("/lab" + topic, kind, data) for topic, kind, data in messages] + others
 
     bag = record(everything)
     _same(read_bag(bag), run)

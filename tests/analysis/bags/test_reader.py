@@ -37,7 +37,7 @@ def _state(run: Run, k: int, i: int, /, **changes: Any) -> AgentState:
 
 
 def _messages(run: Run, namespace: str = "") -> list[Message]:
-    """What a faithful recorder would have: the experiment, a sojourn every four steps, the states."""
+    """What a faithful recorder would have: the experiment, a holding period every four steps, the states."""
     steps, agents, _ = run.states.shape
     out: list[Message] = [(f"{namespace}/experiment", "std_msgs/msg/String", encode_string(run.record.to_json()), 0)]
     for number, first in enumerate(range(0, steps - 1, 4)):
@@ -83,7 +83,7 @@ def _same(found: Run, run: Run) -> None:
 
 
 def test_what_is_missing(tmp_path: Path, make_run: MakeRun) -> None:
-    """Two states, and a sojourn that cannot be decoded, which is there a second time."""
+    """Two states, and a holding period that cannot be decoded, which is there a second time."""
     run = make_run()
     lost = [_state(run, k, i).encode() for k, i in ((5, 1), (40, 2))]
     kept = [message for message in _messages(run) if message[2] not in lost]

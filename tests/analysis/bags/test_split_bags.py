@@ -1,7 +1,7 @@
 """The files of a split bag follow each other in time and read alone; read and played together, nothing comes twice.
 
-The messages come as from a network: agents drift apart, and sojourns are published long before their time. Files are
-read by mcap's reader.
+The messages come as from a network: agents drift apart, and holding periods are published long before their time.
+Files are read by mcap's reader.
 """
 
 from collections.abc import Callable, Iterator
@@ -53,7 +53,7 @@ def unsplit(run: Run, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[st
 
 @pytest.fixture(scope="module")
 def arriving(unsplit: list[tuple[str, Any]]) -> list[tuple[str, bytes, int]]:
-    """As a recorder receives the run: agents are up to 15 steps apart, sojourns come up to 100 steps early."""
+    """As a recorder receives the run: agents are up to 15 steps apart, holding periods come up to 100 steps early."""
     # Each agent's states come in order.
     drift = {f"/agent_{i + 1}/state": 7.5 * np.sin(np.arange(STEPS + 1) / 20 + i) for i in range(AGENTS)}
     keyed = []

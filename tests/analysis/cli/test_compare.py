@@ -86,7 +86,7 @@ def test_the_level_is_that_of_the_verdict(tmp_path: Path) -> None:
     document = json.loads(result.stdout)
     assert (result.exit_code, document["verdict"]) == (1, "disagrees")
     assert document["level"] == pytest.approx(least * 1.01)
-    assert document["blame"]
+    assert document["causes"]
     document = json.loads(call("compare", tmp_path / "bag", "--json", "--level", least / 2).stdout)
     assert document["verdict"] == "agrees"
 

@@ -21,7 +21,7 @@ DOCUMENT = {"name": "pair", "graphs": LINE, "run": {"dt": 0.1, "duration": 20, "
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two runs, one of them compared, a folder of strangers, and two experiments."""
+    """Two runs, one of them compared, a foreign folder, and two experiments."""
     place = tmp_path_factory.mktemp("place")
     for seed in (7, 8):
         made = Experiment.parse(DOCUMENT).simulate(seed=seed)

@@ -105,7 +105,7 @@ def test_blame(case):
     assert low < first.estimate < high
     assert abs(first.estimate - truth) < 2.05 * (high - low) / 2
     assert first.p < 0.01
-    assert result.to_json()["blame"][0]["words"] == first.words
+    assert result.to_json()["causes"][0]["words"] == first.words
 
 
 def test_a_frozen_agent_is_the_only_cause():

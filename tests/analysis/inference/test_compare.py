@@ -144,7 +144,9 @@ def test_document(short_run):
     assert np.sum(document["switching"]["counts"]) == 499
     assert document["continuous"]["system_error"] == pytest.approx(1.3594132029339856, rel=1e-8)
     assert len(document["batch_means"]["interval"]) == 2
-    assert [test["rejected"] for test in document["tests"]] == [False] * 19  # too few sojourns for a test of these
+    assert [test["rejected"] for test in document["tests"]] == [
+        False
+    ] * 19  # too few holding periods for a test of these
 
 
 def test_many_agents_get_no_joint_test_but_all_numbers():
@@ -307,7 +309,7 @@ def test_heavy_tails_of_several_runs_and_live():
     ("document", "errors", "reason"),
     [
         (LINE_RING, "all_paths", None),
-        (LINE_RING | {"switching": {"generator": [[-0.03, 0.03], [0.03, -0.03]]}}, "given_path", "few_sojourns"),
+        (LINE_RING | {"switching": {"generator": [[-0.03, 0.03], [0.03, -0.03]]}}, "given_path", "few_switches"),
         (LINE_RING | {"switching": {"generator": [[-0.001, 0.001], [0.001, -0.001]]}}, "given_path", "short_run"),
         (LINE_RING | {"noise": {"process": 1.0, "loss": 0.2, "on_loss": "hold"}}, "given_path", "kept_values"),
     ],
@@ -316,7 +318,7 @@ def test_other_laws(document, errors, reason):
     found = compared(document)
     assert (found.trust.errors, found.trust.reason) == (errors, reason)
     assert found.to_json()["trust"]["reason"] == reason
-    assert bool(trust_words(found.to_json())) == (reason == "few_sojourns")
+    assert bool(trust_words(found.to_json())) == (reason == "few_switches")
 
 
 def test_real_time_has_none():

@@ -106,7 +106,7 @@ THREE = [[0.8, 0.1, 0.1], [0.3, 0.5, 0.2], [0.2, 0.2, 0.6]]
 SLOW = [[0.95, 0.05], [0.05, 0.95]]
 
 
-def sojourns(transition: list[list[float]], steps: int) -> HoldingTimes:
+def holding_periods(transition: list[list[float]], steps: int) -> HoldingTimes:
     """Sums of the law of an experiment in discrete time."""
     return HoldingTimes(law_of(json.dumps(transition), steps))
 
@@ -143,12 +143,12 @@ def law_of(transition: str, steps: int) -> Law:
 
 def test_sojourns_are_counted_as_by_a_loop() -> None:
     path = chain_path(SLOW, 900, 2)
-    sums = sojourns(SLOW, 900)
+    sums = holding_periods(SLOW, 900)
     for first in range(0, 900, 50):
         count(sums, path[first : first + 51])
     steps, left, age = np.zeros((2, PARTS)), np.zeros((2, PARTS)), 0
     for now, following in zip(path[:-1].tolist(), path[1:].tolist(), strict=True):
-        # Part p has the ages by which at least p, and fewer than p + 1, eighths of the sojourns have ended.
+        # Part p has the ages by which at least p, and fewer than p + 1, eighths of the holding periods have ended.
         part = int(np.floor(PARTS * (1.0 - 0.95**age) + 1e-9))
         steps[now, part] += 1
         left[now, part] += now != following
@@ -159,7 +159,7 @@ def test_sojourns_are_counted_as_by_a_loop() -> None:
 
 def test_the_statistic_of_sojourns_is_that_of_a_table() -> None:
     path = chain_path(SLOW, 20_000, 4)
-    sums = sojourns(SLOW, 20_000)
+    sums = holding_periods(SLOW, 20_000)
     count(sums, path)
     finding = sums.finding()
     tables = [np.vstack([left, steps - left]) for steps, left in zip(*sums.sums, strict=True)]
@@ -172,7 +172,7 @@ def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], s
     """Of 200 chains each; Kolmogorov-Smirnov at 1e-3."""
     p = []
     for seed in range(200):
-        sums = sojourns(transition, steps)
+        sums = holding_periods(transition, steps)
         count(sums, chain_path(transition, steps, seed))
         finding = sums.finding()
         p.append(np.exp(finding.log_p))
@@ -180,7 +180,7 @@ def test_sojourns_of_a_chain_have_even_p_values(transition: list[list[float]], s
 
 
 def test_few_sojourns_are_not_tested() -> None:
-    sums = sojourns(SLOW, 300)
+    sums = holding_periods(SLOW, 300)
     count(sums, chain_path(SLOW, 300, 1))
     assert sums.finding() is None
 
@@ -430,7 +430,7 @@ WORDS = {
     "correlation 0.05 of each agent's noise at lag 20": (
         r"the noise of all agents has correlation 0\.0[45]\S* \(.*\) with its own 20 steps before, not 0"
     ),
-    "gamma sojourns of shape 10": (
+    "gamma holding periods of shape 10": (
         r"the probability of leaving graph (line|ring) depends on how long it has lasted: it is .*, not 0.0476"
     ),
     "one innovation of 8 standard deviations": r"agent 4's noise is 8 standard deviations in step [\d,]+",

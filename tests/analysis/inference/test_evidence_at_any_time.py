@@ -179,7 +179,7 @@ def test_many_looks_in_one_pass_are_those_of_a_pass_each(changes: dict[str, Any]
 def test_in_a_comparison() -> None:
     comparison = compare(simulate(five(duration=200.0)))
     document = comparison.to_json()["any_time"]
-    assert not document["disagrees"]
+    assert not document["exceeded"]
     assert document["crossed_at"] is None
     assert document["threshold"] == 100.0
     assert document["evidence"] == pytest.approx(np.exp(document["log_evidence"]))

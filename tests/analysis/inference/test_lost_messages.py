@@ -14,7 +14,7 @@ def experiment(duration=400, **noise):
 
 
 def by_hand(trajectory, receiver, sender):
-    """(messages, unheard) of one link, message by message."""
+    """(messages, lost) of one link, message by message."""
     step = predict(trajectory.record.experiment).step
     prefix, modes = trajectory.prefix, trajectory.agent_modes[:, receiver].tolist()
     read, sent = trajectory.made[:, receiver].tolist(), trajectory.made[:, sender].tolist()
@@ -32,7 +32,7 @@ def by_hand(trajectory, receiver, sender):
         time, published = read[k + 1], sent[n]
         return published < time or (published == time and (used(k + step.delay) or -1) >= n)
 
-    messages = unheard = k = 0
+    messages = lost = k = 0
     last = prefix - step.delay - 1
     for n in range(1, prefix + 1):
         k = next((at for at in range(k, last) if there(n, at)), last)
@@ -40,8 +40,8 @@ def by_hand(trajectory, receiver, sender):
             continue
         uses = used(k + step.delay), used(k + step.delay + 1)
         if None not in uses:
-            messages, unheard = messages + 1, unheard + (n not in uses)
-    return messages, unheard
+            messages, lost = messages + 1, lost + (n not in uses)
+    return messages, lost
 
 
 def test_with_ideal_timers_every_message_is_heard():
@@ -61,8 +61,8 @@ def test_lost_messages_are_those_that_were_drawn(on_loss):
     assert abs(share - 0.2) < 4 * np.sqrt(0.2 * 0.8 / found.messages.sum())
     assert low < share < high
     assert found.words() is None
-    for (receiver, sender), messages, unheard in zip(found.links.tolist(), found.messages, found.lost, strict=True):
-        assert (messages, unheard) == by_hand(trajectory, receiver, sender)
+    for (receiver, sender), messages, lost in zip(found.links.tolist(), found.messages, found.lost, strict=True):
+        assert (messages, lost) == by_hand(trajectory, receiver, sender)
 
 
 def test_of_a_link_that_is_always_there_the_lost_ones_are_found():
@@ -104,13 +104,13 @@ def test_late_agents_and_messages(late_timers):
     slow = late_timers.run(what, slow=late_timers.busy(0.5, 2.5), late=late_timers.busy(0.3, 1.5))
     found = lost_messages(observed(slow))
     assert found.lost.sum() > 0
-    for (receiver, sender), messages, unheard in zip(found.links.tolist(), found.messages, found.lost, strict=True):
-        assert (messages, unheard) == by_hand(slow, receiver, sender)
+    for (receiver, sender), messages, lost in zip(found.links.tolist(), found.messages, found.lost, strict=True):
+        assert (messages, lost) == by_hand(slow, receiver, sender)
 
 
 def test_document():
     document = measure_timing(observed(simulate(experiment(loss=0.2, on_loss="hold")))).lost_messages.to_json()
-    assert document["unheard"] == sum(link["unheard"] for link in document["links"])
+    assert document["lost"] == sum(link["lost"] for link in document["links"])
     assert document["expected"] == pytest.approx(0.2)
     assert document["words"] is None
     assert {link["expected"] for link in document["links"]} == {0.2}

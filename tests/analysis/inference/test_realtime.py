@@ -275,7 +275,7 @@ def test_timing_by_hand(late_timers):
     assert late.missed == 1
     assert late.lateness_ms["max"] == pytest.approx(1.3 * 25)
     assert late.jitter_ms["max"] == pytest.approx(1.3 * 25)
-    assert late.never_heard == 1
+    assert late.never_received == 1
     assert late.uses - late.ideal_uses == 2
     assert late.outdated_graphs == 1
     assert late.staleness_steps["max"] == 2

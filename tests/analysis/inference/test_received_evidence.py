@@ -139,7 +139,7 @@ def test_a_run_that_ends_early(name: str) -> None:
 
 
 def test_the_path_of_the_network() -> None:
-    """Against counts of the graph of every step, whatever is known when; a sojourn is missing, one comes twice."""
+    """Against counts of the graph of every step, whatever is known when; one period is missing, one comes twice."""
     rng = np.random.default_rng(4)
     lengths = rng.integers(1, 9, 300)
     ends = np.cumsum(lengths)

@@ -13,7 +13,7 @@ from experiments import RunRecord, line_ring, new_record
 from msg_analysis.messages.acceptance import Refusal, RunRules, decode_of_run, sign, state_frame, state_receiver
 from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, encode_string
 from msg_analysis.messages.topics import END, PROGRESS, RESEND
-from msg_analysis.model.graph_path import Sojourn, sojourns
+from msg_analysis.model.graph_path import HoldingPeriod, holding_periods
 from msg_analysis.model.step_model import first_graph
 
 PAIR = {"graphs": {"line": {"path": [1, 2]}}, "switching": {}, "run": {"dt": 0.1, "duration": 1, "start": "zero"}}
@@ -77,22 +77,22 @@ def test_longest_message(changes: dict[str, Any], listed: int) -> None:
 
 
 SWITCHING = new_record(line_ring(run={"duration": 50, "start": "zero", "replicas": 1}))
-PATH = list(sojourns(SWITCHING.experiment, first_graph(SWITCHING.experiment)))
+PATH = list(holding_periods(SWITCHING.experiment, first_graph(SWITCHING.experiment)))
 
 
-def published(sojourn: Sojourn, **changes: Any) -> bytes:
-    graph = SWITCHING.experiment.graph_list[sojourn.mode]
-    fields = {"mode": sojourn.mode + 1, "name": graph.name, "arcs": graph.arcs, "sequence": sojourn.sequence}
-    fields |= {"first_step": sojourn.first_step, "last_step": sojourn.last_step}
-    stamp = sojourn.first_step * 50_000_000
+def published(holding: HoldingPeriod, **changes: Any) -> bytes:
+    graph = SWITCHING.experiment.graph_list[holding.mode]
+    fields = {"mode": holding.mode + 1, "name": graph.name, "arcs": graph.arcs, "sequence": holding.sequence}
+    fields |= {"first_step": holding.first_step, "last_step": holding.last_step}
+    stamp = holding.first_step * 50_000_000
     return ActiveGraph(**{"stamp": stamp, "run": SWITCHING.run.bytes} | fields | changes).encode()
 
 
 def test_the_graph_is_compared_with_the_record() -> None:
-    """Every sojourn in any order passes; one with any other field, or one that the run does not have, does not."""
+    """Every holding period in any order passes; one with any other field, or one that the run has not, does not."""
     rules = RunRules(SWITCHING)
-    for sojourn in [*reversed(PATH), *PATH]:
-        assert isinstance(rules.graph(published(sojourn)), ActiveGraph)
+    for holding in [*reversed(PATH), *PATH]:
+        assert isinstance(rules.graph(published(holding)), ActiveGraph)
     first = PATH[0]
     for changes in (
         {"mode": 0},
@@ -118,11 +118,11 @@ def test_the_graph_is_compared_with_the_record() -> None:
 def test_old_sojourns_are_forgotten() -> None:
     rules = RunRules(SWITCHING)
     rules.forget(500)
-    for sojourn in PATH:
-        found = rules.graph(published(sojourn))
-        assert (found == Refusal.REPEATED) == (sojourn.last_step < 500)
+    for holding in PATH:
+        found = rules.graph(published(holding))
+        assert (found == Refusal.REPEATED) == (holding.last_step < 500)
     rules.forget(10**6)
-    assert {rules.graph(published(sojourn)) for sojourn in PATH} == {Refusal.REPEATED}
+    assert {rules.graph(published(holding)) for holding in PATH} == {Refusal.REPEATED}
 
 
 def test_the_record_is_compared() -> None:

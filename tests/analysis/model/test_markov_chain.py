@@ -18,7 +18,7 @@ from msg_analysis.experiment import validation
 from msg_analysis.experiment.graphs import Graph, hops
 from msg_analysis.experiment.markov_chain import MarkovChain, stationary_law
 from msg_analysis.experiment.validation import connection_problems
-from msg_analysis.model.graph_path import mode_path, sojourns
+from msg_analysis.model.graph_path import holding_periods, mode_path
 from msg_analysis.model.step_model import build_step_model
 
 
@@ -95,7 +95,7 @@ def setup(time: str, matrix: np.ndarray, steps: int, dt: float = 0.3, **switchin
 def test_path_has_the_transition_probabilities(time: str) -> None:
     """Transition counts of 40,000 steps against expm(Gamma dt), Pearson chi-square per row, p > 1e-5 each.
 
-    dt is a third of a mean holding time, so many sojourns fall between two steps. False-alarm rate 6e-5.
+    dt is a third of a mean holding time, so many holding periods fall between two steps. False-alarm rate 6e-5.
     """
     gamma = generator_of(1, 3)
     matrix = gamma if time == "continuous" else scipy.linalg.expm(gamma * 0.3)
@@ -111,14 +111,14 @@ def test_path_has_the_transition_probabilities(time: str) -> None:
 def test_holding_times_are_exponential() -> None:
     """Kolmogorov-Smirnov on 5,000 holding times, p > 1e-4: the false-alarm rate."""
     chain = MarkovChain("continuous", generator_of(2, 2))
-    path = chain.sojourns(chain.stationary, np.random.default_rng(3))
+    path = chain.holding_periods(chain.stationary, np.random.default_rng(3))
     held = [time for mode, time in (next(path) for _ in range(10_000)) if mode == 0]
     assert scipy.stats.kstest(held, "expon", args=(0, -1 / chain.matrix[0, 0])).pvalue > 1e-4
 
 
 def test_sojourns_cover_every_step_once() -> None:
     case = setup("continuous", 5 * generator_of(4, 3), 500)
-    found = list(sojourns(case, case.chain.stationary))
+    found = list(holding_periods(case, case.chain.stationary))
     assert [s.sequence for s in found] == list(range(len(found)))
     assert found[0].first_step == 0
     assert found[-1].last_step == 499

@@ -167,7 +167,7 @@ def test_missing_states_and_the_network() -> None:
     reported = [
         {"kind": "back", "step": 50, "node": "agent_1", "words": "agent_1: back"},
         {"kind": "killed", "step": 40, "node": "agent_1", "words": "agent_1: killed"},
-        {"kind": "unheard-of", "step": 1, "node": "x", "words": "x"},
+        {"kind": "never-seen", "step": 1, "node": "x", "words": "x"},
     ]
     found, _ = run_events(trajectory, reported)
     assert [(one.kind, one.first, one.last) for one in found] == [

@@ -179,10 +179,10 @@ def test_what_became_of_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     comparison, quiet = _made_up(2)
     assert "Network" not in Page(quiet).text
     without_figures(monkeypatch)
-    stranger = {"node": "agent_1", "topic": "<b>graph", "reason": "other run", "count": 1234}
+    rejected = {"node": "agent_1", "topic": "<b>graph", "reason": "other run", "count": 1234}
     path = tmp_path / "report.html"
     restarts = ["agent_2: killed by SIGKILL after step 7, started again"]
-    write_report(comparison, path, restarts=restarts, strangers=[stranger])
+    write_report(comparison, path, restarts=restarts, rejected_messages=[rejected])
     page = Page(path.read_text(encoding="utf-8"))
     for words in (*restarts, "<b>graph", "other run", "1234"):
         assert words in page.text

@@ -90,10 +90,12 @@ def test_all_rejected_tests_are_shown() -> None:
 
 def test_strangers() -> None:
     entry = {"node": "agent_1", "topic": "[red]graph", "reason": "other run", "count": 1234}
-    output = shown(comparison_text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": [entry]})
+    output = shown(comparison_text.print_comparison, comparison("agrees", 2, 2.0) | {"rejected_messages": [entry]})
     (line,) = (line for line in output.splitlines() if "1234" in line)
     assert line.split() == ["agent_1", "[red]graph", "other", "run", "1234"]
-    assert "Rejected" not in shown(comparison_text.print_comparison, comparison("agrees", 2, 2.0) | {"strangers": []})
+    assert "Rejected" not in shown(
+        comparison_text.print_comparison, comparison("agrees", 2, 2.0) | {"rejected_messages": []}
+    )
 
 
 def test_blame_and_bags() -> None:
@@ -107,7 +109,7 @@ def test_blame_and_bags() -> None:
         "verdict": "incomplete",
     }
     document = comparison("disagrees", 2, 2.0)
-    document |= {"blame": [{"words": "all gains [x] are 2"}], "bags": [bag, bag | {"bag": "whole", "complete": True}]}
+    document |= {"causes": [{"words": "all gains [x] are 2"}], "bags": [bag, bag | {"bag": "whole", "complete": True}]}
     output = shown(comparison_text.print_comparison, document)
     assert output.startswith("The runs disagree with the prediction.")
     assert "All gains [x] are 2." in output
@@ -274,7 +276,7 @@ def test_real_time() -> None:
         "deadlines": {"steps": 1000, "missed": 73, "share": 0.073},
         "ideal_uses": {"uses": 400, "ideal": 300, "share": 0.75},
         "outdated_graph": {"steps": 1, "share": 0.00001},
-        "never_heard": 4,
+        "never_received": 4,
     }
     laws = {"pattern": law | {"supported": True}, "sequential": law, "continuous": law | {"supported": False}}
     document = comparison("agrees", 3, 2.0) | {"timing": timing, "laws": laws | {"why": "the reasons"}}

@@ -1,4 +1,4 @@
-"""Lists of runs: what each folder is called, filters, order and dates; one of strangers ends nothing."""
+"""Lists of runs: what each folder is called, filters, order and dates; a foreign one ends nothing."""
 
 import dataclasses
 import fcntl
@@ -13,7 +13,7 @@ import pytest
 
 from msg_analysis import Experiment, InputError
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.runs import RunEntry, RunFilter, list_runs, moment
+from msg_analysis.runs import RunEntry, RunFilter, list_runs, moment, read_result
 
 APART = {"apart": {"path": [1, 2, 3]}}
 PAIR = {"name": "pair", "graphs": APART, "run": {"dt": 0.1, "duration": 5, "seed": 7, "start": "zero"}}
@@ -70,6 +70,13 @@ def test_a_run_with_a_result(tmp_path: Path, bag: Path) -> None:
         "high": pytest.approx(1.99, abs=1e-4),
         "report": str(folder / "report.html"),
     }
+
+
+def test_a_result_of_before(tmp_path: Path) -> None:
+    """Its causes have another key."""
+    cause = {"words": "the noise is too large"}
+    for key in ("causes", "blame"):
+        assert read_result(result(tmp_path / key, **{key: [cause]})).causes == cause["words"]
 
 
 def test_a_short_run_has_the_error_given_the_path(tmp_path: Path) -> None:

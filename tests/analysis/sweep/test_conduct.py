@@ -136,7 +136,7 @@ def test_other_software_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    ("p_values", "p_holm", "verdict", "code"),
+    ("p_values", "p_adjusted", "verdict", "code"),
     [
         ([0.5, 0.02, 0.9], [1.0, 0.06, 1.0], "agrees", 0),  # by itself .02, of three .06
         ([0.5, 0.003, 0.9], [1.0, 0.009, 1.0], "disagrees", 1),
@@ -144,9 +144,9 @@ def test_other_software_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         ([None, 0.5], [None, 0.5], "agrees", 0),
     ],
 )
-def test_all_runs_are_judged_together(p_values: Any, p_holm: Any, verdict: str, code: int) -> None:
+def test_all_runs_are_judged_together(p_values: Any, p_adjusted: Any, verdict: str, code: int) -> None:
     judgement = evaluate_sweep([with_p(p) for p in p_values], 0.01)
-    assert judgement.p_holm == pytest.approx(p_holm)
+    assert judgement.p_adjusted == pytest.approx(p_adjusted)
     assert (judgement.verdict, judgement.exit_code) == (verdict, code)
 
 

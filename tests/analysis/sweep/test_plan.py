@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.sweeps.grid import KeyProblemError, Sweep, json_schema, load_sweep, own_seed, put
+from msg_analysis.sweeps.grid import KeyProblemError, SweepGrid, json_schema, load_sweep, own_seed, put
 
 EXPERIMENT: dict[str, Any] = {
     "name": "two",
@@ -22,13 +22,13 @@ EXPERIMENT: dict[str, Any] = {
 }
 
 
-def load(directory: Path, **sweep: Any) -> Sweep:
+def load(directory: Path, **sweep: Any) -> SweepGrid:
     path = directory / "try.yaml"
     path.write_text(yaml.safe_dump({"experiment": EXPERIMENT, **sweep}, sort_keys=False))
     return load_sweep(path)
 
 
-def values(sweep: Sweep, key: str) -> list[Any]:
+def values(sweep: SweepGrid, key: str) -> list[Any]:
     return [point.values[key] for point in sweep.points]
 
 

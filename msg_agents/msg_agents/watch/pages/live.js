@@ -118,7 +118,7 @@ function show(data) {
     at("network").style.setProperty("--own", graphColour(data.graph));
     for (const { line, modes } of links.values()) line.classList.toggle("active", modes.has(data.graph));
   }
-  at("sojourn").textContent = data.sojourn ? `for ${number((reached - data.sojourn[1]) * setting.dt, 3)} units of time, from step ${data.sojourn[1]} to ${data.sojourn[2] + 1}; ${data.sojourn[0] - 1} jumps so far` : "";
+  at("holding").textContent = data.holding ? `for ${number((reached - data.holding[1]) * setting.dt, 3)} units of time, from step ${data.holding[1]} to ${data.holding[2] + 1}; ${data.holding[0] - 1} jumps so far` : "";
   const gone = new Set(data.gone), finished = (agent) => data.steps.length && data.steps[agent] >= last;
   const silent = (agent) => !over && !finished(agent) && data.ages.length > 0 && data.ages[agent] > setting.silent && data.reached >= 0;
   const away = (agent) => gone.has(agent) || silent(agent);
@@ -146,9 +146,9 @@ function show(data) {
     at("anytime").textContent = wide === null ? "–" : `${number(system.measured - wide)} … ${number(system.measured + wide)}`;
     if (seen && seen.log_evidence !== null) {
       const evidence = seen.evidence === null ? "more than 1e300" : number(seen.evidence, 2);
-      at("evidence").textContent = `${evidence} (${seen.disagrees ? `exceeded: ${seen.strongest}` : `threshold ${seen.threshold}`})`;
+      at("evidence").textContent = `${evidence} (${seen.exceeded ? `exceeded: ${seen.strongest}` : `threshold ${seen.threshold}`})`;
     }
-    at("against").classList.toggle("far", Boolean(seen && seen.disagrees));
+    at("against").classList.toggle("far", Boolean(seen && seen.exceeded));
     const last = points[points.length - 1];
     if (!last || last[0] !== data.values_step) points.push([data.values_step, system.measured, system.predicted, system.standard_error]);
     if (points.length > 1200) points = points.filter((_, place) => place % 2 === 1);
@@ -186,7 +186,7 @@ function draw() { chart(); trace(); }
 
 function trace() {
   if (!newest || !recent) return;
-  const { steps, agents, sojourns } = recent;
+  const { steps, agents, path } = recent;
   keys(agents.length);
   const drawn = canvas("trace", 260);
   if (!drawn) return;
@@ -200,7 +200,7 @@ function trace() {
   const margin = (high - low) * 0.06 || 1;
   low -= margin; high += margin;
   const x = (step) => left + (step - first) / (last - first) * (right - left), y = (value) => bottom - (value - low) / (high - low) * (bottom - top);
-  for (const [mode, from, to] of sojourns) {
+  for (const [mode, from, to] of path) {
     const a = x(Math.max(from, first)), b = x(Math.min(to + 1, last));
     if (b <= a) continue;
     element("rect", { x: a, y: top, width: b - a, height: bottom - top, style: `fill: ${graphColour(mode)}; fill-opacity: var(--tint)` }, box);
