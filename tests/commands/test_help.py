@@ -70,14 +70,12 @@ def test_help(program: str, name: str) -> None:
         assert option.help, option.opts
         assert option.help[0].isupper(), option.help
         assert option.help.endswith("."), option.help
-        if not option.is_flag:
-            metavar = option.make_metavar(context)
-            assert metavar not in VAGUE, option.opts
-            assert metavar in METAVARS.get(long_name(option), {metavar}), option.opts
-        record = option.get_help_record(context)
-        if option.default not in (None, False, ()) and str(option.default) != "Sentinel.UNSET":
-            assert record
-            assert "default: " in record[1], option.opts
+        metavar = option.make_metavar(context)
+        assert option.is_flag or metavar not in VAGUE, option.opts
+        assert option.is_flag or metavar in METAVARS.get(long_name(option), {metavar}), option.opts
+        record = option.get_help_record(context) or ("", "")
+        has_default = option.default not in (None, False, ()) and str(option.default) != "Sentinel.UNSET"
+        assert not has_default or "default: " in record[1], option.opts
         assert "by default" not in option.help.lower() or option.is_flag, "is shown behind it"
 
 

@@ -80,17 +80,16 @@ def test_files_and_targets_exist(page: Path) -> None:
         for file in re.findall(r"(?<![\w/])(?:benchmarks|docker|tests)/[\w/.-]+\.(?:py|yaml)", line)
     }
     assert [file for file in files if not (ROOT / file).exists()] == []
-    for line in lines:
-        if script := re.search(r"(benchmarks/\w+\.py)(.*)", line):
-            source = (ROOT / script[1]).read_text(encoding="utf-8")
-            assert [option for option in re.findall(r"--[a-z-]+", script[2]) if f'"{option}"' not in source] == []
+    for script in filter(None, (re.search(r"(benchmarks/\w+\.py)(.*)", line) for line in lines)):
+        source = (ROOT / script[1]).read_text(encoding="utf-8")
+        assert [option for option in re.findall(r"--[a-z-]+", script[2]) if f'"{option}"' not in source] == []
 
 
 def test_files_to_read_exist() -> None:
     page = (ROOT / "docs/contributing.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`((?:msg_analysis|msg_agents)/[\w/]*)(\.py)?`", page))
     places = {"msg_analysis": ROOT / "analysis", "msg_agents": ROOT / "msg_agents"}
-    assert len(named) > 30
+    assert len(named) > 25
     assert [file + end for file, end in named if not (places[file.split("/")[0]] / (file + end)).exists()] == []
 
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from rich.console import Console
 
-    from msg_agents.doctor.checks import Finding
+    from msg_agents.doctor.checks import CheckResult
 
 
 DEMO = "line_ring"
@@ -230,7 +230,7 @@ STYLES = {"ok": "green", "warning": "bold yellow", "error": "bold red"}
 @click.command(epilog=example_lines("msg-agents doctor"))
 @json_option
 def doctor(*, as_json: bool) -> None:
-    """Finding whether this machine can run networks.
+    """CheckResult whether this machine can run networks.
 
     It also shows how to fix problems. The last check runs two processes for a second. Exit code 2: a run cannot work;
     warnings do not change it.
@@ -254,7 +254,7 @@ def doctor(*, as_json: bool) -> None:
         sys.exit(ExitCode.BAD_INPUT)
 
 
-def _print_check(console: Console, check: Finding) -> None:
+def _print_check(console: Console, check: CheckResult) -> None:
     """One line; terminals get the text folded in a column of its own."""
     from rich.table import Table
     from rich.text import Text

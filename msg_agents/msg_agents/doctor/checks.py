@@ -39,7 +39,7 @@ Status = Literal["ok", "warning", "error"]  # error: a run cannot work
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class CheckResult:
     """One line of the doctor: what was found, and, unless it is ok, what to do; see docs/commands.md."""
 
     name: str
@@ -48,17 +48,17 @@ class Finding:
     value: float | None = None  # what was measured, in the unit that docs/commands.md names
 
 
-def warn_if(name: str, warning: str | None, text: str, value: float | None = None) -> Finding:
+def warn_if(name: str, warning: str | None, text: str, value: float | None = None) -> CheckResult:
     """A warning if there is one, else ok with the text."""
-    return Finding(name, "warning" if warning else "ok", warning or text, value)
+    return CheckResult(name, "warning" if warning else "ok", warning or text, value)
 
 
-def refusal(name: str, require: Callable[[], object]) -> Finding | None:
+def refusal(name: str, require: Callable[[], object]) -> CheckResult | None:
     """The error by which a run would refuse this machine or shell; None if it would not."""
     try:
         require()
     except InputError as error:
-        return Finding(name, "error", str(error))
+        return CheckResult(name, "error", str(error))
     return None
 
 
@@ -70,18 +70,18 @@ FEW_PROCESSES = 200  # and threads: a process of nodes has about 10
 COARSE = 1e-3  # s
 
 
-def check_python() -> Finding:
+def check_python() -> CheckResult:
     """Which Python makes the run."""
-    return Finding("python", "ok", f"{platform.python_version()} ({sys.executable})")
+    return CheckResult("python", "ok", f"{platform.python_version()} ({sys.executable})")
 
 
-def check_cores() -> Finding:
+def check_cores() -> CheckResult:
     """How many cores this process may use."""
     count = count_cores()
-    return Finding("cores", "ok", f"{count} that this process may use", count)
+    return CheckResult("cores", "ok", f"{count} that this process may use", count)
 
 
-def check_clock() -> Finding:
+def check_clock() -> CheckResult:
     """How fine the clock is that wakes agents in real time."""
     resolution = max(time.get_clock_info(name).resolution for name in ("time", "monotonic"))
     text = f"resolution {resolution:g} s"
@@ -89,11 +89,11 @@ def check_clock() -> Finding:
     return warn_if("clock", warning if resolution > COARSE else None, text, resolution)
 
 
-def check_open_files() -> Finding:
+def check_open_files() -> CheckResult:
     """How many files and sockets a process may have open."""
     limit, hardest = resource.getrlimit(resource.RLIMIT_NOFILE)
     if limit == resource.RLIM_INFINITY:
-        return Finding("open_files", "ok", "no limit")
+        return CheckResult("open_files", "ok", "no limit")
     text = f"at most {limit} in a process"
     raisable = hardest == resource.RLIM_INFINITY or hardest >= FEW_FILES
     remedy = f"`ulimit -n {FEW_FILES}`" if raisable else f"raise the hard limit, {hardest}, as root"
@@ -101,11 +101,11 @@ def check_open_files() -> Finding:
     return warn_if("open_files", warning, text, limit)
 
 
-def check_processes() -> Finding:
+def check_processes() -> CheckResult:
     """How many processes and threads there may still be, by the limits of the user and of the container."""
     left = [limit - used for limit, used in (_limit_of_user(), _limit_of_container()) if limit is not None]
     if not left:
-        return Finding("processes", "ok", "no limit")
+        return CheckResult("processes", "ok", "no limit")
     text = f"{min(left)} more can be started, threads included"
     warning = f"{text}: raise `ulimit -u`, or pids.max of the container" if min(left) < FEW_PROCESSES else None
     return warn_if("processes", warning, text, min(left))
@@ -133,7 +133,7 @@ def _limit_of_container() -> tuple[int | None, int]:
     return None, 0
 
 
-def check_shared_memory() -> Finding:
+def check_shared_memory() -> CheckResult:
     """Room for the states of agents, and for what ROS keeps there."""
     name = "shared_memory"
     if found := refusal(name, require_shared_memory):
@@ -150,20 +150,20 @@ def check_shared_memory() -> Finding:
     return warn_if(name, warning, f"{MEMORY}: {free / MEGABYTE:.0f} MB free", free)
 
 
-def check_temporary_directory() -> Finding:
+def check_temporary_directory() -> CheckResult:
     """Room for the files of a run."""
     name = "temporary_directory"
     try:
         directory = Path(tempfile.gettempdir())
     except FileNotFoundError as error:
-        return Finding(name, "error", no_temporary_directory(error) or str(error))
+        return CheckResult(name, "error", no_temporary_directory(error) or str(error))
     free = free_space(directory)
     text = f"{directory}: {free / MEGABYTE:.0f} MB free"
     warning = f"{text}: long runs need more: set TMPDIR to another directory" if free < LITTLE_DISK else None
     return warn_if(name, warning, text, free)
 
 
-def check_logs() -> Finding:
+def check_logs() -> CheckResult:
     """Where ROS nodes write their log files."""
     name, home, directory = "home", os.environ.get("HOME"), log_directory()
     if not can_log():
@@ -181,7 +181,7 @@ PREFIXES_VARIABLE = "AMENT_PREFIX_PATH"
 PACKAGES = ("lib/python3*/site-packages", "local/lib/python3*/dist-packages", "lib/python3*/dist-packages")
 
 
-def check_rclpy() -> Finding:
+def check_rclpy() -> CheckResult:
     """Which ROS 2 the run would load, and which others it could be confused with."""
     name = "rclpy"
     if found := refusal(name, require_rclpy):
@@ -209,7 +209,7 @@ def _places() -> Iterator[Path]:
             yield (folder / "rclpy").resolve()
 
 
-def check_middleware() -> Finding:
+def check_middleware() -> CheckResult:
     """Whether that ROS 2 and its middleware can be loaded."""
     name, wanted, warning = "middleware", os.environ.get("RMW_IMPLEMENTATION"), None
     environment = node_environment(0, RELAYED_PROFILE) | other_logs(Path(tempfile.gettempdir()))

@@ -21,7 +21,7 @@ from msg_agents.discovery.rtps import (
     require_loopback,
 )
 from msg_agents.doctor import checks
-from msg_agents.doctor.checks import Finding, refusal, warn_if
+from msg_agents.doctor.checks import CheckResult, refusal, warn_if
 from msg_agents.environment import (
     LOCALHOST_VARIABLE,
     RANGE_VARIABLE,
@@ -82,7 +82,7 @@ class _Stopwatch(View):
             raise _EnoughError
 
 
-def check_round_trip() -> Finding:
+def check_round_trip() -> CheckResult:
     """Whether two processes of a run hear each other, and how long a message takes there and back."""
     name, watch, what = "round_trip", _Stopwatch(), ""
     try:
@@ -90,19 +90,21 @@ def check_round_trip() -> Finding:
         raise_for(result.interrupted_by)
         what = next(iter(result.failures), "")
     except InputError as error:
-        return Finding(name, "error", str(error))
+        return CheckResult(name, "error", str(error))
     except OSError as error:  # too few files or processes, a full disk
-        return Finding(name, "error", f"two processes could not be started: {error}: raise that limit")
+        return CheckResult(name, "error", f"two processes could not be started: {error}: raise that limit")
     except _EnoughError:
         pass
     if what or not watch.rate:
         remedy = "do what the warnings above say, and see docs/troubleshooting.md"
-        return Finding(name, "error", f"two processes exchange messages: {what or f'not within {LIMIT:g} s'}: {remedy}")
+        return CheckResult(
+            name, "error", f"two processes exchange messages: {what or f'not within {LIMIT:g} s'}: {remedy}"
+        )
     duration = PER_ROUND_TRIP / watch.rate
-    return Finding(name, "ok", f"{duration * 1e3:.2g} ms between two processes, computing included", duration)
+    return CheckResult(name, "ok", f"{duration * 1e3:.2g} ms between two processes, computing included", duration)
 
 
-def check_profiles() -> Finding:
+def check_profiles() -> CheckResult:
     """Whether the run uses its own profile of Fast DDS."""
     warning = None
     if file := os.environ.get(VARIABLES_FILE):
@@ -115,7 +117,7 @@ def check_profiles() -> Finding:
     return warn_if("profiles", warning, "the run's own" + (f" (without effect on it: {others})" if others else ""))
 
 
-def check_range() -> Finding:
+def check_range() -> CheckResult:
     """Where nodes look for others."""
     name = "discovery_range"
     if found := refusal(name, lambda: require_discovery(os.environ)):
@@ -134,7 +136,7 @@ def check_range() -> Finding:
     return warn_if(name, warning, "this machine" + (f" ({LOCALHOST_VARIABLE}={localhost})" if localhost else ""))
 
 
-def check_server() -> Finding:
+def check_server() -> CheckResult:
     """Whether the user's other programs would see the run."""
     server = os.environ.get(SERVER_VARIABLE)
     warning = None
@@ -148,7 +150,7 @@ def check_server() -> Finding:
     return warn_if("discovery_server", warning, "none")
 
 
-def check_peers() -> Finding:
+def check_peers() -> CheckResult:
     """Other machines that are named."""
     peers = os.environ.get(PEERS_VARIABLE)
     alone = os.environ.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
@@ -157,12 +159,12 @@ def check_peers() -> Finding:
     return warn_if("static_peers", warning if peers and not alone else None, text)
 
 
-def check_loopback() -> Finding:
+def check_loopback() -> CheckResult:
     """Whether processes of this machine can reach each other."""
-    return refusal("loopback", require_loopback) or Finding("loopback", "ok", "messages over UDP arrive")
+    return refusal("loopback", require_loopback) or CheckResult("loopback", "ok", "messages over UDP arrive")
 
 
-def check_multicast() -> Finding:
+def check_multicast() -> CheckResult:
     """Whether ROS programs that find each other by multicast could do so here."""
     warning = (
         "not on the loopback interface: a run does not need it, but `ros2` tools and single nodes may not find each "
@@ -171,7 +173,7 @@ def check_multicast() -> Finding:
     return warn_if("multicast", None if loopback_has_multicast() else warning, "works on the loopback interface")
 
 
-def check_buffers() -> Finding:
+def check_buffers() -> CheckResult:
     """How much a socket keeps for a reader that is busy."""
     sizes = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -181,7 +183,7 @@ def check_buffers() -> Finding:
     return judge_buffers(*sizes)
 
 
-def judge_buffers(rmem_max: int, wmem_max: int) -> Finding:
+def judge_buffers(rmem_max: int, wmem_max: int) -> CheckResult:
     """Of the sizes [bytes] that sockets get, at most those that the profiles ask for."""
     small = [name for name, size in (("rmem_max", rmem_max), ("wmem_max", wmem_max)) if size < LEAST]
     warning = None
@@ -194,16 +196,16 @@ def judge_buffers(rmem_max: int, wmem_max: int) -> Finding:
     return warn_if("socket_buffers", warning, f"receive {rmem_max}, send {wmem_max} bytes", rmem_max)
 
 
-def check_own_domain() -> Finding:
+def check_own_domain() -> CheckResult:
     """The domain of this shell, which single nodes and `ros2` use."""
     name = "ros_domain_id"
     value = os.environ.get("ROS_DOMAIN_ID")
     try:
         check_domain()
     except InputError as error:
-        return Finding(name, "warning", f"{error}: only a run with a domain of its own works")
+        return CheckResult(name, "warning", f"{error}: only a run with a domain of its own works")
     if not value:
-        return Finding(name, "ok", "not set: single nodes use 0, a run takes a free one", 0)
+        return CheckResult(name, "ok", "not set: single nodes use 0, a run takes a free one", 0)
     domain = int(value)
     taken = domain in DOMAINS and is_held(domain)
     warning = None
@@ -213,7 +215,7 @@ def check_own_domain() -> Finding:
     return warn_if(name, warning, f"{domain}: single nodes use it, a run takes a free one", domain)
 
 
-def check_free_domains() -> Finding:
+def check_free_domains() -> CheckResult:
     """How many further runs the domains and their UDP ports suffice for."""
     name = "free_domains"
 
@@ -228,10 +230,10 @@ def check_free_domains() -> Finding:
     more = f", and {len(taken) - SHOWN} more" if len(taken) > SHOWN else ""
     which = f"; taken: {', '.join(map(str, taken[:SHOWN]))}{more}" if taken else ""
     free = len(DOMAINS) - len(taken)
-    return Finding(name, "ok", f"{free} of {len(DOMAINS)}, with their UDP ports{which}", free)
+    return CheckResult(name, "ok", f"{free} of {len(DOMAINS)}, with their UDP ports{which}", free)
 
 
-CHECKS: tuple[Callable[[], Finding], ...] = (
+CHECKS: tuple[Callable[[], CheckResult], ...] = (
     checks.check_python,
     checks.check_cores,
     checks.check_clock,
@@ -251,12 +253,12 @@ LATER = (  # each with the checks that it needs to be without an error
 )
 
 
-def examine() -> Iterator[Finding]:
+def examine() -> Iterator[CheckResult]:
     """Make one check after the other; the last ones are not tried where an error before says more."""
     failed: set[str] = set()
     for name, make, needed in (*(("", check, set[str]()) for check in CHECKS), *LATER):
-        found = Finding(name, "warning", NOT_TRIED) if needed & failed else make()
+        found = CheckResult(name, "warning", NOT_TRIED) if needed & failed else make()
         if found.status == "error":
             failed.add(found.name)
         yield found
-    yield Finding("round_trip", "warning", NOT_TRIED) if failed else check_round_trip()
+    yield CheckResult("round_trip", "warning", NOT_TRIED) if failed else check_round_trip()

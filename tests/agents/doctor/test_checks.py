@@ -13,7 +13,7 @@ import pytest
 
 from msg_agents.discovery.rtps import PORT_BASE, PORTS_PER_DOMAIN, free_domain
 from msg_agents.doctor import checks, network_checks
-from msg_agents.doctor.checks import Finding
+from msg_agents.doctor.checks import CheckResult
 from msg_agents.environment import require_shared_memory
 
 VARIABLES = (
@@ -34,7 +34,7 @@ def plain_shell(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.delenv(name, raising=False)
 
 
-def by_variables() -> dict[str, Finding]:
+def by_variables() -> dict[str, CheckResult]:
     """The checks of variables, by name."""
     names = ("profiles", "range", "server", "peers", "own_domain")
     found = [getattr(network_checks, f"check_{name}")() for name in names]

@@ -71,10 +71,10 @@ def test_whom_nothing_connects_against_networkx(seed: int, agents: int, density:
     digraph = nx.from_numpy_array(hears.T, create_using=nx.DiGraph)
     reached = max(len(nx.descendants(digraph, v)) + 1 for v in digraph)
     found = connection_problems([Graph("graph", hears.astype(float))], None)
-    assert bool(found) == (reached < agents)
-    if found:
+    assert len(found) == (reached < agents)
+    for problem in found:
         lost, sources = re.fullmatch(
-            r".*: agents? (.*) cannot be reached from agents? ([\d, ]*) in.*", found[0]
+            r".*: agents? (.*) cannot be reached from agents? ([\d, ]*) in.*", problem
         ).groups()  # type: ignore[union-attr]
         unreached, roots = ({int(label) - 1 for label in text.split(", ")} for text in (lost, sources))
         for root in roots:
