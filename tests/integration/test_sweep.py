@@ -139,8 +139,8 @@ def test_networks_interrupted_killed_and_resumed(network: Any) -> None:
 def test_points_on_the_curves_of_the_paper(network: Any) -> None:
     """Short form: two networks. Level of the family of all points: 1 %, with fixed seeds: no alarm."""
     runs = [
-        emulation.Run(1, "line_ring", 0.5, 1.0, 1.0, duration=20.0),
-        emulation.Run(3, "smallest", 5.0, 1.0, 1.0, leader=2, duration=20.0),
+        emulation.PlannedRun(1, "line_ring", 0.5, 1.0, 1.0, duration=20.0),
+        emulation.PlannedRun(3, "smallest", 5.0, 1.0, 1.0, leader=2, duration=20.0),
     ]
     figures = network.directory / "figures"
     options = ["--emulate", "--format", "svg", "--out", str(figures)]
@@ -149,7 +149,7 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
         "from pathlib import Path",
         "from msg_analysis.cli.main import main",
         "from msg_analysis.paper import examples, figures",
-        "from msg_analysis.paper.figures import Run",
+        "from msg_analysis.paper.figures import PlannedRun",
         f"figures.runs_of = lambda number: [run for run in {runs} if run.example == number]",
         "examples.EXAMPLES |= {k: partial(example, 3) for k, example in examples.EXAMPLES.items()}  # coarse curves",
         "for number in ('all', '1'):  # the second time, nothing runs",

@@ -25,13 +25,13 @@ LAWS: dict[str, dict[str, Any]] = {
 
 # Agent 3 has 1.3 times its noise in every process of the run; the record does not know it.
 NOISY = """
-from msg_analysis.model import process_noise
+from msg_analysis.model import agent_law
 
-class Noisy(process_noise.ProcessNoise):
+class Noisy(agent_law.ProcessNoise):
     def block(self, agent, *others):
         return [noise * (1.3 if agent == 2 else 1.0) for noise in super().block(agent, *others)]
 
-process_noise.ProcessNoise = Noisy
+agent_law.ProcessNoise = Noisy
 """
 
 

@@ -14,7 +14,7 @@ from msg_analysis.theory.prediction import Prediction
 
 def messages_of(trajectory: Run) -> list[tuple[str, bytes]]:
     """(topic, message) in the order of time, as a bag has them (``test_messages_are_those_of_the_bag``)."""
-    return [(topic, content) for topic, content, _, _ in writing._messages(trajectory)]
+    return [(topic, content) for topic, content, _, _ in writing._messages(trajectory, writing.BLOCK_NUMBERS)]
 
 
 def watch(

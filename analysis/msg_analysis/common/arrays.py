@@ -40,10 +40,10 @@ def large_zeros(shape: tuple[int, ...], dtype: Any, *, total: int) -> AnyArray:
 class LargeRows:
     """Rows that are found one part after the other: in a file from some number of bytes on, if there is room for it."""
 
-    def __init__(self, columns: int, dtype: Any, in_memory: int = LARGE // 8) -> None:
+    def __init__(self, columns: int, dtype: Any, in_memory: int | None = None) -> None:
         self._shape, self._dtype = (-1, columns), np.dtype(dtype)
         self._parts: list[AnyArray] = []
-        self._in_memory = in_memory  # bytes, at most
+        self._in_memory = LARGE // 8 if in_memory is None else in_memory  # bytes, at most
         self._held = self._written = 0  # bytes
         self._file: IO[bytes] | None = None
 

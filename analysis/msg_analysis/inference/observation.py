@@ -88,10 +88,10 @@ def transient_length(series: FloatArray) -> int:
 
 
 def _blocks(
-    first: int, end: int, numbers_per_step: int, what: str, most: int = BLOCK_NUMBERS
+    first: int, end: int, numbers_per_step: int, what: str, most: int | None = None
 ) -> Iterator[tuple[int, int]]:
     """Blocks of the steps first..end-1; other arguments as of ``Observation.blocks``."""
-    length = max(1, most // max(1, numbers_per_step))
+    length = max(1, (most or BLOCK_NUMBERS) // max(1, numbers_per_step))
     for begin in range(first, end, length):
         tell(what, begin, end)
         yield begin, min(begin + length, end)

@@ -216,7 +216,7 @@ def test_the_states_for_the_page_have_the_graphs_of_their_steps() -> None:
     trace = snapshot_document(source.snapshot([901] * 5, estimate.report()))["trace"]
     assert trace["steps"] == [*range(900 - WINDOW, 900)]
     assert trace["agents"] == pytest.approx(trajectory.states[900 - WINDOW : 900, :, 0].T, rel=1e-3)
-    graph = {step: mode for mode, first, last in trace["holding times"] for step in range(first, last + 1)}
+    graph = {step: mode for mode, first, last in trace["path"] for step in range(first, last + 1)}
     assert [graph[step] for step in trace["steps"]] == trajectory.modes[900 - WINDOW : 900].tolist()
 
 

@@ -299,7 +299,7 @@ def test_verdicts_without_a_prediction() -> None:
     trajectory = simulate(experiment({"name": "saturated"}, run={"duration": 200}))
     comparison = compare(trajectory)
     assert comparison.verdict == "unpredicted"
-    text = render(comparison, trajectory)
+    text = render(comparison)
     assert "No verdict, because there is no prediction." in text
     assert "protocol saturated (msg_agents_example_protocols 0.1.0) is not linear" in text
     found = comparison.to_json()
@@ -319,7 +319,7 @@ def test_incomplete_without_a_prediction(step: int, tmp_path: Path) -> None:
     assert (comparison.verdict, comparison.exit_code) == ("incomplete", 3)
     assert comparison.steps == step - 1
     assert (comparison.system_error.measured is None) == (step == 50)
-    assert "No verdict: the data are incomplete." in render(comparison, comparison.trajectory)
+    assert "No verdict: the data are incomplete." in render(comparison)
 
 
 def test_length_of_a_transient() -> None:
