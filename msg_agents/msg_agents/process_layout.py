@@ -36,9 +36,7 @@ from msg_analysis.messages.topics import agent_node_name
 RECORDER, SWITCHER, CHANNEL = "recorder", "switcher", "channel"
 SMALL = 8  # agents that each have a process by ``processes: auto``; of more, so many share one, or more on few cores
 MOST_PROCESSES = 200  # of agents, which the relay connects: with all others they fill the ports of two ROS domains
-MOST_UNAIDED = (
-    90  # of agents, which look for each other: Fast DDS finds ``MOST_PARTICIPANTS``, some of which are others
-)
+MOST_UNAIDED = 90  # of agents, which look for each other: some of the ``MOST_PARTICIPANTS`` of Fast DDS are others
 SPARE_PARTICIPANTS = 8  # participants on a host besides those of the run, such as tools that watch it
 _RANGE = re.compile(r"([0-9]+)-([0-9]+)")
 

@@ -65,6 +65,7 @@ def test_help(program: str, name: str) -> None:
     text = help_of(program, name)
     assert max(map(len, text.splitlines())) <= 80
     assert example_lines(program, name)
+    assert re.match(r"  [A-Z][a-z]+\b", text.split("\n\n")[1]), "a verb first, no name of the code"
     context = context_of(program, name)
     for option in options(program, name):
         assert option.help, option.opts

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeGuard
 
 from pydantic import (
     BaseModel,
@@ -51,7 +51,7 @@ def expected(text: str) -> PydanticCustomError:
     return PydanticCustomError("expected", "{text}", {"text": text})
 
 
-def is_number(value: object) -> bool:
+def is_number(value: object) -> TypeGuard[float]:
     """Whether a value is a number, not a boolean, of at most ``LARGEST_NUMBER``."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
 
@@ -213,8 +213,8 @@ def _loss(value: object, section: ValidatorFunctionWrapHandler) -> Any:
         return section(value)
     if not is_number(value):
         raise expected("a probability, or keys with probabilities: default, edges, arcs")
-    if not 0 <= value < 1:  # type: ignore[operator]
-        raise expected("a number >= 0" if value < 0 else "a number < 1")  # type: ignore[operator]
+    if not 0 <= value < 1:
+        raise expected("a number >= 0" if value < 0 else "a number < 1")
     return section({"default": value})
 
 
@@ -234,9 +234,9 @@ def _process(value: object) -> NoiseGain | dict[str, NoiseGain]:
 
 def _noise_gain(value: object) -> NoiseGain:
     if is_number(value):
-        if value < 0:  # type: ignore[operator]
+        if value < 0:
             raise expected("a standard deviation >= 0")
-        return float(value)  # type: ignore[arg-type]
+        return float(value)
     if isinstance(value, list) and value and all(is_number(entry) for entry in value):
         if min(value) < 0:
             raise expected("standard deviations >= 0")
@@ -354,8 +354,8 @@ def _processes(value: object) -> str | int:
 def _gain(value: object) -> float:
     if value in ("inf", ".inf") or (isinstance(value, float) and value == math.inf):
         return math.inf
-    if is_number(value) and value > 0:  # type: ignore[operator]
-        return float(value)  # type: ignore[arg-type]
+    if is_number(value) and value > 0:
+        return float(value)
     raise expected("a number > 0, or inf for leaders held at the reference")
 
 

@@ -114,7 +114,12 @@ def why_not_tested(observation: Observation) -> str | None:
 def logged_autocovariance(
     observation: Observation, lags: IntArray | None = None, most_numbers: float = MOST_NUMBERS
 ) -> LoggedAutocovariance | None:
-    """Autocovariances at ``lags`` (L,) [steps] given the path; None where the losses make too many kinds of steps."""
+    """Autocovariances of a run in lockstep, with their expectation and covariance given its path.
+
+    ``lags``: (L,) ascending, >= 0 [steps]; None: 0 and up to 8 more, to where 5 % of the correlation is left.
+    ``most_numbers`` in the matrices of all lags and steps: of longer runs the beginning is tested. None where the
+    losses make too many kinds of steps.
+    """
     kinds = steps_of_path(observation)
     if kinds is None:
         return None

@@ -329,7 +329,10 @@ class Rate:
 
 
 def find_rates(counts: IntArray, chain: MarkovChain, dt: float, families: int, level: float) -> list[Rate]:
-    """Rates that explain the transitions ``counts`` (n, n): score tests, then maximum likelihood of their factors."""
+    """Rates that explain the transitions ``counts`` (n, n): score tests, then maximum likelihood of their factors.
+
+    ``dt``: length of a step [units of simulated time]; nothing is found with more than ``MAX_JUMPS`` kinds of jumps.
+    """
     n = chain.modes
     transition = chain.transition(dt)
     jumps = [(g, h) for g, h in np.argwhere(chain.matrix > 0.0).tolist() if g != h]

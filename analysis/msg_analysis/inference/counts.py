@@ -53,7 +53,11 @@ class Transitions:
         return Transitions(self.counts + other.counts, self.paths + other.paths)
 
     def test(self, transition: FloatArray) -> SwitchingTest:
-        """Likelihood-ratio test of the paths against P (n, n): chi-square, or simulated where switches are rare."""
+        """Test of the paths against the transition matrix P (n, n), by the likelihood-ratio statistic G.
+
+        Its law is chi-square where every possible transition is expected often enough; else it is simulated: paths of
+        the same length from the same first graph (fixed seed), with a gamma fit where none of them is as extreme.
+        """
         counts = self.counts
         visits = counts.sum(axis=1)
         expected = visits[:, None] * transition
@@ -141,7 +145,13 @@ class LossTest:
 
 
 def loss_test(observation: Observation | Measurement) -> LossTest | None:
-    """Test that messages are lost with the probability of their link, as the law says; None without (logged) loss."""
+    """Test that messages are lost with the probability of their link, as the law says; None without (logged) loss.
+
+    The statistic adds one chi-square per link, in bursts one for the messages after a lost one and one for those after
+    another, and two for products of (lost - expected) in standard errors: of messages of one link in successive steps,
+    and of pairs of messages in one step. What has too few messages for a chi-square law is pooled, with all of the same
+    probability, and tested by the exact binomial law; products that are too rare are left out.
+    """
     tally = LossTally.of(observation)
     return tally.test() if tally else None
 

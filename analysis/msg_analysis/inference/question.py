@@ -256,9 +256,8 @@ class Question:
 
     name: ClassVar[str]  # of the test in the verdict
     meaning: ClassVar[str]  # what is wrong where it is rejected
-    p_value: ClassVar[
-        attrgetter[float | None]
-    ]  # from ``Statistics``, of the test, where that is one without an estimate
+    # From ``Statistics``, of the test, where that is one without an estimate.
+    p_value: ClassVar[attrgetter[float | None]]
     subject: ClassVar[str] = ""  # of its evidence, where that has one row and is not about the name
     main: ClassVar[bool] = False  # whether one part of the law answers it, see ``evidence_weights``
     about_chain: ClassVar[bool] = False  # whether it is about the graphs, not about the steps of the agents

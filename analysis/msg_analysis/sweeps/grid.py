@@ -80,7 +80,7 @@ def _range(first: float, last: float, value: dict[str, Any]) -> Axis:
             raise expected("`from` and `to` > 0 with spacing: log")
         numbers = np.geomspace(first, last, count)
     elif "step" in value:
-        numbers = first + float(value["step"]) * np.arange(count)
+        numbers = np.asarray(first + float(value["step"]) * np.arange(count), dtype=float)
     else:
         numbers = np.linspace(first, last, count)
     # Without the last digits, which are rounding: 0.30000000000000004.

@@ -30,9 +30,9 @@ SECOND = 1e3  # ms
 
 def _number(wanted: str, fits: Callable[[float], bool]) -> BeforeValidator:
     def check(value: object) -> object:
-        if not is_number(value) or not fits(float(value)):  # type: ignore[arg-type]
+        if not is_number(value) or not fits(float(value)):
             raise expected(wanted)
-        return float(value)  # type: ignore[arg-type]
+        return float(value)
 
     return BeforeValidator(check)
 
@@ -57,7 +57,7 @@ class TwoStates(BaseModel):
 def _loss(value: object) -> object:
     if isinstance(value, dict | TwoStates):
         return value
-    if not is_number(value) or not 0 <= value < 1:  # type: ignore[operator]
+    if not is_number(value) or not 0 <= value < 1:
         raise expected("a number >= 0 and < 1, or {good, bad, to_bad, to_good}")
     return TwoStates(good=value, bad=value, to_bad=0.0, to_good=1.0)
 

@@ -230,7 +230,7 @@ STYLES = {"ok": "green", "warning": "bold yellow", "error": "bold red"}
 @click.command(epilog=example_lines("msg-agents doctor"))
 @json_option
 def doctor(*, as_json: bool) -> None:
-    """CheckResult whether this machine can run networks.
+    """Check whether this machine can run networks.
 
     It also shows how to fix problems. The last check runs two processes for a second. Exit code 2: a run cannot work;
     warnings do not change it.

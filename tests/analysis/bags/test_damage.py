@@ -70,7 +70,7 @@ def test_torn_at_every_chunk_and_at_many_bytes(recorded: tuple[Run, Path], tmp_p
     states = dict(zip(ends, counts, strict=True))  # up to there; channels 1, 2: experiment, graph
     assert len(states) > 5
     cuts = {*states, *(end - 1 for end in states), len(data) - 1, len(data) - 9}
-    cuts |= set(random.Random(2).sample(range(len(data)), 200))
+    cuts |= set(random.Random(2).sample(range(len(data)), 500))
     head = data.index(b"/experiment") - 200  # the run record stands before the topics
     torn, previous = tmp_path / "torn.mcap", -1
     for cut in sorted(cuts):
@@ -98,7 +98,7 @@ def test_flipped_bytes(recorded: tuple[Run, Path], tmp_path: Path) -> None:
     data, (summary, everything) = whole.read_bytes(), contents(whole)
     end = summary.chunk_indexes[-1].chunk_start_offset + summary.chunk_indexes[-1].chunk_length
     flipped, rng, costs = tmp_path / "flipped.mcap", random.Random(3), 0
-    for number in range(120):
+    for number in range(200):
         place = rng.randrange(len(data))
         flipped.write_bytes(data[:place] + bytes([data[place] ^ 1 << rng.randrange(8)]) + data[place + 1 :])
         try:
@@ -125,8 +125,8 @@ def test_damage_around_a_chunk(tmp_path: Path, make_run: MakeRun, compression: C
     data, (summary, everything) = file.read_bytes(), contents(file)
     chunk = summary.chunk_indexes[-1]
     content = chunk.chunk_start_offset + chunk.chunk_length
-    places = [*range(chunk.chunk_start_offset + 9, content - chunk.compressed_size, 3)]
-    places += range(content, content + chunk.message_index_length, 17)
+    places = [*range(chunk.chunk_start_offset + 9, content - chunk.compressed_size, 2)]
+    places += range(content, content + chunk.message_index_length, 7)
     assert len(places) > 30
     damaged, count = tmp_path / "damaged.mcap", 0
     for place in places:

@@ -116,6 +116,14 @@ def test_a_frozen_agent_is_the_only_cause():
     assert cause.words == "agent 3 does not move in any of its steps, although it has noise"
 
 
+def test_an_agent_that_freezes_for_a_while():
+    trajectory = run(BASE, BASE)
+    trajectory.states[400:500, 1] = trajectory.states[400, 1]
+    first = compare(trajectory).causes[0]
+    assert (first.kind, first.agent) == ("frozen", 2)
+    assert first.estimate == pytest.approx(99 / 1000)
+
+
 def test_two_faults_are_both_found():
     both = noise(process=[1.0, 1.1, 1.0, 1.0]) | weaker(0.6, sender=2, receiver=3)
     causes = compare(run(BASE | both, BASE)).causes

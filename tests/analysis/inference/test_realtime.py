@@ -156,9 +156,9 @@ IN_DETAIL = [
 
 @pytest.mark.parametrize("case", ["consensus", "noise by graph"])
 def test_calibration(late_timers, case):
-    """20 late runs of 400 steps."""
+    """30 late runs of 400 steps."""
     late = lateness(late_timers)
-    runs = [late_timers.run(CASES[case].with_run(seed=seed), timing_seed=seed, **late) for seed in range(20)]
+    runs = [late_timers.run(CASES[case].with_run(seed=seed), timing_seed=seed, **late) for seed in range(30)]
     results = [compare(run) for run in runs]
     names = ["system error", *(f"error of agent {i}" for i in (1, 2, 3)), "covariance"]
     names += [f"residuals: {what}" for what in ("covariance", "whiteness", "gains", "common gain")]
@@ -214,7 +214,7 @@ def other_gain(factor):
 @pytest.mark.parametrize(
     ("truth", "found_by"),
     [
-        (other_gain(0.6), "residuals: gains"),
+        (other_gain(0.8), "residuals: gains"),
         (lambda model: dataclasses.replace(model, noise_gain=1.1 * model.noise_gain), "residuals: covariance"),
     ],
 )
@@ -329,3 +329,14 @@ def test_without_noise_and_in_lockstep(late_timers):
     assert [percent(share) for share in (0.0, 1e-6, 0.0731, 0.5, 0.9995, 1.0)] == [
         "0 %", "less than 0.01 %", "7.31 %", "50 %", "more than 99.9 %", "100 %"
     ]  # fmt: skip
+
+
+def test_noise_by_graph_is_tested_of_late_agents(late_timers):
+    late = noise_tests(late_timers.run(CASES["noise by graph"], **lateness(late_timers)))
+    assert min(late.p_covariance, late.p_whiteness) > 1e-3
+
+
+def test_the_pattern_law_finds_a_wrong_gain_by_itself(late_timers):
+    result = compare(late_timers.run(LONG, truth=other_gain(0.6), **lateness(late_timers)))
+    assert result.laws.pattern.supported is False
+    assert "an agent did not follow its law" in result.laws.pattern.why

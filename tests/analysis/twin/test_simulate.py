@@ -1,11 +1,13 @@
 """The twin against a naive loop, and what it draws against what it should have drawn."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import scipy.stats
 from tests.analysis.twin.test_links import LAWS, experiment
 
-from experiments import line_ring, new_record, predict, simulate
+from experiments import Run, line_ring, new_record, predict, simulate
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.step_model import build_step_model
 
@@ -80,3 +82,20 @@ def test_another_agent_changes_nobody_elses_noise() -> None:
     assert np.array_equal(two.states, four.states[:, :2])
     assert np.array_equal(two.published, four.published[:, :2])
     assert np.array_equal(two.lost, four.lost[:, :2, :1])
+
+
+def test_the_air_depends_on_nothing_else() -> None:
+    """Other replicas, weights, process noise, another agent: the same messages are lost, in the same steps."""
+
+    def flown(agents: int = 3, **changes: Any) -> Run:
+        graphs = {key: {"path": list(range(1, agents + 1))} for key in "ab"}
+        run = {"dt": 0.05, "replicas": 1, "seed": 5, "start": "zero"} | changes.pop("run", {})
+        return simulate(line_ring(agents, **{"graphs": graphs, "noise": AIR} | changes, run=run))
+
+    one = flown()
+    heavy = {"a": {"edges": [[1, 2, 2.0], [2, 3]]}, "b": {"edges": [[1, 2], [2, 3, 3.0]]}}
+    for other in (flown(graphs=heavy), flown(noise=AIR | {"process": 0.1}), flown(4)):
+        noise, others = one.published - one.states, other.published - other.states
+        np.testing.assert_allclose(noise, others[:, :3], atol=1e-12)
+        assert np.array_equal(one.lost[:, :2], other.lost[:, :2])
+    assert np.array_equal(one.lost, flown(run={"replicas": 7}).lost)
