@@ -12,12 +12,18 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.pool import compare
 from msg_analysis.model.run import Run
-from msg_analysis.twin.check import check
 from msg_analysis.twin.simulate import simulate
 
 LEADERS = {"agents": [1, 4], "reference": 2.0}
+RECEPTION = {"broadcast": 0.5, "link": 0.4, "loss": 0.25}
+PAIRS = [RECEPTION | {absent: 0.0} for absent in RECEPTION]
+"""With the networks without any of it, each of any two is there and not there with the other."""
 CASES: dict[str, dict[str, Any]] = {
-    "tracking": {"problem": "tracking", "leaders": {**LEADERS, "gain": 0.7}, "noise": {"process": [1, 2, 1, 0.5, 1]}},
+    "tracking": {
+        "problem": "tracking",
+        "leaders": {**LEADERS, "gain": 0.7},
+        "noise": {"process": [1, 2, 1, 0.5, 1], **RECEPTION},
+    },
     "noise by graph": {
         "noise": {
             "process": {"line": [1, 2, 0, 0.5, 1], "ring": [[0.1 * (1 + i + j) for j in range(5)] for i in range(5)]}
@@ -27,7 +33,8 @@ CASES: dict[str, dict[str, Any]] = {
     "discrete": {
         "time": "discrete",
         "switching": {"transition": [[0.9, 0.1], [0.4, 0.6]]},
-        "noise": {"process": [[1.0 if i == j else 0.3 / (1 + i + 2 * j) for j in range(5)] for i in range(5)]},
+        "noise": {"process": [[1.0 if i == j else 0.3 / (1 + i + 2 * j) for j in range(5)] for i in range(5)]}
+        | RECEPTION,
         "run": {"dt": 1, "duration": 300},
     },
     "disconnected": {
@@ -61,7 +68,7 @@ def test_equals_the_twin(network: Any, case: str, processes: Any) -> None:
 def equals_the_twin(what: Experiment, trajectory: Run | None) -> None:
     """300 steps: more than the window of the lockstep and more than one block of noise."""
     assert_equal_to_twin(trajectory)
-    assert trajectory.completeness.expected == 5 * 301
+    assert trajectory.completeness.expected == 5 * 301 * (2 if what.noise.broadcast else 1)
     assert trajectory.completeness.out_of_order == 0
     assert trajectory.completeness.refused == {}
     again = simulate(what)  # from the experiment alone: nothing of the bag is used
@@ -129,27 +136,7 @@ def _imported(log: str) -> set[str]:
     return {line.rpartition("|")[2].strip() for line in log.splitlines() if "import time:" in line}
 
 
-def test_two_runs_at_the_same_time(network: Any) -> None:
-    """Of one experiment, into one directory, in the same second: they neither hear nor overwrite each other."""
-    file, out = network.file(run={"processes": 1}), network.directory / "runs"
-    runs = [network.record(file, "--seed", seed) for seed in ("1", "2")]
-    for run in runs:
-        network.ended(run)
-    bags = sorted(directory for directory in out.iterdir() if directory.is_dir())
-    assert len(bags) == 2
-    trajectories = {trajectory.record.experiment.run.seed: trajectory for trajectory in map(read_bag, bags)}
-    assert trajectories.keys() == {1, 2}
-    for seed, trajectory in trajectories.items():
-        equals_the_twin(network.experiment(run={"processes": 1, "seed": seed}), trajectory)
-
-
-RECEPTION = {"broadcast": 0.5, "link": 0.4, "loss": 0.25}
-PAIRS = [RECEPTION | {absent: 0.0} for absent in RECEPTION]
-"""With the networks without any of it, each of any two is there and not there with the other."""
-TRACKING = {"problem": "tracking", "leaders": {"agents": [1, 4], "gain": 0.7, "reference": 2.0}}
-
-
-@pytest.mark.parametrize("noise", [*PAIRS, RECEPTION], ids=json.dumps)
+@pytest.mark.parametrize("noise", PAIRS, ids=json.dumps)
 def test_equals_the_twin_and_the_prediction(network: Any, noise: dict[str, float]) -> None:
     """400 steps: the bits of the twin, and |z| < 4 for the system and 5 agents: 4e-4 false alarms a case."""
     what = network.experiment(noise=noise, run={"duration": 20, "replicas": 16, "processes": 2})
@@ -164,32 +151,3 @@ def test_equals_the_twin_and_the_prediction(network: Any, noise: dict[str, float
         assert mine is None or np.array_equal(mine, other)
     comparison = compare(trajectory)
     assert all(abs(estimate.z) < 4 for estimate in [comparison.system_error, *comparison.node_errors])
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {**TRACKING, "run": {"processes": "one_per_agent"}},
-        {
-            "time": "discrete",
-            "switching": {"transition": [[0.9, 0.1], [0.4, 0.6]]},
-            "run": {"dt": 1, "duration": 300, "processes": 1},
-        },
-    ],
-    ids=["tracking", "discrete"],
-)
-def test_other_laws_equal_the_twin(network: Any, changes: dict[str, Any]) -> None:
-    what = network.experiment(noise=RECEPTION, **changes)
-    result = network.run(what)
-    assert result.trajectory.completeness.complete
-    assert check(result.trajectory).difference is None
-
-
-def test_killed_agents_come_back_with_their_noise(network: Any) -> None:
-    """What a new process publishes again is computed from the truth that the old one kept."""
-    run = {"duration": 120, "replicas": 64, "processes": 3}
-    file = network.file(noise=RECEPTION, run=run)
-    process = network.record(file, "--restarts", "3", "--json")
-    trajectory = network.killed_and_back(process, network.any_agent, 2)
-    assert_equal_to_twin(trajectory)
-    assert trajectory.completeness.refused == {}

@@ -200,8 +200,8 @@ def test_two_runs_at_the_same_time(network: Any) -> None:
     """Of other laws, each in one process, into one directory: they neither hear nor overwrite each other."""
     out, runs = network.directory / "runs", {}
     for seed, (law, changes) in enumerate(OTHER_LAWS.items(), start=1):
-        run = {**UNDISTURBED, "processes": 1, "seed": seed, **changes.get("run", {})}
-        runs[law] = network.record(network.file(f"{law}.yaml", **{**changes, "run": run}))
+        run = {**UNDISTURBED, "processes": 1, **changes.get("run", {})}
+        runs[law] = network.record(network.file(f"{law}.yaml", **{**changes, "run": run}), "--seed", str(seed))
     errors = [run.communicate(timeout=100)[1] for run in runs.values()]
     assert [run.returncode for run in runs.values()] == [0, 0]
     assert not any("Traceback" in text or "failed" in text for text in errors), errors

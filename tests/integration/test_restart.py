@@ -19,7 +19,7 @@ from msg_agents.run.result import read_steps
 from msg_agents.run.supervisor import STEPS
 
 FAULTS = [["agent"], ["agent"] * 3, ["switcher"], ["agent", "switcher"]]
-RUN = {"duration": 250, "start": "zero", "processes": 3}  # 20 s, in the middle of which each fault happens
+RUN = {"duration": 150, "start": "zero", "processes": 3}  # 12 s, in the middle of which each fault happens
 KILLED = r"(agents?_\w+|switcher): killed by SIGKILL.*, started again$"
 LISTENER = """
 import os, signal, struct, sys, rclpy

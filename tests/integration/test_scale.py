@@ -33,7 +33,7 @@ def test_complete_and_equal_to_the_twin(network: Any, rows: int, columns: int, p
 
 def test_a_killed_process_of_many_agents_comes_back(network: Any) -> None:
     """What its agents had told each other directly has gone with it."""
-    run = {"duration": 200, "start": "zero", "processes": 2, "replicas": 16}
+    run = {"duration": 100, "start": "zero", "processes": 2, "replicas": 16}
     process = network.record(network.file(**grid(6, 5), run=run), "--restarts", "1", "--json")
     network.wait_for_steps()
     network.processes("agent")[0].kill()
@@ -85,9 +85,9 @@ def test_processes_of_one_agent_that_hear_all_others(network: Any) -> None:
     Nobody waits for the planned end of the run, so it cannot be over too early.
     """
     run = {"duration": 1000, "start": "zero", "processes": "one_per_agent", "replicas": 16}
-    process = network.record(network.file(**complete(17), run=run), "--restarts", "1", "--json")
+    process = network.record(network.file(**complete(9), run=run), "--restarts", "1", "--json")
     steps = network.wait_for_steps()
-    kept = assert_cores(network, pinned=2 <= len(os.sched_getaffinity(0)) <= 17)
+    kept = assert_cores(network, pinned=2 <= len(os.sched_getaffinity(0)) <= 9)
     victim = network.processes("agent")[-1]
     back_on(network, victim, kept[victim.agent])
     before = max(read_steps(steps))
@@ -121,7 +121,7 @@ def test_processes_that_hear_most_of_a_network(
         "/agent_1/state": sorted(f"agent_{i}" for i in of_first),
         "/agent_24/state": sorted(f"agent_{i}" for i in of_last),
     }
-    run = {"duration": 80, "start": "zero", "processes": processes, "replicas": 16}
+    run = {"duration": 60, "start": "zero", "processes": processes, "replicas": 16}
     wanted = {topic: [[name, "RELIABLE"] for name in names] for topic, names in readers.items()}
     with watched_endpoints(wanted, {}, domain):
         options = ("--no-pin", "--restarts", "1", "--json", "--domain", str(domain))
