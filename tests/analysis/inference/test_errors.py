@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from experiments import line_ring, observed, pieces
+from experiments import observed, pieces
 from msg_analysis.inference.estimates import covariance_test, estimates
 from msg_analysis.inference.given_path import GivenPath, means_given_path
 from msg_analysis.inference.time_means import expected_mean, time_means
@@ -128,11 +128,10 @@ def test_known_starts_are_predicted_by_the_transient(start):
 
 
 def short(**changes):
-    run = {"dt": 0.1, "duration": 1.2, "seed": 3, "start": [1.0, -1.0, 3.0]} | changes.pop("run", {})
+    run = {"duration": 1.2, "start": [1.0, -1.0, 3.0]} | changes.pop("run", {})
     graphs = {"left": {"edges": [[1, 2]]}, "right": {"edges": [[2, 3, 2.0], [1, 2]]}}
-    chain = {"generator": [[-2.0, 2.0], [1.0, -1.0]]}
-    fields = {"graphs": graphs, "agents": 3, "switching": chain, "noise": {"process": [1.0, 0.5, 2.0]}}
-    return line_ring(**fields | changes, run=run)
+    fields = {"problem": "consensus", "leaders": None, "graphs": graphs, "noise": {"process": [1.0, 0.5, 2.0]}}
+    return pieces(**fields | changes, run=run)
 
 
 CASES = {
@@ -233,9 +232,7 @@ def test_less_is_tested_when_there_is_much():
 
 
 def test_many_kinds_of_losses_are_left_out():
-    observation = observed(CASES["air"])
-    assert means_given_path(observation) is not None
-    assert means_given_path(observation, most_numbers=1) is None
+    assert means_given_path(observed(CASES["air"]), most_numbers=1) is None
 
 
 def test_slow_switching_makes_it_much_better():
