@@ -61,20 +61,6 @@ def nominal(what):
     return [np.eye(3) - what.run.dt * (graph.laplacian + gains) for graph in what.graph_list]
 
 
-@pytest.mark.parametrize("what", [CASES["all"], CASES["correlated"]])
-def test_innovations_are_what_is_left_of_each_step(what):
-    observation, trajectory, weights = observed(what), simulate(what), nominal(what)
-    found = residuals(observation, 0, 400, ReceivedValues.of(observation, 0, 400))
-    for k, g in enumerate(trajectory.modes):
-        for i in range(3):
-            rest = trajectory.states[k + 1, i] - weights[g][i, i] * trajectory.states[k, i]
-            rest -= what.reference * (1 - weights[g][i].sum())
-            neighbours = [j for j in range(3) if j != i and weights[g][i, j]]
-            for j, lost in zip(neighbours, trajectory.lost[k, i], strict=False):
-                rest -= weights[g][i, j] * (trajectory.states[k, i] if lost else trajectory.published[k, j])
-            np.testing.assert_allclose(found[k, i], rest, atol=1e-12)
-
-
 @pytest.mark.parametrize("most", [400, 12, 8])
 def test_regression_against_a_loop(most):
     """Each difference of each graph; the pull of each agent in each graph; in both graphs together."""

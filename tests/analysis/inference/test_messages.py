@@ -12,10 +12,10 @@ import pytest
 from tests.support.message_runs import message_run
 
 from experiments import compare, line_ring, observed, predict
-from msg_analysis.common.arrays import LARGE_VARIABLE, in_file
+from msg_analysis.common.arrays import LARGE_VARIABLE
 from msg_analysis.inference import pattern_events
 from msg_analysis.inference.counts import LossTally, loss_test
-from msg_analysis.inference.event_order import newest_steps, order_events, period_tables
+from msg_analysis.inference.event_order import newest_steps, order_events
 from msg_analysis.inference.realtime_laws import means_in_lockstep, pattern_means
 from msg_analysis.inference.received_values import ReceivedValues, RepeatedNoise
 from msg_analysis.inference.residuals import residuals
@@ -102,12 +102,14 @@ def means_of(observation):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_expectation_and_variance_given_the_log(case):
+def test_expectation_and_variance_given_the_log(case, monkeypatch):
     """The expectation exactly; the variance, which is a function of the states, in the mean over many replicas.
 
-    It is a mean over 20,000 replicas with relative spread of about 1: 3 % are four standard errors.
+    It is a mean over 20,000 replicas with relative spread of about 1: 3 % are four standard errors. What is in use is
+    found in blocks of one or two steps, and is in files.
     """
-    observation = observed(made(case, replicas=20_000))
+    monkeypatch.setenv(LARGE_VARIABLE, "1")
+    observation = dataclasses.replace(observed(made(case, replicas=20_000)), block_numbers=300)
     brute, means = Unrolled(observation), means_of(observation)
     frame = observation.prediction.system.frame
     expected = frame @ means.expected_moments @ frame.T
@@ -258,22 +260,6 @@ def test_a_link_that_loses_more_is_named(on_loss, burst):
     assert first.expected == pytest.approx(0.2)
     assert first.interval[0] < 0.3 < first.interval[1]
     assert "of the messages from agent 2 to agent 3 are lost, not 20 %" in first.words
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_values_in_use_in_blocks_and_in_files(case, monkeypatch):
-    """What is in use, block by block of one or two steps, is what is found for the whole run at once."""
-    observation = observed(made(case, duration=60))
-    timed = observation if observation.timers else observation.as_timed()
-    whole = period_tables(timed, order_events(timed))
-    monkeypatch.setenv(LARGE_VARIABLE, "1")
-    observation = dataclasses.replace(observation, block_numbers=300)
-    again = observation if observation.timers else observation.as_timed()
-    split = period_tables(again, order_events(again))
-    assert in_file(split[0].rows)
-    for one, other in zip(split, whole, strict=True):
-        assert np.array_equal(one.rows, other.rows)
-        assert np.array_equal(one.ends, other.ends)
 
 
 def test_the_verdict_in_real_time_is_calibrated():
