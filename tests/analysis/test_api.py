@@ -53,34 +53,35 @@ def test_names() -> None:
 
 def test_one_class_for_each_concept(experiment: Experiment, run: Run) -> None:
     """Whoever made it: what every function gives is of the class that the package exports."""
-    made = [
-        (
-            Experiment,
-            (experiment.with_run(seed=4), run.experiment, run.record.experiment, experiment.predict().experiment),
-        ),
-        (Run, (run, run.compare().trajectory)),
-        (msg_analysis.Prediction, (experiment.predict(), experiment.spectrum([0, 1]).prediction)),
-        (msg_analysis.Comparison, (run.compare(), compare(run, experiment.simulate(seed=4)))),
-        (msg_analysis.Spectrum, (experiment.spectrum([0, 1], [0.1]),)),
-    ]
-    for kind, objects in made:
+    prediction, comparison, spectrum = experiment.predict(), run.compare(), experiment.spectrum([0, 1], [0.1])
+    made = {
+        Experiment: (experiment.with_run(seed=4), run.experiment, run.record.experiment, prediction.experiment),
+        Run: (run, comparison.trajectory),
+        msg_analysis.Prediction: (prediction, spectrum.prediction),
+        msg_analysis.Comparison: (comparison, compare(run, experiment.simulate(seed=4))),
+        msg_analysis.Spectrum: (spectrum,),
+    }
+    for kind, objects in made.items():
         assert {type(each) for each in objects} == {kind}
 
 
-def test_predict(experiment: Experiment) -> None:
-    """The golden numbers, as arrays."""
+def test_theory(experiment: Experiment) -> None:
+    """The golden numbers, as arrays, in units of time; with a stationary start the error stays."""
     prediction = experiment.predict()
-    assert prediction.emulated.system_error == pytest.approx(GOLDEN["emulated"]["system_error"], rel=1e-8)
-    assert prediction.continuous
-    np.testing.assert_allclose(prediction.continuous.node_certainty, GOLDEN["continuous"]["node_certainty"], rtol=1e-8)
-    assert prediction.continuous.system_certainty == pytest.approx(GOLDEN["continuous"]["system_certainty"], rel=1e-8)
     assert prediction.emulated.covariance.shape == (5, 5)
+    for law in ("emulated", "continuous"):
+        moments, course = getattr(prediction, law), experiment.transient([0, 1, 2.5], law=law)  # type: ignore[arg-type]
+        for key in ("system_error", "system_certainty", "node_errors", "node_certainty"):
+            np.testing.assert_allclose(getattr(moments, key), GOLDEN[law][key], rtol=1e-8)
+        np.testing.assert_allclose(course.times, [0, 1, 2.5])
+        np.testing.assert_allclose(course.system_error, GOLDEN[law]["system_error"], rtol=1e-6)
+        assert course.node_errors.shape == (3, 5)
+    selection = experiment.leaders(1)
+    assert selection.sets[0] == (selection.bound, (3,))  # the middle of the line
 
 
 def test_simulate(experiment: Experiment, run: Run) -> None:
-    assert run.states.shape == (1001, 5, 16)
-    assert run.times.shape == (1001,)
-    assert run.times[-1] == pytest.approx(50)
+    assert (run.states.shape, run.times.shape, run.times[-1]) == ((1001, 5, 16), (1001,), pytest.approx(50))
     again = Experiment.load(LINE_RING).simulate(seed=3, duration=50)
     assert np.array_equal(again.states, run.states)
     assert again.record.run != run.record.run
@@ -93,10 +94,8 @@ def test_simulate(experiment: Experiment, run: Run) -> None:
 def test_a_bag_is_the_same_run(run: Run, tmp_path: Path) -> None:
     assert run.save(tmp_path / "bag") == tmp_path / "bag"
     read = read_bag(tmp_path / "bag")
-    assert isinstance(read, Run)
+    assert (type(read), read.completeness.complete) == (Run, True)
     assert np.array_equal(read.states, run.states)
-    assert np.array_equal(read.modes, run.modes)
-    assert read.completeness.complete
     with pytest.raises(BagError, match="exists already"):
         run.save(tmp_path / "bag")
     with pytest.raises(BagError, match="not found"):
@@ -110,7 +109,6 @@ def test_compare(run: Run, experiment: Experiment, tmp_path: Path) -> None:
     assert alone.to_json() == by_path.to_json()
     assert alone.verdict == "agrees"
     together = compare(tmp_path / "bag", experiment.simulate(seed=4))
-    assert together.pool
     assert [member.name for member in together.pool.members] == [str(tmp_path / "bag"), "run 2"]
     file = write_report(together, tmp_path / "report.html")
     assert file.read_text(encoding="utf-8").startswith("<!")
@@ -128,25 +126,6 @@ def test_compare(run: Run, experiment: Experiment, tmp_path: Path) -> None:
 def test_compare_refuses(runs: list[str], options: dict[str, float], words: str) -> None:
     with pytest.raises(InputError, match=words):
         compare(*runs, **options)
-
-
-def test_transient(experiment: Experiment) -> None:
-    """In units of time, whatever the law; with a stationary start the error stays."""
-    times = [0, 1, 2.5]
-    for law in ("emulated", "continuous"):
-        course = experiment.transient(times, law=law)  # type: ignore[arg-type]
-        np.testing.assert_allclose(course.times, times)
-        np.testing.assert_allclose(course.system_error, GOLDEN[law]["system_error"], rtol=1e-6)
-        assert course.node_errors.shape == (3, 5)
-    with pytest.raises(InputError, match="not a multiple of the step"):
-        experiment.transient([0.01])
-
-
-def test_select_leaders(experiment: Experiment) -> None:
-    selection = experiment.leaders(1)
-    error, agents = selection.sets[0]
-    assert agents == (3,)  # the middle of the line
-    assert selection.bound == error
 
 
 def test_everything_says_what_it_is(experiment: Experiment, run: Run) -> None:
@@ -168,13 +147,11 @@ def test_everything_says_what_it_is(experiment: Experiment, run: Run) -> None:
     ]
     for result, words in results:
         text = repr(result)
-        assert "\n" not in text
-        assert len(text) < 200
+        assert ("\n" in text, len(text) < 200) == (False, True)
         assert all(word in text for word in words), text
         lines = result._repr_markdown_().splitlines()
         rows = [line for line in lines if line.startswith("|")]
-        assert len(rows) >= 3
-        assert lines[-1] == rows[-1]
+        assert (len(rows) >= 3, lines[-1]) == (True, rows[-1])
         assert any(re.fullmatch(r"(\| -{3}:? )+\|", row) for row in rows)
         assert len({row.count("|") for row in rows}) == 1
     classes = [getattr(msg_analysis, name) for name in msg_analysis.__all__ if name[0].isupper()]
@@ -183,12 +160,9 @@ def test_everything_says_what_it_is(experiment: Experiment, run: Run) -> None:
 
 def test_large_networks_are_short_too() -> None:
     agents = list(range(1, 61))
-    document = {
-        "name": "large",
-        "graphs": {f"g{i}": {"path": agents if i % 2 else agents[::-1]} for i in range(6)},
-        "switching": {"rates": {f"g{i}": {f"g{(i + 1) % 6}": 1.0} for i in range(6)}},
-    }
-    experiment = Experiment.parse(document)
+    graphs = {f"g{i}": {"path": agents if i % 2 else agents[::-1]} for i in range(6)}
+    rates = {f"g{i}": {f"g{(i + 1) % 6}": 1.0} for i in range(6)}
+    experiment = Experiment.parse({"name": "large", "graphs": graphs, "switching": {"rates": rates}})
     assert "g3, ...;" in repr(experiment)
     assert len(experiment.predict()._repr_markdown_().splitlines()) < 40
 

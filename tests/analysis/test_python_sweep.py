@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from msg_analysis import Experiment, ExperimentError, InputError, NotAvailableError, sweep
-from msg_analysis.cli.main import main
+from msg_analysis.sweeps.grid import load_sweep
 from msg_analysis.testing import assert_agrees
 
 LINE_RING = Path(__file__).parents[2] / "tests/data/golden/line_ring.yaml"
@@ -37,17 +36,16 @@ def test_predictions_are_those_of_the_experiments(experiment: Experiment) -> Non
 
 
 def test_runs_are_those_of_the_command(experiment: Experiment, tmp_path: Path) -> None:
-    """The same seeds and numbers, whatever did them."""
-    found = sweep(experiment, {"switching.scale": [0.5, 2]}, kind="simulate", repetitions=2)
-    file = tmp_path / "rates.json"
-    document = {"experiment": experiment.to_document(), "over": {"switching.scale": [0.5, 2]}}
+    """The same jobs, with their seeds, as those of a file; a row is the comparison of one run."""
+    over = {"switching.scale": [0.5, 2]}
+    found = sweep(experiment, over, kind="simulate", repetitions=2)
+    file, document = tmp_path / "rates.json", {"experiment": experiment.to_document(), "over": over}
     file.write_text(json.dumps(document | {"kind": "simulate", "repetitions": 2}))
-    result = CliRunner().invoke(main, ["sweep", str(file), "--out", str(tmp_path / "out"), "--workers", "1", "--json"])
-    rows = json.loads(result.stdout)["points"]
-    for mine, theirs in zip(found.rows, rows, strict=True):
-        assert {key: mine[key] for key in ("seed", "p_adjusted", "system_error.measured", "verdict")} == {
-            key: theirs[key] for key in ("seed", "p_adjusted", "system_error.measured", "verdict")
-        }
+    assert [point.job for point in found.points.points] == [point.job for point in load_sweep(file).points]
+    for row in found.rows:
+        what = experiment.with_values({"switching.scale": row["switching.scale"]})
+        result = what.simulate(seed=row["seed"]).compare()
+        assert (row["system_error.measured"], row["verdict"]) == (result.system_error.measured, result.verdict)
     assert found.judgement.verdict == "agrees"
 
 
