@@ -234,13 +234,6 @@ def test_calibration_with_noise_by_graph(line, ring):
     assert_calibrated(results)
 
 
-def test_noise_in_the_wrong_graph_is_found():
-    swapped, told = (loud(*noise, duration=200) for noise in ((1.0, 0.3), (0.3, 1.0)))
-    comparison = compare(claimed(simulate(swapped), told))
-    assert comparison.verdict == "disagrees"
-    assert comparison.innovations.p_covariance < 1e-6
-
-
 LINE_RING = document(5, 0.5, run={"dt": 0.1, "duration": 400.0, "replicas": 1, "seed": 3})
 
 

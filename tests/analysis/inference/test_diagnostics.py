@@ -368,14 +368,4 @@ def test_a_fault_is_found_and_named(fault: str) -> None:
     in_time = stretch or first.kind in ("frozen", "graph", "outlier")
     steps = first.steps
     assert (steps is not None) == in_time
-    assert steps is None or f"{steps[0]:,}" in first.words
-
-
-def test_the_stretch_is_the_right_one() -> None:
-    """The steps of which the states do not change."""
-    result = departures.one_run("an agent stands still for 20 steps", 16, 102)
-    states = result.trajectory.states[:, 2]
-    still = np.flatnonzero((states[1:] == states[:-1]).all(axis=1)) + 1
-    assert result.causes[0].steps == (still[0], still[-1])
-    assert result.causes[0].estimate == pytest.approx(20 / (len(states) - 1))
-    assert len(still) == 20
+    assert steps is None or all(f"{step:,}" in first.words for step in steps)

@@ -6,6 +6,7 @@ import late_timers
 import numpy as np
 import pytest
 from late_timers import busy
+from tests.analysis.inference.test_messages import Unrolled
 
 from experiments import CORRELATED, TRACKING, directed, observed, simulate
 from msg_analysis.common.arrays import LARGE_VARIABLE, in_file
@@ -52,52 +53,19 @@ def written_out(observation):
     the covariance is the sum over the periods of what the noise of the period adds, given the noise before it; else its
     expectation.
     """
-    step, timers = observation.step, observation.timers
-    steps, m = timers.graphs.shape
-    replicas = observation.replicas
-    mean = np.full((steps + 1, m, replicas), np.nan)
-    gain = np.full((steps + 1, m, steps * m), np.nan)
-    seen = observation.states - step.reference
-    noise, period = np.zeros((steps * m, replicas)), np.zeros(steps * m)
-    mean[0], gain[0] = observation.start - step.reference, 0.0
-    known = {(0, i) for i in range(m)}
-    neighbours_of = [[step.neighbours(g, i).tolist() for i in range(m)] for g in range(step.modes)]
-    waiting = [(k, i) for k in range(steps) for i in range(m)]
-    while waiting:
-        left = []
-        for k, i in waiting:
-            g = timers.graphs[k, i]
-            senders = [i, *neighbours_of[g][i]]
-            steps_used = [k, *timers.used[k, i, : len(senders) - 1].tolist()]
-            uses = [(k, i) if s < 0 else (s, j) for s, j in zip(steps_used, senders, strict=True)]
-            if not known.issuperset(uses):
-                left.append((k, i))
-                continue
-            mean[k + 1, i], gain[k + 1, i], pulled = (
-                sum(step.nominal[g, i, j] * values[use] for j, use in zip(senders, uses, strict=True))
-                for values in (mean, gain, seen)
-            )
-            gain[k + 1, i, k * m : (k + 1) * m] += step.noise_gain[g, i]
-            known.add((k + 1, i))
-            noise[k * m + i] = (seen[k + 1, i] - pulled) / (step.noise_gain[g, i, i] or 1.0)
-            period[k * m + i] = np.ceil(timers.made[k + 1, i] / np.round(step.dt * 1e9))
-        assert len(left) < len(waiting)
-        waiting = left
-    times = np.round(np.arange(steps) * step.dt * 1e9)
-    newest = (timers.made[None] <= times[:, None, None]).sum(axis=1) - 1
-    x, b = mean[newest, range(m)], gain[newest, range(m)]
-    if observation.prediction.experiment.problem == "consensus":
-        x, b = x - x.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
+    (steps, m), replicas = observation.timers.graphs.shape, observation.replicas
+    unrolled = Unrolled(observation, replicas)
+    x, b = np.split(unrolled.sampled, [replicas], axis=2)
+    mean, gain = (part.reshape(steps * m, -1) for part in np.split(unrolled.states[1:], [replicas], axis=2))
+    seen = (observation.states[1:] - observation.step.reference).reshape(steps * m, -1)
+    noise = np.linalg.lstsq(gain, seen - mean, rcond=None)[0]
+    period = np.ceil(observation.timers.made[1:] / np.round(observation.step.dt * 1e9)).ravel()
     expected = (np.einsum("kir,kjr->ij", x, x) / replicas + np.einsum("kin,kjn->ij", b, b)) / steps
-    entries = [(i, j) for i in range(m) for j in range(i + 1)]
-    forms = [np.einsum("kn,kl->nl", b[:, i], b[:, j]) / steps for i, j in entries]
-    forms = [(form + form.T) / 2 for form in forms]
-    linear = [
-        (np.einsum("kn,kr->nr", b[:, i], x[:, j]) + np.einsum("kn,kr->nr", b[:, j], x[:, i])) / steps
-        for i, j in entries
-    ]
-    forms, linear = np.array(forms), np.array(linear)
-    if all((gains == np.diag(np.diag(gains))).all() for gains in step.noise_gain):
+    i, j = np.tril_indices(m)
+    forms = np.einsum("kan,kal->anl", b[:, i], b[:, j], optimize=True) / steps
+    forms = (forms + forms.transpose(0, 2, 1)) / 2
+    linear = (np.einsum("kan,kar->anr", b[:, i], x[:, j]) + np.einsum("kan,kar->anr", b[:, j], x[:, i])) / steps
+    if all((gains == np.diag(np.diag(gains))).all() for gains in observation.step.noise_gain):
         covariance = np.zeros((len(forms), len(forms)))
         for number in range(1, steps):
             now, before = period == number, period < number
@@ -139,7 +107,7 @@ def test_against_all_noise_written_out(case, timing, monkeypatch):
     for node, place, i in zip(nodes, diagonal, range(3), strict=True):
         assert node.standard_error == pytest.approx(np.sqrt(covariance[place, place]), rel=1e-7)
         assert node.measured == pytest.approx(measured[i, i])
-    off = np.array([(measured - expected)[i, j] for i in range(3) for j in range(i + 1)])
+    off = (measured - expected)[np.tril_indices(3)]
     scale = np.sqrt(np.diag(covariance))
     inverse = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-10, hermitian=True)
     found = covariance_test(means, system)
@@ -186,15 +154,13 @@ def test_a_clock_that_jumps():
 
 def test_clocks_that_disagree():
     trajectory = made_late("consensus", "ideal")
-    ahead = trajectory.made.copy()
+    ahead, back = trajectory.made.copy(), trajectory.made.copy()
     ahead[1:, 1] += 250_000_000
     observation = observed(dataclasses.replace(trajectory, made=ahead))
     with pytest.raises(PatternUnavailableError, match=r"a value that agent 2 computed 0\.\d+ units of time later"):
         pattern_means(observation, order_events(observation))
-    back = trajectory.made.copy()
     back[50, 1] = back[48, 1]
-    order = order_events(observed(dataclasses.replace(trajectory, made=back)))
-    assert order.contradiction is not None
+    assert order_events(observed(dataclasses.replace(trajectory, made=back))).contradiction is not None
 
 
 def test_less_is_tested_when_there_is_much():

@@ -15,7 +15,7 @@ from experiments import compare, line_ring, observed, predict
 from msg_analysis.common.arrays import LARGE_VARIABLE
 from msg_analysis.inference import pattern_events
 from msg_analysis.inference.counts import LossTally, loss_test
-from msg_analysis.inference.event_order import newest_steps, order_events
+from msg_analysis.inference.event_order import order_events
 from msg_analysis.inference.realtime_laws import means_in_lockstep, pattern_means
 from msg_analysis.inference.received_values import ReceivedValues, RepeatedNoise
 from msg_analysis.inference.residuals import residuals
@@ -51,9 +51,9 @@ def made(case, seed=1, **run):
 
 
 class Unrolled:
-    """All states of a run as combinations of a constant 1 and of independent standard normal numbers."""
+    """All states as combinations of the states of some replicas at the start, and of independent normal numbers."""
 
-    def __init__(self, observation):
+    def __init__(self, observation, starts=1):
         what, step = observation.prediction.experiment, observation.step
         timed = observation if observation.timers else observation.as_timed()
         steps, m = timed.timers.graphs.shape
@@ -62,27 +62,29 @@ class Unrolled:
             np.eye(m) - what.step_length * (np.diag(g.adjacency.sum(axis=1)) - g.adjacency + np.diag(what.leader_gains))
             for g in what.graph_list
         ]
-        size = 1 + m * steps + m * (steps + 1) + len(links) * (steps + 1)
-        unit, numbers = np.eye(size), iter(range(1, size))
-        states = {(0, i): observation.start[i, 0] * unit[0] - what.reference * unit[0] for i in range(m)}
-        process = {(k, i): math.sqrt(what.step_length) * unit[next(numbers)] for k in range(steps) for i in range(m)}
-        broadcast = {(k, i): step.broadcast * unit[next(numbers)] for k in range(steps + 1) for i in range(m)}
-        link = {(k, i, j): step.link * unit[next(numbers)] for k in range(steps + 1) for i, j in links}
+        size = starts + m * steps + (step.broadcast > 0) * m * (steps + 1) + (step.link > 0) * len(links) * (steps + 1)
+        unit, numbers = np.eye(size), iter(range(starts, size))
+        states = {(0, i): (observation.start[i, :starts] - what.reference) @ unit[:starts] for i in range(m)}
+        process = [[math.sqrt(what.step_length) * unit[next(numbers)] for _ in range(m)] for _ in range(steps)]
+        said = {(k, i): step.broadcast and step.broadcast * unit[next(numbers)] for k, i in np.ndindex(steps + 1, m)}
+        link = {(k, i, j): step.link and step.link * unit[next(numbers)] for k in range(steps + 1) for i, j in links}
         order = np.arange(steps * m)
         if observation.timers:
             order = np.argsort(order_events(observation).position.ravel())
         for k, i in np.column_stack(np.unravel_index(order, (steps, m))).tolist():
             graph = int(timed.timers.graphs[k, i])
-            total = weights[graph][i, i] * states[k, i]
+            total = weights[graph][i, i] * states[k, i] + what.noise_gain[graph][i] @ process[k]
             for d, j in enumerate(step.neighbours(graph, i).tolist()):
                 s = int(timed.timers.used[k, i, d])
-                heard = states[k, i] if s < 0 else states[s, j] + broadcast[s, j] + link[s, i, j]
+                heard = states[k, i] if s < 0 else states[s, j] + said[s, j] + link[s, i, j]
                 total = total + weights[graph][i, j] * heard
-            states[k + 1, i] = total + process[k, i]
-        newest = newest_steps(timed)[:steps]
-        self.sampled = np.array([[states[int(newest[k, i]), i] for i in range(m)] for k in range(steps)])
+            states[k + 1, i] = total
+        self.states = np.array([[states[k, i] for i in range(m)] for k in range(steps + 1)])
+        times = np.round(np.arange(steps) * what.step_length * 1e9)
+        newest = (timed.timers.made[None] <= times[:, None, None]).sum(axis=1) - 1
+        self.sampled = self.states[newest, range(m)]
         if what.problem == "consensus":
-            self.sampled -= self.sampled.mean(axis=1, keepdims=True)
+            self.sampled = self.sampled - self.sampled.mean(axis=1, keepdims=True)
 
     def node_errors(self):
         """(m,) expected time means."""
