@@ -4,10 +4,7 @@ import sys
 from pathlib import Path
 
 import errata
-import numpy as np
 import pytest
-
-from experiments import Experiment, predict
 
 PAGE = (Path(__file__).parents[3] / "docs/errata.md").read_text(encoding="utf-8")
 
@@ -29,20 +26,3 @@ def test_what_is_printed(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["errata.py", "99"])
     with pytest.raises(SystemExit, match=r"^2$"):
         errata.main()
-
-
-@pytest.mark.parametrize("noise", [[1.0] * 5, np.sqrt([0.001, 0.001, 0.001, 1.0, 0.001]).tolist()])
-def test_the_script_and_the_package_agree(noise):
-    pairs = [[1, 4], [1, 5], [2, 3], [3, 4]], [[1, 3], [2, 4], [2, 5], [3, 4]]
-    document = {
-        "name": "pairs",
-        "graphs": {"first": {"edges": pairs[0]}, "second": {"edges": pairs[1]}},
-        "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
-        "noise": {"process": noise},
-        "run": {"dt": 0.05, "duration": 1},
-    }
-    pi = np.array([0.5, 0.5])
-    graphs = [errata.laplacian(pair, 5) for pair in pairs]
-    expected = errata.continuous(graphs, pi, errata.generator(pi, 1.0), np.diag(np.square(noise)))
-    prediction = predict(Experiment.parse(document))
-    np.testing.assert_allclose(prediction.continuous.node_errors, expected, rtol=1e-10)
