@@ -130,7 +130,6 @@ def test_objects_in_a_file_are_not_loaded(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("graph", "changes", "words"),
     [
-        (np.ones((2, 3)), {}, r"graphs\.g\.adjacency: 2 rows of 3 entries: expected a square matrix"),
         (np.array([[0, np.nan], [1, 0]]), {}, r"graphs\.g\.adjacency\[1\]\[2\]"),
         ({"path": ["a", "b", "x"]}, {"names": ["a", "b", "c"]}, 'node "x": expected one of the names a, b, c'),
         ({"edges": [[1, 2]], "weight": 2}, {}, r"graphs\.g\.weight: 2.0: expected with path, cycle"),

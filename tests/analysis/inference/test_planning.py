@@ -146,9 +146,7 @@ def test_power_is_that_of_runs() -> None:
 def test_faults_that_a_law_cannot_have() -> None:
     assert [row["kind"] for row in ONE_GRAPH.plan().to_json()["faults"]] == ["noise", "noise", "gain", "gain"]
     fast = experiments.line_ring(time="discrete", switching={"transition": [[0.2, 0.8], [0.8, 0.2]]})
-    kept = [(row["kind"], row["factor"]) for row in fast.plan().to_json()["faults"]]
-    assert ("switching", 0.7) in kept
-    assert ("switching", 1.4) not in kept
+    assert [row["factor"] for row in fast.plan().to_json()["faults"] if row["kind"] == "switching"] == [0.7]
 
 
 def test_notes() -> None:
