@@ -50,7 +50,6 @@ def test_runs_are_those_of_the_command(tmp_path: Path) -> None:
     [
         ({"noise.proces": [1]}, {}, r"point 1 \(noise.proces = 1\): noise.proces: unknown key"),
         ({"run.dt": [0.05, 9]}, {}, r"point 2 \(run.dt = 9\): run.d"),
-        ({"run.seed": []}, {}, r"sweep: over.run.seed: \[\]"),
         ({}, {}, "sweep: over"),
         ({"run.seed": [1]}, {"kind": "guess"}, "sweep: kind"),
         ({"run.seed": [1, 2]}, {"kind": "simulate", "repetitions": 2}, "repetitions: 2: expected 1"),

@@ -74,16 +74,6 @@ def test_neither_file_nor_example() -> None:
         text_of("lin_ring")
 
 
-@pytest.mark.parametrize(
-    "command", ["predict", "simulate", "leaders --count 1", "transient --times 1", "facts", "plan", "spectrum"]
-)
-def test_no_command_takes_another_name(command: str) -> None:
-    word, *options = command.split()
-    result = CliRunner().invoke(main, [word, "discreet", *options])
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert result.stderr.startswith("error: discreet: no such file, and no example of this name: expected a file, or")
-
-
 def test_info_takes_both(here: Path) -> None:
     """A bag of that name wins, too; any other directory does not."""
     run = CliRunner()

@@ -11,7 +11,7 @@ from tests.analysis.inference.test_messages import Unrolled
 from experiments import CORRELATED, TRACKING, directed, observed, simulate
 from msg_analysis.common.arrays import LARGE_VARIABLE, in_file
 from msg_analysis.inference.estimates import covariance_test, estimates
-from msg_analysis.inference.event_order import EventOrder, newest_steps, order_events, sampled
+from msg_analysis.inference.event_order import EventOrder, order_events, sampled
 from msg_analysis.inference.pattern_events import Periods
 from msg_analysis.inference.realtime_laws import PatternUnavailableError, pattern_means
 
@@ -123,18 +123,6 @@ def test_what_has_to_be_remembered():
     assert 3 < Periods(slow, order_events(slow)).largest < 12
     late = observed(made_late("correlated", "late"))
     assert Periods(late, order_events(late)).largest > 5
-
-
-def test_ideal_periods_are_the_sequential_law():
-    observation = observed(simulate(real_time(CORRELATED, **TRACKING)))
-    periods = Periods(observation, order_events(observation))
-    system = observation.prediction.system
-    for number in range(1, STEPS):
-        g = observation.modes[number - 1]
-        np.testing.assert_allclose(periods[number].matrix, system.matrices[g], atol=1e-14)
-        np.testing.assert_allclose(periods[number].noise, system.noise[g], atol=1e-14)
-    np.testing.assert_array_equal(newest_steps(observation), np.tile(np.arange(STEPS + 1)[:, None], (1, 3)))
-    np.testing.assert_array_equal(sampled(observation, order_events(observation)), observation.states)
 
 
 def test_a_clock_that_jumps():
