@@ -110,15 +110,15 @@ def run(
                 key = i, k // STEPS_PER_BLOCK
                 if key not in blocks:
                     blocks[key] = noise.block(*key)
-                x, d = (
-                    -0.0,
-                    0,
-                )  # summed in the order of docs/network.md, so that runs are those of the law to the last bit
+                # Summed in the order of docs/network.md, so that runs are those of the law to the last bit.
+                x, d = np.full(experiment.run.replicas, -0.0), 0
                 for j in inputs[g][i]:
                     value = states[k, i]
                     if j != i:
                         used[k, i, d] = s = has[i][j]
-                        value, d = value if s < 0 else states[s, j], d + 1  # own value: nothing heard of it yet
+                        d += 1
+                        if s >= 0:  # else nothing has been heard of it yet
+                            value = states[s, j]
                     x = x + weights[g][i][j] * value
                 states[k + 1, i] = x + (blocks[key][g][k % STEPS_PER_BLOCK] + offsets[g][i])
                 agent_modes[k + 1, i] = g

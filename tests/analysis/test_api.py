@@ -172,14 +172,16 @@ def test_plots(twin: Run) -> None:
     share = [sum(path.get_extents().width for path in each.get_paths()) / twin.times[-1] for each in band.collections]
     np.testing.assert_allclose(share, [np.mean(twin.modes == mode) for mode in (0, 1)])
     comparison = twin.compare()
-    above, below = comparison.plot().axes
+    compared = comparison.plot()
+    above, below = compared.axes
     assert above.lines[0].get_ydata()[-1] == pytest.approx(comparison.system_error.measured)
     prediction = LINE_RING.predict()
-    drawn = prediction.plot().axes[0].lines
+    predicted = prediction.plot()
+    drawn = predicted.axes[0].lines
     assert len(drawn) == 3
     np.testing.assert_allclose(drawn[0].get_ydata(), prediction.emulated.node_errors)
     assert below.get_xlabel() == "agent"
-    for each in (figure, comparison.plot(), prediction.plot()):
+    for each in (figure, compared, predicted):
         assert each._repr_png_().startswith(b"\x89PNG")
     for agents, replica in (([6], 1), ([0], 1), ([], 1), (None, 0), (None, 17)):
         with pytest.raises(InputError, match=r"agents: |replica: (0|17)"):

@@ -1,4 +1,4 @@
-"""What is blamed for runs in which one thing is wrong, and selection against plain least squares."""
+"""Causes that are named for runs in which one thing is wrong, and selection against plain least squares."""
 
 import dataclasses
 

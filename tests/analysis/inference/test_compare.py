@@ -148,7 +148,7 @@ def test_document(short_run):
 
 
 def test_many_agents_get_no_joint_test_but_all_numbers():
-    run = simulate(line_ring(60, run={"duration": 10, "start": "zero"}))
+    run = simulate(line_ring(40, run={"duration": 10, "start": "zero"}))
     found = compare(run)
     assert found.covariance.chi2 is found.covariance.dof is found.covariance.p is None
     assert "too many agents" in found.covariance.note

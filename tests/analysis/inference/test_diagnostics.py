@@ -131,10 +131,8 @@ def test_noise_by_graph() -> None:
         for total, samples in [*((s, number) for s in squares), (squares.sum(), 5 * number)]:
             p.append(2.0 * min(stats.chi2.sf(total, samples), stats.chi2.cdf(total, samples)))
     assert np.exp(sums.finding().log_p) == pytest.approx(min(1.0, 12 * min(p)))
-    names = sums.law.graphs
-    assert sums.about(0) == f"noise of agent 1 in graph {names[0]}"
-    assert sums.about(11) == f"noise of all agents in graph {names[1]}"
-    assert len(sums.logarithms()) == 12
+    names = [f"noise of agent 1 in graph {sums.law.graphs[0]}", f"noise of all agents in graph {sums.law.graphs[1]}"]
+    assert ([sums.about(row) for row in (0, 11)], len(sums.logarithms())) == (names, 12)
 
 
 def test_noise_over_time_by_windows() -> None:
@@ -189,8 +187,7 @@ def test_noise_over_time_by_lags(agent: int | None) -> None:
     lag, column = p[min(p)]
     assert lag % 10 in (0, 5)
     assert np.exp(finding.log_p) == pytest.approx(min(p))
-    assert (finding.agent, finding.span) == (agent, (lag, lag))
-    assert column == (5 if agent is None else agent)
+    assert (finding.agent, finding.span, column) == (agent, (lag, lag), 5 if agent is None else agent)
     assert np.exp(sums.logarithms()[6:, 0]) == pytest.approx(evidence.sum(axis=0))
     assert sums.about(8) == "size of the noise of agent 3 and of its own earlier noise"
     assert len(sums.logarithms()) == 12

@@ -89,7 +89,7 @@ def test_standard_errors_by_fourth_moments(observation):
         (math.inf, 100.0, 1.0, True),  # the path is given
     ],
 )
-def test_intervals_need_many_sojourns(observation, switches, first, others, enough):
+def test_intervals_need_many_holding_times(observation, switches, first, others, enough):
     means = dataclasses.replace(
         time_means(observation), system_variances=np.repeat([first] + [others] * 19, 5), switches=switches
     )

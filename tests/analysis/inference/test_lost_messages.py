@@ -56,8 +56,8 @@ def test_lost_messages_are_those_that_were_drawn(on_loss):
     assert abs(share - 0.2) < 4 * np.sqrt(0.2 * 0.8 / found.messages.sum())
     assert low < share < high
     assert found.words() is None
-    for (receiver, sender), messages, lost in zip(found.links.tolist(), found.messages, found.lost, strict=True):
-        assert (messages, lost) == by_hand(trajectory, receiver, sender)
+    by_link = list(zip(found.messages, found.lost, strict=True))
+    assert by_link == [by_hand(trajectory, *link) for link in found.links.tolist()]
     document = found.to_json()
     assert (document["lost"], document["words"]) == (sum(link["lost"] for link in document["links"]), None)
     assert [document["expected"], *(link["expected"] for link in document["links"])] == pytest.approx([0.2] * 7)
@@ -100,5 +100,5 @@ def test_late_agents_and_messages():
     slow = late_timers.run(real_time(40), slow=busy(0.5, 2.5), late=busy(0.3, 1.5))
     found = lost_messages(observed(slow))
     assert found.lost.sum() > 0
-    for (receiver, sender), messages, lost in zip(found.links.tolist(), found.messages, found.lost, strict=True):
-        assert (messages, lost) == by_hand(slow, receiver, sender)
+    by_link = list(zip(found.messages, found.lost, strict=True))
+    assert by_link == [by_hand(slow, *link) for link in found.links.tolist()]

@@ -232,8 +232,8 @@ def test_in_real_time_losses_are_counted_by_use(pace):
     right = lossy({"loss": 0.3}, pace=pace)
     assert loss_test(right).p > 1e-3
     assert loss_test(lossy({"loss": 0.3}, pace=pace, actual={"loss": 0.25})).p < 1e-3
-    held = LossTally.of(lossy({"loss": 0.3, "on_loss": "hold"}, pace=pace))
-    assert (held is None) == (pace == "realtime")
+    held = lossy({"loss": 0.3, "on_loss": "hold"}, pace=pace)
+    assert (LossTally.of(held) is None) == (pace == "realtime")
 
 
 def test_uses_of_a_message_again_widen_the_law():
