@@ -134,7 +134,7 @@ def test_what_never_moves_is_infinite_evidence() -> None:
         {"noise": {"loss": 0.3, "link": 0.2, "broadcast": 0.1}},
         {"noise": {"process": [1.0, 0.0, 1.0, 1.0, 1.0], "delay": 2}},
         {"noise": {"loss": 0.3, "on_loss": "hold", "link": 0.2}},
-        {"noise": {"process": [[1.0, 0.5, 0, 0, 0]] * 5, "loss": 0.3, "on_loss": "hold"}},
+        {"noise": {"process": [[1.0, 0.5, 0, 0, 0]] * 5, "loss": 0.3, "on_loss": "hold", "link": 0.2}},
         {"run": {"pace": "realtime"}},
     ],
     ids=[
