@@ -71,7 +71,7 @@ def run(
     blocks: dict[tuple[int, int], list[np.ndarray]] = {}
     # As plain numbers and lists, which are read one by one.
     weights, offsets = model.nominal.tolist(), model.offsets.tolist()
-    senders = [[model.neighbours(g, i).tolist() for i in range(m)] for g in range(model.modes)]
+    inputs = [[model.inputs(g, i).tolist() for i in range(m)] for g in range(model.modes)]
 
     switches = [0, *np.flatnonzero(np.diff(modes) != 0) + 1]
     # What agent i has of agent j, and the newest holding period that it has.
@@ -110,13 +110,18 @@ def run(
                 key = i, k // STEPS_PER_BLOCK
                 if key not in blocks:
                     blocks[key] = noise.block(*key)
-                x = weights[g][i][i] * states[k, i] + offsets[g][i]
-                x = x + blocks[key][g][k % STEPS_PER_BLOCK]
-                for d, j in enumerate(senders[g][i]):
-                    used[k, i, d] = s = has[i][j]
-                    value = states[k, i] if s < 0 else states[s, j]  # nothing heard of it yet
+                # Summed in the order of docs/network.md, so that runs are those of the law to the last bit.
+                x, d = np.full(experiment.run.replicas, -0.0), 0
+                for j in inputs[g][i]:
+                    value = states[k, i]
+                    if j != i:
+                        used[k, i, d] = s = has[i][j]
+                        d += 1
+                        if s >= 0:  # else nothing has been heard of it yet
+                            value = states[s, j]
                     x = x + weights[g][i][j] * value
-                states[k + 1, i], agent_modes[k + 1, i] = x, g
+                states[k + 1, i] = x + (blocks[key][g][k % STEPS_PER_BLOCK] + offsets[g][i])
+                agent_modes[k + 1, i] = g
                 made[k + 1, i] = round(now * experiment.step_length * 1e9)
                 done[i] += 1
                 for j in range(m):

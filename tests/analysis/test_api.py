@@ -10,22 +10,16 @@ import numpy as np
 import pytest
 
 import msg_analysis
+from experiments import GOLDEN, golden
 from msg_analysis import BagError, Experiment, ExperimentError, InputError, Run, compare, read_bag, write_report
 
-ROOT = Path(__file__).parents[2]
-LINE_RING = ROOT / "tests/data/golden/line_ring.yaml"
-TRACKING = ROOT / "tests/data/golden/tracking.yaml"
-GOLDEN = json.loads((ROOT / "tests/data/golden/line_ring.predict.json").read_text())
+NUMBERS = json.loads((GOLDEN / "line_ring.predict.json").read_text())
+LINE_RING = golden("line_ring", duration=50, seed=3)
 
 
 @pytest.fixture(scope="module")
-def experiment() -> Experiment:
-    return Experiment.load(LINE_RING).with_run(duration=50, seed=3)
-
-
-@pytest.fixture(scope="module")
-def run(experiment: Experiment) -> Run:
-    return experiment.simulate()
+def twin() -> Run:
+    return LINE_RING.simulate()
 
 
 def test_importing_the_package_imports_nothing_else() -> None:
@@ -51,66 +45,64 @@ def test_names() -> None:
         getattr(msg_analysis, "nonsense")  # noqa: B009
 
 
-def test_one_class_for_each_concept(experiment: Experiment, run: Run) -> None:
+def test_one_class_for_each_concept(twin: Run) -> None:
     """Whoever made it: what every function gives is of the class that the package exports."""
-    made = [
-        (
-            Experiment,
-            (experiment.with_run(seed=4), run.experiment, run.record.experiment, experiment.predict().experiment),
-        ),
-        (Run, (run, run.compare().trajectory)),
-        (msg_analysis.Prediction, (experiment.predict(), experiment.spectrum([0, 1]).prediction)),
-        (msg_analysis.Comparison, (run.compare(), compare(run, experiment.simulate(seed=4)))),
-        (msg_analysis.Spectrum, (experiment.spectrum([0, 1], [0.1]),)),
-    ]
-    for kind, objects in made:
+    prediction, comparison, spectrum = LINE_RING.predict(), twin.compare(), LINE_RING.spectrum([0, 1], [0.1])
+    made = {
+        Experiment: (LINE_RING.with_run(seed=4), twin.experiment, twin.record.experiment, prediction.experiment),
+        Run: (twin, comparison.trajectory),
+        msg_analysis.Prediction: (prediction, spectrum.prediction),
+        msg_analysis.Comparison: (comparison, compare(twin, LINE_RING.simulate(seed=4))),
+        msg_analysis.Spectrum: (spectrum,),
+    }
+    for kind, objects in made.items():
         assert {type(each) for each in objects} == {kind}
 
 
-def test_predict(experiment: Experiment) -> None:
-    """The golden numbers, as arrays."""
-    prediction = experiment.predict()
-    assert prediction.emulated.system_error == pytest.approx(GOLDEN["emulated"]["system_error"], rel=1e-8)
-    assert prediction.continuous
-    np.testing.assert_allclose(prediction.continuous.node_certainty, GOLDEN["continuous"]["node_certainty"], rtol=1e-8)
-    assert prediction.continuous.system_certainty == pytest.approx(GOLDEN["continuous"]["system_certainty"], rel=1e-8)
+def test_theory() -> None:
+    """The golden numbers, as arrays, in units of time; with a stationary start the error stays."""
+    prediction = LINE_RING.predict()
     assert prediction.emulated.covariance.shape == (5, 5)
+    for law in ("emulated", "continuous"):
+        moments, course = getattr(prediction, law), LINE_RING.transient([0, 1, 2.5], law=law)  # type: ignore[arg-type]
+        for key in ("system_error", "system_certainty", "node_errors", "node_certainty"):
+            np.testing.assert_allclose(getattr(moments, key), NUMBERS[law][key], rtol=1e-8)
+        np.testing.assert_allclose(course.times, [0, 1, 2.5])
+        np.testing.assert_allclose(course.system_error, NUMBERS[law]["system_error"], rtol=1e-6)
+        assert course.node_errors.shape == (3, 5)
+    selection = LINE_RING.leaders(1)
+    assert selection.sets[0] == (selection.bound, (3,))  # the middle of the line
 
 
-def test_simulate(experiment: Experiment, run: Run) -> None:
-    assert run.states.shape == (1001, 5, 16)
-    assert run.times.shape == (1001,)
-    assert run.times[-1] == pytest.approx(50)
-    again = Experiment.load(LINE_RING).simulate(seed=3, duration=50)
-    assert np.array_equal(again.states, run.states)
-    assert again.record.run != run.record.run
-    assert run.experiment == experiment == Experiment.parse(experiment.to_document())
-    assert experiment.simulate(record=run.record).record is run.record
+def test_simulate(twin: Run) -> None:
+    assert (twin.states.shape, twin.times.shape, twin.times[-1]) == ((1001, 5, 16), (1001,), pytest.approx(50))
+    again = golden("line_ring").simulate(seed=3, duration=50)
+    assert np.array_equal(again.states, twin.states)
+    assert again.record.run != twin.record.run
+    assert twin.experiment == LINE_RING == Experiment.parse(LINE_RING.to_document())
+    assert LINE_RING.simulate(record=twin.record).record is twin.record
     with pytest.raises(ExperimentError, match=r"run\.seed: -1"):
-        experiment.simulate(seed=-1)
+        LINE_RING.simulate(seed=-1)
 
 
-def test_a_bag_is_the_same_run(run: Run, tmp_path: Path) -> None:
-    assert run.save(tmp_path / "bag") == tmp_path / "bag"
+def test_a_bag_is_the_same_run(twin: Run, tmp_path: Path) -> None:
+    assert twin.save(tmp_path / "bag") == tmp_path / "bag"
     read = read_bag(tmp_path / "bag")
-    assert isinstance(read, Run)
-    assert np.array_equal(read.states, run.states)
-    assert np.array_equal(read.modes, run.modes)
-    assert read.completeness.complete
+    assert (type(read), read.completeness.complete) == (Run, True)
+    assert np.array_equal(read.states, twin.states)
     with pytest.raises(BagError, match="exists already"):
-        run.save(tmp_path / "bag")
+        twin.save(tmp_path / "bag")
     with pytest.raises(BagError, match="not found"):
         read_bag(tmp_path / "nowhere")
 
 
-def test_compare(run: Run, experiment: Experiment, tmp_path: Path) -> None:
+def test_compare(twin: Run, tmp_path: Path) -> None:
     """Runs and bags, one or several. The seeds are fixed; fresh ones would disagree with probability 0.01 each."""
-    run.save(tmp_path / "bag")
-    alone, by_path = run.compare(), compare(tmp_path / "bag")
+    twin.save(tmp_path / "bag")
+    alone, by_path = twin.compare(), compare(tmp_path / "bag")
     assert alone.to_json() == by_path.to_json()
     assert alone.verdict == "agrees"
-    together = compare(tmp_path / "bag", experiment.simulate(seed=4))
-    assert together.pool
+    together = compare(tmp_path / "bag", LINE_RING.simulate(seed=4))
     assert [member.name for member in together.pool.members] == [str(tmp_path / "bag"), "run 2"]
     file = write_report(together, tmp_path / "report.html")
     assert file.read_text(encoding="utf-8").startswith("<!")
@@ -130,51 +122,30 @@ def test_compare_refuses(runs: list[str], options: dict[str, float], words: str)
         compare(*runs, **options)
 
 
-def test_transient(experiment: Experiment) -> None:
-    """In units of time, whatever the law; with a stationary start the error stays."""
-    times = [0, 1, 2.5]
-    for law in ("emulated", "continuous"):
-        course = experiment.transient(times, law=law)  # type: ignore[arg-type]
-        np.testing.assert_allclose(course.times, times)
-        np.testing.assert_allclose(course.system_error, GOLDEN[law]["system_error"], rtol=1e-6)
-        assert course.node_errors.shape == (3, 5)
-    with pytest.raises(InputError, match="not a multiple of the step"):
-        experiment.transient([0.01])
-
-
-def test_select_leaders(experiment: Experiment) -> None:
-    selection = experiment.leaders(1)
-    error, agents = selection.sets[0]
-    assert agents == (3,)  # the middle of the line
-    assert selection.bound == error
-
-
-def test_everything_says_what_it_is(experiment: Experiment, run: Run) -> None:
+def test_everything_says_what_it_is(twin: Run) -> None:
     """In a line; and in a notebook as a table, whose rows have equally many cells: every class that is exported."""
-    prediction, comparison = experiment.predict(), run.compare()
+    prediction, comparison = LINE_RING.predict(), twin.compare()
     results = [
-        (experiment, ["line_ring", "consensus of 5 agents", "1000 steps"]),
-        (run, ["line_ring", "x(0..1000)", "seed 3", "complete"]),
-        (run.completeness, []),
+        (LINE_RING, ["line_ring", "consensus of 5 agents", "1000 steps"]),
+        (twin, ["line_ring", "x(0..1000)", "seed 3", "complete"]),
+        (twin.completeness, []),
         (prediction, ["1.41159", "1.35941", "1.5"]),
         (prediction.emulated, ["5 agents", "1.41159"]),
         (comparison, ["agrees", "measured", "predicted 1.41159"]),
         (comparison.system_error, []),
-        (compare(run, experiment.simulate(seed=4)), ["2 runs"]),
-        (experiment.leaders(1), ["agents 3", "exhaustive"]),
-        (experiment.transient([0, 1]), ["2 times"]),
-        (experiment.spectrum([0, 1]), []),
-        (msg_analysis.sweep(experiment, {"switching.scale": [1.0, 2.0]}), ["switching.scale", "2 points"]),
+        (compare(twin, LINE_RING.simulate(seed=4)), ["2 runs"]),
+        (LINE_RING.leaders(1), ["agents 3", "exhaustive"]),
+        (LINE_RING.transient([0, 1]), ["2 times"]),
+        (LINE_RING.spectrum([0, 1]), []),
+        (msg_analysis.sweep(LINE_RING, {"switching.scale": [1.0, 2.0]}), ["switching.scale", "2 points"]),
     ]
     for result, words in results:
         text = repr(result)
-        assert "\n" not in text
-        assert len(text) < 200
+        assert ("\n" in text, len(text) < 200) == (False, True)
         assert all(word in text for word in words), text
         lines = result._repr_markdown_().splitlines()
         rows = [line for line in lines if line.startswith("|")]
-        assert len(rows) >= 3
-        assert lines[-1] == rows[-1]
+        assert (len(rows) >= 3, lines[-1]) == (True, rows[-1])
         assert any(re.fullmatch(r"(\| -{3}:? )+\|", row) for row in rows)
         assert len({row.count("|") for row in rows}) == 1
     classes = [getattr(msg_analysis, name) for name in msg_analysis.__all__ if name[0].isupper()]
@@ -183,39 +154,38 @@ def test_everything_says_what_it_is(experiment: Experiment, run: Run) -> None:
 
 def test_large_networks_are_short_too() -> None:
     agents = list(range(1, 61))
-    document = {
-        "name": "large",
-        "graphs": {f"g{i}": {"path": agents if i % 2 else agents[::-1]} for i in range(6)},
-        "switching": {"rates": {f"g{i}": {f"g{(i + 1) % 6}": 1.0} for i in range(6)}},
-    }
-    experiment = Experiment.parse(document)
+    graphs = {f"g{i}": {"path": agents if i % 2 else agents[::-1]} for i in range(6)}
+    rates = {f"g{i}": {f"g{(i + 1) % 6}": 1.0} for i in range(6)}
+    experiment = Experiment.parse({"name": "large", "graphs": graphs, "switching": {"rates": rates}})
     assert "g3, ...;" in repr(experiment)
     assert len(experiment.predict()._repr_markdown_().splitlines()) < 40
 
 
-def test_plots(experiment: Experiment, run: Run) -> None:
+def test_plots(twin: Run) -> None:
     """What is drawn: numbers of the run, its comparison, its prediction; notebooks show it as PNG."""
-    figure = run.plot([5, 1], replica=4)
+    figure = twin.plot([5, 1], replica=4)
     axes, band = figure.axes
     assert [line.get_label() for line in axes.lines] == ["agent 5", "agent 1"]
-    assert np.array_equal(axes.lines[0].get_ydata(), run.states[:, 4, 3])
-    assert np.array_equal(axes.lines[0].get_xdata(), run.times)
+    assert np.array_equal(axes.lines[0].get_ydata(), twin.states[:, 4, 3])
+    assert np.array_equal(axes.lines[0].get_xdata(), twin.times)
     assert [label.get_text() for label in band.get_yticklabels()] == ["line", "ring"]
-    share = [sum(path.get_extents().width for path in each.get_paths()) / run.times[-1] for each in band.collections]
-    np.testing.assert_allclose(share, [np.mean(run.modes == mode) for mode in (0, 1)])
-    comparison = run.compare()
-    above, below = comparison.plot().axes
+    share = [sum(path.get_extents().width for path in each.get_paths()) / twin.times[-1] for each in band.collections]
+    np.testing.assert_allclose(share, [np.mean(twin.modes == mode) for mode in (0, 1)])
+    comparison = twin.compare()
+    compared = comparison.plot()
+    above, below = compared.axes
     assert above.lines[0].get_ydata()[-1] == pytest.approx(comparison.system_error.measured)
-    prediction = experiment.predict()
-    drawn = prediction.plot().axes[0].lines
+    prediction = LINE_RING.predict()
+    predicted = prediction.plot()
+    drawn = predicted.axes[0].lines
     assert len(drawn) == 3
     np.testing.assert_allclose(drawn[0].get_ydata(), prediction.emulated.node_errors)
     assert below.get_xlabel() == "agent"
-    for each in (figure, comparison.plot(), prediction.plot()):
+    for each in (figure, compared, predicted):
         assert each._repr_png_().startswith(b"\x89PNG")
     for agents, replica in (([6], 1), ([0], 1), ([], 1), (None, 0), (None, 17)):
         with pytest.raises(InputError, match=r"agents: |replica: (0|17)"):
-            run.plot(agents, replica=replica)
+            twin.plot(agents, replica=replica)
 
 
 def test_plots_of_unusual_runs() -> None:
@@ -225,5 +195,5 @@ def test_plots_of_unusual_runs() -> None:
     many = many.with_run(dt=0.01, duration=0.01)
     run = many.simulate()
     run.states[1, 3] = np.nan
-    for figure in (run.plot(), many.predict().plot(), compare(Experiment.load(TRACKING).simulate(duration=1)).plot()):
+    for figure in (run.plot(), many.predict().plot(), compare(golden("tracking", duration=1).simulate()).plot()):
         assert figure._repr_png_()

@@ -22,15 +22,20 @@ BoolArray = NDArray[np.bool_]
 AnyArray = NDArray[Any]
 
 
-LARGE = 2**27  # bytes from which an array is in a file
+LARGE = 2**27  # bytes from which an array is in a file,
+LARGE_VARIABLE = "MSG_ANALYSIS_LARGE"  # unless this environment variable has another number of bytes
 BLOCK_NUMBERS = 2_000_000  # numbers of a large array that are processed together: 16 MB
 SMALL_BLOCK = 200_000  # the same where there are several such arrays: they stay in the caches, and memory is used again
 
 
+def _large() -> int:
+    return int(os.environ.get(LARGE_VARIABLE, LARGE))
+
+
 def large_zeros(shape: tuple[int, ...], dtype: Any, *, total: int) -> AnyArray:
-    """Zeros, in a file if ``total`` >= ``LARGE`` bytes belong together and it has room; MemoryError or ValueError."""
+    """Zeros, in a file if so many bytes belong together (``total``) and it has room; MemoryError or ValueError."""
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    if total >= LARGE and size and hasattr(os, "posix_fallocate"):
+    if total >= _large() and size and hasattr(os, "posix_fallocate"):
         with suppress(OSError), tempfile.TemporaryFile(prefix="msg_analysis.") as file:
             os.posix_fallocate(file.fileno(), 0, size)  # a write to a full disk would end the process
             return np.memmap(file, dtype=dtype, mode="r+", shape=shape)
@@ -43,7 +48,7 @@ class LargeRows:
     def __init__(self, columns: int, dtype: Any, in_memory: int | None = None) -> None:
         self._shape, self._dtype = (-1, columns), np.dtype(dtype)
         self._parts: list[AnyArray] = []
-        self._in_memory = LARGE // 8 if in_memory is None else in_memory  # bytes, at most
+        self._in_memory = _large() // 8 if in_memory is None else in_memory  # bytes, at most
         self._held = self._written = 0  # bytes
         self._file: IO[bytes] | None = None
 

@@ -34,19 +34,20 @@ class Measurement:
     modes: IntArray  # (N,) g(0..N-1)
     lost: BoolArray | None  # (N, m, D) see ``Run.lost``
     sure_messages: int  # see ``Observation.sure_messages``
+    block_numbers: int = BLOCK_NUMBERS  # see ``Observation.block_numbers``
 
     @classmethod
-    def of(cls, trajectory: Run) -> Measurement:
+    def of(cls, trajectory: Run, block_numbers: int = BLOCK_NUMBERS) -> Measurement:
         """Everything before the first gap, of a run from a bag or from the twin."""
         experiment, steps = trajectory.record.experiment, max(trajectory.prefix, 0)
         series = np.empty(steps)
         numbers = int(trajectory.states[:1].size)
-        for begin, end in _blocks(0, steps, numbers, "errors"):
+        for begin, end in _blocks(0, steps, numbers, "errors", block_numbers):
             series[begin:end] = (_deviations(trajectory, begin, end) ** 2).sum(axis=1).mean(axis=1)
             trajectory.release()
         first = transient_length(series)
         products = np.zeros((experiment.agents, experiment.agents))
-        for begin, end in _blocks(first, steps, numbers, "covariance"):
+        for begin, end in _blocks(first, steps, numbers, "covariance", block_numbers):
             flat = _deviations(trajectory, begin, end).transpose(1, 0, 2).reshape(experiment.agents, -1)
             products += flat @ flat.T
             trajectory.release()
@@ -59,6 +60,7 @@ class Measurement:
             modes=trajectory.modes[:steps],
             lost=None if lost is None else lost[:steps],
             sure_messages=experiment.noise.delay + (1 if experiment.noise.holds else 0),
+            block_numbers=block_numbers,
         )
 
     @property
@@ -68,7 +70,7 @@ class Measurement:
 
     def blocks(self, numbers_per_step: int, what: str) -> Iterator[tuple[int, int]]:
         """See ``Observation.blocks``."""
-        return _blocks(0, self.steps, numbers_per_step, what)
+        return _blocks(0, self.steps, numbers_per_step, what, self.block_numbers)
 
 
 def transient_length(series: FloatArray) -> int:
@@ -87,11 +89,9 @@ def transient_length(series: FloatArray) -> int:
     return BATCH * int(np.argmin(scores[: count // 2 + 1]))
 
 
-def _blocks(
-    first: int, end: int, numbers_per_step: int, what: str, most: int | None = None
-) -> Iterator[tuple[int, int]]:
+def _blocks(first: int, end: int, numbers_per_step: int, what: str, most: int) -> Iterator[tuple[int, int]]:
     """Blocks of the steps first..end-1; other arguments as of ``Observation.blocks``."""
-    length = max(1, (most or BLOCK_NUMBERS) // max(1, numbers_per_step))
+    length = max(1, most // max(1, numbers_per_step))
     for begin in range(first, end, length):
         tell(what, begin, end)
         yield begin, min(begin + length, end)
@@ -133,7 +133,7 @@ class Observation:
     block_numbers: int = BLOCK_NUMBERS  # of temporary arrays of a block of steps, at most
 
     @classmethod
-    def of(cls, trajectory: Run, prediction: Prediction) -> Observation:
+    def of(cls, trajectory: Run, prediction: Prediction, block_numbers: int = BLOCK_NUMBERS) -> Observation:
         """Everything before the first gap; InputError if a log in real time does not say what the agents used."""
         real_time = trajectory.record.experiment.run.pace == "realtime"
         steps = _known_steps(trajectory) if real_time else trajectory.prefix
@@ -155,6 +155,7 @@ class Observation:
             None if lost is None else lost[:steps],
             timers,
             None if used is None or real_time else used[:steps],
+            block_numbers,
         )
 
     @property

@@ -88,7 +88,9 @@ class LiveReport:
 class LiveEstimate:
     """The errors of a run next to their prediction, from the states as they arrive; InputError without one."""
 
-    def __init__(self, record: RunRecord, *, nodes: bool = True, evidence: bool = True) -> None:
+    def __init__(
+        self, record: RunRecord, *, nodes: bool = True, evidence: bool = True, kept: int | None = None
+    ) -> None:
         experiment = record.experiment
         lockstep = experiment.run.pace == "lockstep"
         self.record = record
@@ -100,7 +102,8 @@ class LiveEstimate:
         self.log: StateLog | None = None  # None: the messages are not needed
         if evidence and prediction is not None and supports(prediction):
             if needs_log(experiment):
-                self._received, self.log = ReceivedEvidence(prediction, experiment.run.replicas), StateLog(record)
+                self._received = ReceivedEvidence(prediction, experiment.run.replicas, kept)
+                self.log = StateLog(record)
             else:
                 self._plain = RunningEvidence(prediction, experiment.run.replicas)
         self.evidence = self._received or self._plain

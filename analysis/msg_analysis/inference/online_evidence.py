@@ -165,9 +165,12 @@ LEAST_KEPT, MOST_KEPT = 256, 4096  # steps, besides those of the delay
 
 
 class ReceivedEvidence(EvidenceWatch):
-    """The evidence of a run from its states with their logs, as they come, each once or more often."""
+    """The evidence of a run from its states with their logs, as they come, each once or more often.
 
-    def __init__(self, prediction: Prediction, replicas: int) -> None:
+    ``kept``: newest steps whose values are kept, besides those of the delay; by default as many as ``KEPT_BYTES`` hold.
+    """
+
+    def __init__(self, prediction: Prediction, replicas: int, kept: int | None = None) -> None:
         super().__init__(prediction, replicas)
         if not needs_log(prediction.experiment):
             raise ValueError("the states alone give the evidence of this run")
@@ -178,8 +181,9 @@ class ReceivedEvidence(EvidenceWatch):
         self._lossy = experiment.noise.loss.any and not self._realtime
         truth = experiment.truth
         each = 8 * m * (replicas * (2 if truth else 1) + step.most_neighbours + 1)
-        self._kept = kept = experiment.noise.delay + int(np.clip(KEPT_BYTES // each, LEAST_KEPT, MOST_KEPT))
-        self._timeout = (kept - experiment.noise.delay) // 2  # steps for which values that are not there are awaited
+        kept = kept or int(np.clip(KEPT_BYTES // each, LEAST_KEPT, MOST_KEPT))
+        self._timeout = kept // 2  # steps for which values that are not there are awaited
+        self._kept = kept = experiment.noise.delay + kept
         # Rings: what is known of step k is at the place k modulo their length.
         self._label = np.full(kept, -2, dtype=np.int64)
         self._done = np.zeros(kept, dtype=np.bool_)  # whether the step from here to the next one has been added

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray
 from msg_analysis.common.resources import blas_threads
 from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.inference.candidates import Cause
@@ -151,15 +151,15 @@ def _coarser(means: TimeMeans, other: TimeMeans) -> TimeMeans:
 MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
 
 
-def compare_run(trajectory: Run, *, level: float = 0.01) -> Comparison:
+def compare_run(trajectory: Run, *, level: float = 0.01, block_numbers: int = BLOCK_NUMBERS) -> Comparison:
     """Compare a run, or its complete beginning, with what theory predicts for it, see ``pool.compare``."""
     unpredicted = unpredictable(trajectory.record.experiment)
     if unpredicted:
-        return _measured(trajectory, level, unpredicted)
+        return _measured(trajectory, level, unpredicted, block_numbers)
     prediction = predict(trajectory.record.experiment, trajectory.record.step_model)
     if trajectory.prefix < MIN_STEPS and not trajectory.completeness.complete:
         return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
-    observation = Observation.of(trajectory, prediction)
+    observation = Observation.of(trajectory, prediction, block_numbers)
     if observation.steps < MIN_STEPS and not trajectory.completeness.complete:
         return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
     until = trajectory.record.until
@@ -242,9 +242,9 @@ def _any_time(
     return any_time_evidence(evidence.watched, level, families, variance, evidence.steps, planned)
 
 
-def _measured(trajectory: Run, level: float, unpredicted: str) -> Comparison:
+def _measured(trajectory: Run, level: float, unpredicted: str, block_numbers: int) -> Comparison:
     """Comparison without a prediction."""
-    measurement = Measurement.of(trajectory)
+    measurement = Measurement.of(trajectory, block_numbers)
     series, covariance, step = measurement.system_series, measurement.covariance, measurement.step
     if measurement.steps < MIN_STEPS and not trajectory.completeness.complete:
         return Comparison(

@@ -1,25 +1,11 @@
-"""Runs in real time with late agents, from the benchmarks; one prediction of many runs."""
+"""One prediction of many runs."""
 
-import importlib.util
 import json
-import sys
-from pathlib import Path
 
 import pytest
 
 from msg_analysis.inference import verdict
 from msg_analysis.theory.prediction import predict
-
-SCRIPT = Path(__file__).parents[3] / "benchmarks" / "late_timers.py"
-
-
-@pytest.fixture(scope="session")
-def late_timers():
-    spec = importlib.util.spec_from_file_location("late_timers", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["late_timers"] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture

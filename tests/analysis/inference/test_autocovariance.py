@@ -7,7 +7,6 @@ import pytest
 import scipy.stats
 
 from experiments import Experiment, Observation, line_ring, observed, predict
-from msg_analysis.inference import autocovariance
 from msg_analysis.inference.autocovariance import LoggedAutocovariance, logged_autocovariance, why_not_tested
 from msg_analysis.inference.given_path import means_given_path
 
@@ -67,18 +66,6 @@ def test_many_states_of_one_path(noise: dict[str, Any]) -> None:
     assert result.covariance == pytest.approx(scatter, rel=0.15)
 
 
-def test_windows_are_products() -> None:
-    along = np.random.default_rng(1).normal(size=(17, 3, 3))
-    for lag in (0, 1, 2, 5, 16, 17):
-        windows = autocovariance._windows(along, lag)
-        assert len(windows) == 18 - lag
-        for k, window in enumerate(windows):
-            expected = np.eye(3)
-            for matrix in along[k : k + lag]:
-                expected = matrix @ expected
-            assert window == pytest.approx(expected, rel=1e-9, abs=1e-12)
-
-
 @pytest.mark.parametrize(
     "noise",
     [{"process": 1.0}, {"process": 1.0, "loss": 0.2, "broadcast": 0.3}, {"process": 1.0, "delay": 2, "link": 0.3}],
@@ -105,21 +92,21 @@ def test_faulty_runs() -> None:
     assert loud.p < 1e-6
 
 
-def test_long_runs_are_tested_in_part() -> None:
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({}, "None"),
+        ({"noise": {"delay": 1}}, "None"),
+        ({"run": {"duration": 4}}, "too few"),
+        ({"run": {"pace": "realtime"}}, "real time"),
+        ({"noise": {"delay": 1, "loss": 0.1}}, "come later"),
+        ({"noise": {"loss": 0.1, "on_loss": "hold"}}, "keep values"),
+    ],
+)
+def test_what_is_not_tested(changes: dict[str, Any], why: str) -> None:
+    assert why in str(why_not_tested(observed(steps(**changes))))
+
+
+def test_long_runs_are_tested_in_part_and_those_without_noise_not_at_all() -> None:
     assert logged_autocovariance(observed(steps()), LAGS, most_numbers=5 * 4 * 4 * 300).steps == 300
-
-
-def test_what_is_not_tested() -> None:
-    assert why_not_tested(observed(steps())) is None
-    assert "too few" in str(why_not_tested(observed(steps(run={"duration": 4}))))
-    assert "real time" in str(why_not_tested(observed(steps(run={"pace": "realtime"}))))
-    assert why_not_tested(observed(steps(noise={"process": 1.0, "delay": 1}))) is None
-    both, held = {"delay": 1, "loss": 0.1}, {"loss": 0.1, "on_loss": "hold"}
-    assert "come later" in str(why_not_tested(observed(steps(noise={"process": 1.0, **both}))))
-    assert "keep values" in str(why_not_tested(observed(steps(noise={"process": 1.0, **held}))))
-
-
-def test_without_noise_there_is_no_p() -> None:
-    quiet = {"name": "q", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "noise": {"process": 0.0}}
-    run = {"duration": 10, "start": [1, 2, 3]}
-    assert found(observed(Experiment.parse(quiet | {"run": run}))).p is None
+    assert found(observed(steps({"process": 0.0}, run={"start": [1, 2, 3, 4, 5]}))).p is None

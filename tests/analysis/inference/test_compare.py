@@ -41,47 +41,45 @@ def short_run():
     return simulate(golden("line_ring", duration=25, replicas=2))
 
 
-CASES = {
-    "line_ring": {"duration": 60, "replicas": 4},
-    "tracking": {"duration": 60, "replicas": 4},
-    "discrete": {"duration": 400, "replicas": 4},
-    "zero start": {"duration": 60, "replicas": 4, "start": "zero"},
-    "far start": {"duration": 30, "replicas": 4, "start": [3.0, 0.0, 0.0, 1.0, -2.0]},
-}
-
-
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    ("name", "run"),
+    [
+        ("line_ring", {"duration": 60}),
+        ("tracking", {"duration": 60}),
+        ("discrete", {"duration": 400}),
+        ("line_ring", {"duration": 60, "start": "zero"}),
+        ("line_ring", {"duration": 30, "start": [3.0, 0.0, 0.0, 1.0, -2.0]}),
+    ],
+)
 @pytest.mark.usefixtures("predicted_once")
-def test_calibration(case):
+def test_calibration(name, run):
     """40 true runs."""
-    experiment = golden(case if case in ("tracking", "discrete") else "line_ring", **CASES[case])
+    experiment = golden(name, replicas=4, **run)
     assert_calibrated([compare(simulate(experiment.with_run(seed=seed))) for seed in SEEDS])
 
 
-HARD = {
-    "far": {"start": [50.0, -30.0, 20.0, -40.0]},
-    "without noise": {"start": [50.0, -30.0, 20.0, -40.0], "noise": {"process": 0.0}},
-    "rare": {"rate": 1e-3, "duration": 100.0},
-    "common noise": {"noise": {"process": [[1.0, 0.0, 0.0, 0.0]] * 4}},
-}
-
-
-def hard(case):
-    options = {"rate": 0.5, "duration": 10.0, "start": "stationary", "noise": {"process": 1.0}} | HARD[case]
+def hard(process=1.0, rate=0.5, **run):
     graphs = {"line": {"path": [1, 2, 3, 4]}, "pairs": {"edges": [[1, 2], [3, 4]]}}
-    run = {"duration": options["duration"], "start": options["start"], "replicas": 1}
-    return line_ring(4, options["rate"], graphs=graphs, noise=options["noise"], run=run)
+    run = {"duration": 10.0, "replicas": 1} | run
+    return line_ring(4, rate, graphs=graphs, noise={"process": process}, run=run)
+
+
+HARD = {
+    "far": hard(start=[50.0, -30.0, 20.0, -40.0]),
+    "without noise": hard(0.0, start=[50.0, -30.0, 20.0, -40.0]),
+    "rare": hard(rate=1e-3, duration=100.0),
+    "common noise": hard([[1.0, 0.0, 0.0, 0.0]] * 4),
+}
 
 
 @pytest.mark.parametrize("case", HARD)
 @pytest.mark.usefixtures("predicted_once")
-def test_the_level_holds_where_a_few_sojourns_decide(case):
+def test_the_level_holds_where_a_few_holding_times_decide(case):
     """60 correct runs of 10 units (rare: 100), 1,000 for the documentation: alarms at 1e-4 by the binomial law.
 
     Over all paths of the graphs, the errors of such runs are far from normal: 3 to 7 % of the verdicts were wrong.
     """
-    experiment = hard(case)
-    results = [compare(simulate(experiment.with_run(seed=seed))) for seed in range(60)]
+    results = [compare(simulate(HARD[case].with_run(seed=seed))) for seed in range(60)]
     assert_few_alarms(results)
     noisy = case in ("far", "rare")
     assert all(("system error, corrected" in p_values(result)) == noisy for result in results)
@@ -91,9 +89,9 @@ def test_the_level_holds_where_a_few_sojourns_decide(case):
 @pytest.mark.usefixtures("predicted_once")
 def test_differences_that_are_only_rounding_are_no_evidence():
     """One noise for all agents, so that x_j - x_i = 0: how that is rounded depends on the processor."""
-    experiment, random = hard("common noise"), np.random.default_rng(5)
+    random = np.random.default_rng(5)
     for seed in range(5):
-        run = simulate(experiment.with_run(seed=seed))
+        run = simulate(HARD["common noise"].with_run(seed=seed))
         run.states[:] = np.nextafter(run.states, random.choice([-np.inf, np.inf], run.states.shape))
         result = compare(run)
         assert result.verdict == "agrees"
@@ -123,13 +121,9 @@ def test_power_of_the_time_means():
 def test_document(short_run):
     result = compare(short_run)
     document = json.loads(json.dumps(result.to_json(), allow_nan=False))
-    assert document["verdict"] == "agrees"
-    assert result.exit_code == 0
-    assert document["completeness"]["missing"] == 0
-    assert document["steps"] == 500
-    assert document["simulated_time"] == pytest.approx(25.0)
-    assert document["seed"] == 7
-    assert document["run"] == str(short_run.record.run)
+    assert (document["verdict"], result.exit_code, document["completeness"]["missing"]) == ("agrees", 0, 0)
+    assert (document["steps"], document["simulated_time"]) == (500, pytest.approx(25.0))
+    assert (document["run"], document["seed"]) == (str(short_run.record.run), 7)
     error = document["system_error"]
     assert error["predicted"] == pytest.approx(predict(short_run.record.experiment).emulated.system_error)
     assert error["z"] == pytest.approx((error["measured"] - error["predicted"]) / error["standard_error"])
@@ -147,12 +141,16 @@ def test_document(short_run):
     assert len(document["batch_means"]["interval"]) == 2
     # Too few holding periods for a test of these.
     assert [test["rejected"] for test in document["tests"]] == [False] * 19
+    running = result.running
+    assert len(running["time"]) == len(running["system_error"]) == len(running["standard_error"]) <= 400
+    last = [running[key][-1] for key in ("time", "system_error", "standard_error")]
+    assert last == pytest.approx([25.0, error["measured"], error["standard_error"]])
 
 
 def test_many_agents_get_no_joint_test_but_all_numbers():
-    run = simulate(line_ring(60, run={"duration": 10, "start": "zero"}))
+    run = simulate(line_ring(40, run={"duration": 10, "start": "zero"}))
     found = compare(run)
-    assert (found.covariance.chi2, found.covariance.dof, found.covariance.p) == (None, None, None)
+    assert found.covariance.chi2 is found.covariance.dof is found.covariance.p is None
     assert "too many agents" in found.covariance.note
     y = run.states[:-1] - run.states[:-1].mean(axis=1, keepdims=True)
     np.testing.assert_allclose(found.covariance.measured, np.einsum("kir,kjr->ij", y, y) / 400, atol=1e-12)
@@ -160,20 +158,9 @@ def test_many_agents_get_no_joint_test_but_all_numbers():
     assert found.given.system_error.z is not None
 
 
-def test_running_mean_ends_at_the_estimate(short_run):
-    result = compare(short_run)
-    running = result.running
-    assert len(running["time"]) == len(running["system_error"]) == len(running["standard_error"]) <= 400
-    assert running["time"][-1] == pytest.approx(25.0)
-    assert running["system_error"][-1] == pytest.approx(result.system_error.measured)
-    assert running["standard_error"][-1] == pytest.approx(result.system_error.standard_error)
-
-
 def test_incomplete_data_get_numbers_of_the_beginning_but_no_verdict(short_run):
     result = compare(cut(short_run, 301))
-    assert result.verdict == "incomplete"
-    assert result.exit_code == 3
-    assert result.steps == 300
+    assert (result.verdict, result.exit_code, result.steps) == ("incomplete", 3, 300)
     y = short_run.states[:300] - short_run.states[:300].mean(axis=1, keepdims=True)
     assert result.system_error.measured == pytest.approx((y**2).mean(axis=(0, 2)).sum())
 
@@ -188,24 +175,18 @@ def test_too_little_data_get_no_numbers(short_run, step):
     assert document["system_error"]["predicted"] > 0
     tests = ("p_covariance", "p_whiteness", "p_gain", "p_common_gain")
     assert document["innovations"] == dict.fromkeys((*tests, "ratios", "samples"))
-    assert document["switching"] == {"counts": None, "expected": None, "p": None}
-    assert document["loss"] == {"lost": None, "expected": None, "p": None}
+    assert document["switching"] == dict.fromkeys(("counts", "expected", "p"))
+    assert document["loss"] == dict.fromkeys(("lost", "expected", "p"))
     assert document["broadcast"] == {"p": None}
     assert document["batch_means"]["interval"] == [None, None]
     assert document["tests"] == []
 
 
 def test_without_noise_or_switching_there_is_less_to_reject():
-    quiet = changed(golden("line_ring", duration=10), noise={"process": 0.0})
-    result = compare(simulate(quiet))
-    assert result.verdict == "agrees"
-    assert result.system_error.z is None
-    assert set(p_values(result)) == {"switching"}
+    result = compare(simulate(line_ring(noise={"process": 0.0})))
+    assert (result.verdict, result.system_error.z, set(p_values(result))) == ("agrees", None, {"switching"})
     json.dumps(result.to_json(), allow_nan=False)
-    one = changed(
-        golden("line_ring", duration=20), graphs={"ring": {"cycle": [1, 2, 3, 4, 5]}}, switching={"generator": [[0.0]]}
-    )
-    result = compare(simulate(one))
+    result = compare(simulate(line_ring(graphs={"ring": {"cycle": [1, 2, 3]}}, switching={"generator": [[0.0]]})))
     assert result.verdict == "agrees"
     assert "switching" not in p_values(result)
 
@@ -224,18 +205,13 @@ def test_a_number_too_large_to_compute_with_disagrees(name, value):
     json.dumps(comparison.to_json(), allow_nan=False)
 
 
-@pytest.mark.usefixtures("predicted_once")
 def test_noise_that_is_common_to_all():
-    """What rounding leaves of the disagreement is none: it has no z, and no order. All of 40 runs agree."""
+    """What rounding leaves of the disagreement is none: it has no z, and no order."""
     graphs = {"line": {"path": [1, 2, 3]}, "star": {"edges": [[1, 2], [1, 3]]}}
-    what, verdicts = line_ring(graphs=graphs, noise={"process": [[1, 0, 0]] * 3}, run={"duration": 100}), []
-    for seed in range(40):
-        result = compare(simulate(what.with_run(seed=seed)))
-        assert result.system_error.measured == result.system_error.predicted == 0.0
-        assert result.system_error.z is None
-        assert [node.measured for node in result.node_errors] == [0.0] * 3
-        verdicts.append(result.verdict)
-    assert verdicts.count("agrees") >= 38  # level 0.01: fewer in 1 of 150 cases
+    result = compare(simulate(line_ring(graphs=graphs, noise={"process": [[1, 0, 0]] * 3}, run={"duration": 100})))
+    assert (result.verdict, result.system_error.z) == ("agrees", None)
+    errors = [result.system_error.measured, result.system_error.predicted]
+    assert errors + [node.measured for node in result.node_errors] == [0.0] * 5
 
 
 SHARED = [[1.0, 0.5, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 0.0]]
@@ -256,13 +232,6 @@ def test_calibration_with_noise_by_graph(line, ring):
     assert_calibrated(results)
 
 
-def test_noise_in_the_wrong_graph_is_found():
-    swapped, told = (loud(*noise, duration=200) for noise in ((1.0, 0.3), (0.3, 1.0)))
-    comparison = compare(claimed(simulate(swapped), told))
-    assert comparison.verdict == "disagrees"
-    assert comparison.innovations.p_covariance < 1e-6
-
-
 LINE_RING = document(5, 0.5, run={"dt": 0.1, "duration": 400.0, "replicas": 1, "seed": 3})
 
 
@@ -281,9 +250,7 @@ def test_heavy_tails(document):
         assert error.predicted is not None
         assert error.standard_error is error.z is error.p is None
     assert found.given.system_error.z is not None
-    assert found.given.variance_ratio is None
-    assert found.order is None
-    assert found.any_time.half_width is None
+    assert found.given.variance_ratio is found.order is found.any_time.half_width is None
     assert not found.running["standard_error"].any()
     tests = {test.name: test.p for test in found.tests}
     assert tests["system error, corrected"] == pytest.approx(found.given.system_error.p)
@@ -293,16 +260,11 @@ def test_heavy_tails(document):
 
 
 def test_heavy_tails_of_several_runs_and_live():
-    runs = [
-        (str(seed), simulate(Experiment.parse(HEAVY | {"run": {"dt": 0.6, "duration": 240.0, "seed": seed}})))
-        for seed in (1, 2)
-    ]
-    found = compare_pooled(runs)
+    heavy = Experiment.parse(HEAVY)
+    found = compare_pooled((str(seed), simulate(heavy.with_run(duration=240.0, seed=seed))) for seed in (1, 2))
     assert found.trust.reason == "heavy_tails"
-    assert found.system_error.standard_error is None
-    assert all(member.system_error.standard_error is None for member in found.pool.members)
-    live = LiveEstimate(new_record(Experiment.parse(HEAVY)))
-    assert "infinite" in live.report().note
+    assert [one.system_error.standard_error for one in (found, *found.pool.members)] == [None] * 3
+    assert "infinite" in LiveEstimate(new_record(heavy)).report().note
 
 
 @pytest.mark.parametrize(
@@ -317,11 +279,4 @@ def test_heavy_tails_of_several_runs_and_live():
 def test_other_laws(document, errors, reason):
     found = compared(document)
     assert (found.trust.errors, found.trust.reason) == (errors, reason)
-    assert found.to_json()["trust"]["reason"] == reason
     assert bool(trust_words(found.to_json())) == (reason == "few_switches")
-
-
-def test_real_time_has_none():
-    """There errors are given the log, whatever the law over all paths is."""
-    document = LINE_RING | {"run": LINE_RING["run"] | {"pace": "realtime", "duration": 40.0}}
-    assert compared(document).trust is None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from tests.support.watched_run import sums_of
 
-from experiments import Experiment, Observation, compare, five, observed, predict, simulate
+from experiments import compare, five, line_ring, observed, predict, simulate
 from msg_analysis.inference.evidence_sums import EvidenceSums, WatchedEvidence, any_time_evidence
 from msg_analysis.inference.observation import spaced_steps
 from msg_analysis.inference.pool import compare_pooled
@@ -19,17 +19,8 @@ from msg_analysis.theory import packed_symmetric
 
 def test_the_error_martingale_is_fair() -> None:
     """Over the next graph and the next state, by Gauss-Hermite quadrature, the factor of every rate has mean 1."""
-    law = Experiment.parse(
-        {
-            "name": "two",
-            "problem": "consensus",
-            "time": "continuous",
-            "graphs": {"near": {"arcs": [[1, 2, 2.0], [2, 1, 1.0]]}, "far": {"arcs": [[1, 2, 0.3]]}},
-            "switching": {"generator": [[-1, 1], [2, -2]]},
-            "run": {"dt": 0.1, "duration": 10, "replicas": 1, "seed": 1},
-        }
-    )
-    prediction = predict(law)
+    graphs = {"near": {"arcs": [[1, 2, 2.0], [2, 1, 1.0]]}, "far": {"arcs": [[1, 2, 0.3]]}}
+    prediction = predict(line_ring(2, graphs=graphs, switching={"generator": [[-1, 1], [2, -2]]}, run={"dt": 0.1}))
     system = prediction.system
     nodes, weights = np.polynomial.hermite_e.hermegauss(120)
     weights = weights / weights.sum()
@@ -94,16 +85,10 @@ def test_sums_are_those_of_a_loop_over_the_steps(changes: dict[str, Any]) -> Non
 )
 def test_correct_runs_seldom_pass_at_any_time(changes: dict[str, Any]) -> None:
     """Of 40 runs, watched 100 times each, at level 10 %: false-alarm rate P(binomial(40, 0.1) > 10) = 0.2 %."""
-    passed, prediction = 0, predict(five(seed=100, duration=25.0, **changes))
+    passed = 0
     for seed in range(40):
-        trajectory = simulate(five(seed=100 + seed, duration=25.0, **changes))
-        if trajectory.made is None:
-            prediction = prediction.for_run(trajectory.record.experiment)
-        else:  # the seed says in which order the agents step
-            prediction = predict(trajectory.record.experiment)
-        observation = Observation.of(trajectory, prediction)
+        observation = observed(five(seed=100 + seed, duration=25.0, **changes))
         watched = WatchedEvidence.of(observation, np.arange(5, observation.steps + 1, 5))
-        assert watched.logarithms is not None
         passed += bool((watched.logarithms >= np.log(10.0)).any())
     assert passed <= 10
 
@@ -124,26 +109,19 @@ def test_faults_are_found_and_named(changes: dict[str, Any], words: str) -> None
     observation = observed(five(duration=600.0, **changes), five(duration=600.0))
     looks = np.arange(100, observation.steps + 1, 100)
     found = any_time_evidence(WatchedEvidence.of(observation, looks), 0.01)
-    assert found.exceeded
-    assert found.crossed is not None
-    assert found.questions[0][0] == words
+    assert (found.exceeded, found.crossed is None, found.questions[0][0]) == (True, False, words)
 
 
 def test_a_fault_of_the_system_error() -> None:
     """Its own martingale sees agents that have twice the noise variance, without asking for any agent."""
-    noisy = five(duration=600.0, noise={"process": 2.0**0.5})
-    observation = observed(noisy, five(duration=600.0))
-    sums = sums_of(observation)
-    assert sums.families()["system error"].max() > np.log(1000.0)
+    observation = observed(five(duration=600.0, noise={"process": 2.0**0.5}), five(duration=600.0))
+    assert sums_of(observation).families()["system error"].max() > np.log(1000.0)
 
 
 def test_what_never_moves_is_infinite_evidence() -> None:
     still = five(noise={"process": [1.0, 0.0, 1.0, 1.0, 1.0]})
-    observation = observed(five(noise={"process": [1.0, 0.01, 1.0, 1.0, 1.0]}), still)
-    sums = sums_of(observation)
-    assert sums.evidence() == np.inf
-    same = observed(still)
-    sums = sums_of(same)
+    assert sums_of(observed(five(noise={"process": [1.0, 0.01, 1.0, 1.0, 1.0]}), still)).evidence() == np.inf
+    sums = sums_of(observed(still))
     assert sums.evidence() < 20.0
     assert "residuals: covariance" in sums.families()
 
@@ -155,33 +133,41 @@ def test_what_never_moves_is_infinite_evidence() -> None:
         {"run": {"replicas": 3}},
         {"noise": {"loss": 0.3, "link": 0.2, "broadcast": 0.1}},
         {"noise": {"process": [1.0, 0.0, 1.0, 1.0, 1.0], "delay": 2}},
+        {"noise": {"loss": 0.3, "on_loss": "hold", "link": 0.2}},
+        {"noise": {"process": [[1.0, 0.5, 0, 0, 0]] * 5, "loss": 0.3, "on_loss": "hold", "link": 0.2}},
         {"run": {"pace": "realtime"}},
     ],
-    ids=["plain", "replicas", "on the air", "an agent without noise", "real time"],
+    ids=[
+        "plain",
+        "replicas",
+        "on the air",
+        "an agent without noise",
+        "messages used again",
+        "not followed",
+        "real time",
+    ],
 )
 def test_many_looks_in_one_pass_are_those_of_a_pass_each(changes: dict[str, Any]) -> None:
-    """With innovations that are too large, an agent that stands still, and looks after 1 to 150 steps."""
+    """With residuals that are too large, and an agent that stands still; also in the pass of the residuals."""
     observation = observed(five(duration=40.0, **changes))
     observation.states[301, 2] += 3.0
     observation.states[401:407, 3] = observation.states[400, 3]
-    looks = np.cumsum([1, 1, 2, 5, 3, 120, 150, 100, 7, 12, 1, 150])
-    looks = np.append(looks, observation.steps)
-    together = WatchedEvidence.of(observation, looks)
+    looks = spaced_steps(observation.steps, 20)  # so many of a run of 800 steps
     sums, one_by_one = EvidenceSums(observation.prediction, observation.replicas, in_detail=True), []
     for first, last in pairwise([0, *looks.tolist()]):
         sums.add(observation, first, last)
         one_by_one.append(sums.evidence())
-    np.testing.assert_allclose(together.logarithms, one_by_one, rtol=1e-9, atol=1e-9)
-    for kind, logarithms in sums.families().items():
-        assert together.sums.families()[kind] == pytest.approx(logarithms, rel=1e-9, abs=1e-9), kind
+    for watched in (WatchedEvidence.of(observation, looks), Evidence.of(observation, 0.01).watched):
+        np.testing.assert_array_equal(watched.steps, looks)
+        np.testing.assert_allclose(watched.logarithms, one_by_one, rtol=1e-9, atol=1e-9)
+        for kind, logarithms in sums.families().items():
+            assert watched.sums.families()[kind] == pytest.approx(logarithms, rel=1e-9, abs=1e-9), kind
 
 
 def test_in_a_comparison() -> None:
     comparison = compare(simulate(five(duration=200.0)))
     document = comparison.to_json()["any_time"]
-    assert not document["exceeded"]
-    assert document["crossed_at"] is None
-    assert document["threshold"] == 100.0
+    assert [document[key] for key in ("exceeded", "crossed_at", "threshold")] == [False, None, 100.0]
     assert document["evidence"] == pytest.approx(np.exp(document["log_evidence"]))
     logs = [entry["log_evidence"] for entry in document["questions"]]
     assert logs == sorted(logs, reverse=True)
@@ -209,24 +195,3 @@ def test_questions_of_single_parts_keep_their_share() -> None:
     assert evidence_weights([False, False]) == pytest.approx([0.5, 0.5])
     names = ["residuals: covariance", "residuals: gains", "switching", "loss"]
     assert [question.name for question in QUESTIONS if question.main] == names
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {"noise": {"loss": 0.3, "link": 0.2, "broadcast": 0.1}},
-        {"noise": {"loss": 0.3, "on_loss": "hold", "link": 0.2}},
-        {"noise": {"process": [[1.0, 0.5, 0, 0, 0]] * 5, "loss": 0.3, "on_loss": "hold", "link": 0.2}},
-        {"run": {"pace": "realtime"}},
-    ],
-    ids=["plain", "on the air", "messages used again", "not followed", "real time"],
-)
-def test_one_pass_for_the_tests_and_the_evidence(changes: dict[str, Any]) -> None:
-    """In the pass of the innovations the evidence is the same as in a pass of its own."""
-    observation = observed(five(duration=40.0, **changes))
-    looks = spaced_steps(observation.steps, 20)  # so many of a run of 800 steps
-    shared, own = Evidence.of(observation, 0.01).watched, WatchedEvidence.of(observation, looks)
-    assert shared.steps is not None
-    np.testing.assert_array_equal(shared.steps, looks)
-    np.testing.assert_allclose(shared.logarithms, own.logarithms, rtol=1e-9, atol=1e-9)

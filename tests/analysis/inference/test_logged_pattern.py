@@ -2,45 +2,48 @@
 
 import dataclasses
 
+import late_timers
 import numpy as np
 import pytest
+from late_timers import busy
+from tests.analysis.inference.test_messages import Unrolled
 
 from experiments import CORRELATED, TRACKING, directed, observed, simulate
-from msg_analysis.common import arrays
-from msg_analysis.common.arrays import in_file
+from msg_analysis.common.arrays import LARGE_VARIABLE, in_file
 from msg_analysis.inference.estimates import covariance_test, estimates
-from msg_analysis.inference.event_order import EventOrder, newest_steps, order_events, sampled
+from msg_analysis.inference.event_order import EventOrder, order_events, sampled
 from msg_analysis.inference.pattern_events import Periods
 from msg_analysis.inference.realtime_laws import PatternUnavailableError, pattern_means
 
-STEPS = 90
+STEPS = 89  # the last block of sqrt(N) periods is a part of one
+CHAIN = {"generator": [[-3.0, 3.0], [2.0, -2.0]]}
 
 
-def experiment(run=None, **changes):
-    chain = {"generator": [[-3.0, 3.0], [2.0, -2.0]]}
-    run = {"duration": STEPS / 10, "pace": "realtime"} | (run or {})
-    return directed(**{"switching": chain, **changes}, run=run)
+def real_time(process=1.0, start="stationary", pace="realtime", **changes):
+    run = {"duration": STEPS / 10, "pace": pace, "start": start}
+    return directed(switching=CHAIN, noise={"process": process}, run=run, **changes)
 
 
 CASES = {
-    "consensus": experiment(),
-    "zero": experiment(run={"start": "zero"}),
-    "values": experiment(run={"start": [3.0, -1.0, 0.5]}),
-    "correlated": experiment(noise={"process": CORRELATED}),
-    "noise by graph": experiment(noise={"process": {"a": [1.0, 0.5, 2.0], "b": CORRELATED}}, **TRACKING),
-    "agent without noise": experiment(noise={"process": [1.0, 0.0, 2.0]}),
-    "tracking": experiment(**TRACKING),
+    "consensus": real_time(),
+    "zero": real_time(start="zero"),
+    "values": real_time(start=[3.0, -1.0, 0.5]),
+    "correlated": real_time(CORRELATED),
+    "noise by graph": real_time({"a": [1.0, 0.5, 2.0], "b": CORRELATED}, **TRACKING),
+    "agent without noise": real_time([1.0, 0.0, 2.0]),
+    "tracking": real_time(**TRACKING),
+}
+TIMING = {
+    "ideal": {},
+    "late": {"late": busy(0.4, 2.5)},
+    "slow": {"slow": busy(0.7, 3.0)},
+    "all": {"late": busy(0.3, 1.5), "slow": busy(0.5, 1.5), "switch": busy(0.8, 2.0)},
 }
 
 
-def timing(late_timers, kind):
-    busy = late_timers.busy
-    return {
-        "ideal": {},
-        "late": {"late": busy(0.4, 2.5)},
-        "slow": {"slow": busy(0.7, 3.0)},
-        "all": {"late": busy(0.3, 1.5), "slow": busy(0.5, 1.5), "switch": busy(0.8, 2.0)},
-    }[kind]
+def made_late(case, timing="all"):
+    """A run of a case with these timers."""
+    return late_timers.run(CASES[case], **TIMING[timing])
 
 
 def written_out(observation):
@@ -50,57 +53,19 @@ def written_out(observation):
     the covariance is the sum over the periods of what the noise of the period adds, given the noise before it; else its
     expectation.
     """
-    step, timers = observation.step, observation.timers
-    steps, m = timers.graphs.shape
-    replicas = observation.replicas
-    mean = np.full((steps + 1, m, replicas), np.nan)
-    gain = np.full((steps + 1, m, steps * m), np.nan)
-    seen = observation.states - step.reference
-    noise, period = np.zeros((steps * m, replicas)), np.zeros(steps * m)
-    mean[0], gain[0] = observation.start - step.reference, 0.0
-    known = {(0, i) for i in range(m)}
-    neighbours_of = [[step.neighbours(g, i).tolist() for i in range(m)] for g in range(step.modes)]
-    waiting = [(k, i) for k in range(steps) for i in range(m)]
-    while waiting:
-        left = []
-        for k, i in waiting:
-            g = timers.graphs[k, i]
-            neighbours = neighbours_of[g][i]
-            uses = [(int(timers.used[k, i, d]), j) for d, j in enumerate(neighbours)]
-            uses = [(k, i) if s < 0 else (s, j) for s, j in uses]
-            if (k, i) not in known or not known.issuperset(uses):
-                left.append((k, i))
-                continue
-            row = step.nominal[g, i]
-            mean[k + 1, i] = row[i] * mean[k, i] + sum(
-                row[j] * mean[use] for j, use in zip(neighbours, uses, strict=True)
-            )
-            gain[k + 1, i] = row[i] * gain[k, i] + sum(
-                row[j] * gain[use] for j, use in zip(neighbours, uses, strict=True)
-            )
-            gain[k + 1, i, k * m : (k + 1) * m] += step.noise_gain[g, i]
-            known.add((k + 1, i))
-            rest = seen[k + 1, i] - row[i] * seen[k, i]
-            rest = rest - sum(row[j] * seen[use] for j, use in zip(neighbours, uses, strict=True))
-            noise[k * m + i] = rest / (step.noise_gain[g, i, i] or 1.0)
-            period[k * m + i] = np.ceil(timers.made[k + 1, i] / np.round(step.dt * 1e9))
-        assert len(left) < len(waiting)
-        waiting = left
-    times = np.round(np.arange(steps) * step.dt * 1e9)
-    newest = (timers.made[None] <= times[:, None, None]).sum(axis=1) - 1
-    x, b = mean[newest, range(m)], gain[newest, range(m)]
-    if observation.prediction.experiment.problem == "consensus":
-        x, b = x - x.mean(axis=1, keepdims=True), b - b.mean(axis=1, keepdims=True)
+    (steps, m), replicas = observation.timers.graphs.shape, observation.replicas
+    unrolled = Unrolled(observation, replicas)
+    x, b = np.split(unrolled.sampled, [replicas], axis=2)
+    mean, gain = (part.reshape(steps * m, -1) for part in np.split(unrolled.states[1:], [replicas], axis=2))
+    seen = (observation.states[1:] - observation.step.reference).reshape(steps * m, -1)
+    noise = np.linalg.lstsq(gain, seen - mean, rcond=None)[0]
+    period = np.ceil(observation.timers.made[1:] / np.round(observation.step.dt * 1e9)).ravel()
     expected = (np.einsum("kir,kjr->ij", x, x) / replicas + np.einsum("kin,kjn->ij", b, b)) / steps
-    entries = [(i, j) for i in range(m) for j in range(i + 1)]
-    forms = [np.einsum("kn,kl->nl", b[:, i], b[:, j]) / steps for i, j in entries]
-    forms = [(form + form.T) / 2 for form in forms]
-    linear = [
-        (np.einsum("kn,kr->nr", b[:, i], x[:, j]) + np.einsum("kn,kr->nr", b[:, j], x[:, i])) / steps
-        for i, j in entries
-    ]
-    forms, linear = np.array(forms), np.array(linear)
-    if all((gains == np.diag(np.diag(gains))).all() for gains in step.noise_gain):
+    i, j = np.tril_indices(m)
+    forms = np.einsum("kan,kal->anl", b[:, i], b[:, j], optimize=True) / steps
+    forms = (forms + forms.transpose(0, 2, 1)) / 2
+    linear = (np.einsum("kan,kar->anr", b[:, i], x[:, j]) + np.einsum("kan,kar->anr", b[:, j], x[:, i])) / steps
+    if all((gains == np.diag(np.diag(gains))).all() for gains in observation.step.noise_gain):
         covariance = np.zeros((len(forms), len(forms)))
         for number in range(1, steps):
             now, before = period == number, period < number
@@ -114,10 +79,14 @@ def written_out(observation):
 
 
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("kind", ["ideal", "late", "slow", "all"])
-def test_against_all_noise_written_out(late_timers, case, kind):
-    """Expectation and standard errors of the system error, of all nodes, and chi-square of all moments."""
-    observation = observed(late_timers.run(CASES[case], **timing(late_timers, kind)))
+@pytest.mark.parametrize("timing", TIMING)
+def test_against_all_noise_written_out(case, timing, monkeypatch):
+    """Expectation and standard errors of the system error, of all nodes, and chi-square of all moments.
+
+    In blocks of a few steps, and with all arrays in files.
+    """
+    monkeypatch.setenv(LARGE_VARIABLE, "1")
+    observation = dataclasses.replace(observed(made_late(case, timing)), block_numbers=40)
     order = order_events(observation)
     assert order.contradiction is None
     means = pattern_means(observation, order)
@@ -132,12 +101,13 @@ def test_against_all_noise_written_out(late_timers, case, kind):
         x = x - x.mean(axis=1, keepdims=True)
     measured = np.einsum("kir,kjr->ij", x, x) / x.shape[0] / x.shape[2]
     assert total.standard_error == pytest.approx(error, rel=1e-8)
+    assert means.system_variances.sum() / STEPS**2 == pytest.approx(error**2, rel=1e-8)
     assert total.measured == pytest.approx(np.trace(measured))
     assert total.z == pytest.approx((np.trace(measured) - np.trace(expected)) / error, rel=1e-6)
     for node, place, i in zip(nodes, diagonal, range(3), strict=True):
         assert node.standard_error == pytest.approx(np.sqrt(covariance[place, place]), rel=1e-7)
         assert node.measured == pytest.approx(measured[i, i])
-    off = np.array([(measured - expected)[i, j] for i in range(3) for j in range(i + 1)])
+    off = (measured - expected)[np.tril_indices(3)]
     scale = np.sqrt(np.diag(covariance))
     inverse = np.linalg.pinv(covariance / np.outer(scale, scale), rcond=1e-10, hermitian=True)
     found = covariance_test(means, system)
@@ -145,32 +115,19 @@ def test_against_all_noise_written_out(late_timers, case, kind):
     assert found.dof == np.linalg.matrix_rank(covariance / np.outer(scale, scale), tol=1e-9, hermitian=True)
 
 
-def test_what_has_to_be_remembered(late_timers):
+def test_what_has_to_be_remembered():
     """Nothing with ideal timers; with slow messages what others still use; noise of a step half made, if correlated."""
     ideal = observed(simulate(CASES["correlated"]))
     assert Periods(ideal, order_events(ideal)).largest == 3
-    slow = observed(late_timers.run(CASES["consensus"], slow=late_timers.busy(0.7, 3.0)))
+    slow = observed(made_late("consensus", "slow"))
     assert 3 < Periods(slow, order_events(slow)).largest < 12
-    late = late_timers.run(CASES["correlated"], late=late_timers.busy(0.4, 2.5))
-    late = observed(late)
+    late = observed(made_late("correlated", "late"))
     assert Periods(late, order_events(late)).largest > 5
 
 
-def test_ideal_periods_are_the_sequential_law():
-    observation = observed(simulate(experiment(noise={"process": CORRELATED}, **TRACKING)))
-    periods = Periods(observation, order_events(observation))
-    system = observation.prediction.system
-    for number in range(1, STEPS):
-        g = observation.modes[number - 1]
-        np.testing.assert_allclose(periods[number].matrix, system.matrices[g], atol=1e-14)
-        np.testing.assert_allclose(periods[number].noise, system.noise[g], atol=1e-14)
-    np.testing.assert_array_equal(newest_steps(observation), np.tile(np.arange(STEPS + 1)[:, None], (1, 3)))
-    np.testing.assert_array_equal(sampled(observation, order_events(observation)), observation.states)
-
-
-def test_a_clock_that_jumps(late_timers):
+def test_a_clock_that_jumps():
     """All that happens between two ticks has one time; what was used tells the order."""
-    trajectory = late_timers.run(CASES["consensus"], **timing(late_timers, "all"))
+    trajectory = made_late("consensus")
     tick = 70_000_000
     made = -(-trajectory.made // tick) * tick
     observation = observed(dataclasses.replace(trajectory, made=made))
@@ -183,33 +140,19 @@ def test_a_clock_that_jumps(late_timers):
     assert estimates(means, observation.prediction.system)[0].standard_error == pytest.approx(error, rel=1e-8)
 
 
-def test_clocks_that_disagree(late_timers):
-    trajectory = late_timers.run(CASES["consensus"])
-    ahead = trajectory.made.copy()
+def test_clocks_that_disagree():
+    trajectory = made_late("consensus", "ideal")
+    ahead, back = trajectory.made.copy(), trajectory.made.copy()
     ahead[1:, 1] += 250_000_000
     observation = observed(dataclasses.replace(trajectory, made=ahead))
     with pytest.raises(PatternUnavailableError, match=r"a value that agent 2 computed 0\.\d+ units of time later"):
         pattern_means(observation, order_events(observation))
-    back = trajectory.made.copy()
     back[50, 1] = back[48, 1]
-    order = order_events(observed(dataclasses.replace(trajectory, made=back)))
-    assert order.contradiction is not None
+    assert order_events(observed(dataclasses.replace(trajectory, made=back))).contradiction is not None
 
 
-def test_blocks_change_nothing(late_timers, monkeypatch):
-    observation = observed(late_timers.run(CASES["correlated"], **timing(late_timers, "all")))
-    order = order_events(observation)
-    whole = pattern_means(observation, order)
-    monkeypatch.setattr("msg_analysis.inference.realtime_laws.math.isqrt", lambda _: 7)
-    monkeypatch.setattr(arrays, "LARGE", 1)
-    split = pattern_means(dataclasses.replace(observation, block_numbers=40), order)
-    for name in ("measured", "predicted", "covariance", "system_series", "system_variances"):
-        np.testing.assert_allclose(getattr(split, name), getattr(whole, name), rtol=1e-9, atol=1e-14)
-    assert whole.system_variances.sum() / STEPS**2 == pytest.approx(whole.trace @ whole.covariance @ whole.trace)
-
-
-def test_less_is_tested_when_there_is_much(late_timers):
-    observation = observed(late_timers.run(CASES["tracking"], **timing(late_timers, "all")))
+def test_less_is_tested_when_there_is_much():
+    observation = observed(made_late("tracking"))
     system, order = observation.prediction.system, order_events(observation)
     whole = estimates(pattern_means(observation, order), system)
     entries = Periods(observation, order).largest
@@ -229,9 +172,9 @@ def test_less_is_tested_when_there_is_much(late_timers):
         pattern_means(observation, order, most_entries=3)
 
 
-def test_order_in_blocks_and_in_files(late_timers, monkeypatch):
+def test_order_in_blocks_and_in_files(monkeypatch):
     """With clocks that jump, agents that catch up, and many states of one time: as at once."""
-    trajectory = late_timers.run(CASES["consensus"], **timing(late_timers, "all"))
+    trajectory = made_late("consensus")
     tick = 300_000_000
     observation = observed(dataclasses.replace(trajectory, made=-(-trajectory.made // tick) * tick))
     whole = order_events(observation)
@@ -243,7 +186,7 @@ def test_order_in_blocks_and_in_files(late_timers, monkeypatch):
     for k, i in np.ndindex(whole.position.shape):
         for d, j in enumerate(observation.step.neighbours(int(observation.timers.graphs[k, i]), i).tolist()):
             assert used[k, i, d] <= 0 or whole.position[used[k, i, d] - 1, j] < whole.position[k, i]
-    monkeypatch.setattr(arrays, "LARGE", 1)
+    monkeypatch.setenv(LARGE_VARIABLE, "1")
     split = order_events(dataclasses.replace(observation, block_numbers=90), ties_at_once=2)
     assert in_file(split.position)
     assert np.array_equal(split.position, whole.position)
@@ -253,7 +196,7 @@ def test_order_in_blocks_and_in_files(late_timers, monkeypatch):
 
 def test_the_order_in_lockstep():
     """Of the states of a run in which all agents step at the same time, that by step and agent."""
-    observation = observed(simulate(experiment(run={"pace": "lockstep"}))).as_timed()
+    observation = observed(simulate(real_time(pace="lockstep"))).as_timed()
     one, other = EventOrder.of_lockstep(STEPS, 3), order_events(observation)
     assert np.array_equal(one.position, other.position)
     assert np.array_equal(one.newest, other.newest)

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 from tests.support.message_runs import message_run
 
-from experiments import Observation, compare, line_ring, predict
-from msg_analysis.common import arrays
-from msg_analysis.common.arrays import in_file
+from experiments import compare, line_ring, observed, predict
+from msg_analysis.common.arrays import LARGE_VARIABLE
 from msg_analysis.inference import pattern_events
 from msg_analysis.inference.counts import LossTally, loss_test
-from msg_analysis.inference.event_order import newest_steps, order_events, period_tables
+from msg_analysis.inference.event_order import order_events
 from msg_analysis.inference.realtime_laws import means_in_lockstep, pattern_means
 from msg_analysis.inference.received_values import ReceivedValues, RepeatedNoise
 from msg_analysis.inference.residuals import residuals
@@ -37,21 +36,24 @@ CASES = {
 }
 
 
-def experiment(noise, more=None, **run):
+REAL_TIME = [case for case in CASES if "real time" in case]
+
+
+def network(noise, more=None, **run):
     run = {"dt": 0.2, "duration": 4, "replicas": 1, "start": [1.0, -2.0, 0.5, 0.0, 1.0], "seed": 4} | run
     return line_ring(5, 0.5, noise={"process": 1.0, **noise}, run=run, **(more or {}))
 
 
-def observed(case, seed=1, **run):
+def made(case, seed=1, **run):
     noise, more, late = CASES[case]
-    what = experiment(noise, more, pace="realtime" if "real time" in case else "lockstep", **run)
-    return Observation.of(message_run(what, seed, **late), predict(what))
+    pace = "realtime" if case in REAL_TIME else "lockstep"
+    return message_run(network(noise, more, pace=pace, **run), seed, **late)
 
 
 class Unrolled:
-    """All states of a run as combinations of a constant 1 and of independent standard normal numbers."""
+    """All states as combinations of the states of some replicas at the start, and of independent normal numbers."""
 
-    def __init__(self, observation):
+    def __init__(self, observation, starts=1):
         what, step = observation.prediction.experiment, observation.step
         timed = observation if observation.timers else observation.as_timed()
         steps, m = timed.timers.graphs.shape
@@ -60,27 +62,29 @@ class Unrolled:
             np.eye(m) - what.step_length * (np.diag(g.adjacency.sum(axis=1)) - g.adjacency + np.diag(what.leader_gains))
             for g in what.graph_list
         ]
-        size = 1 + m * steps + m * (steps + 1) + len(links) * (steps + 1)
-        unit, numbers = np.eye(size), iter(range(1, size))
-        states = {(0, i): observation.start[i, 0] * unit[0] - what.reference * unit[0] for i in range(m)}
-        process = {(k, i): math.sqrt(what.step_length) * unit[next(numbers)] for k in range(steps) for i in range(m)}
-        broadcast = {(k, i): step.broadcast * unit[next(numbers)] for k in range(steps + 1) for i in range(m)}
-        link = {(k, i, j): step.link * unit[next(numbers)] for k in range(steps + 1) for i, j in links}
+        size = starts + m * steps + (step.broadcast > 0) * m * (steps + 1) + (step.link > 0) * len(links) * (steps + 1)
+        unit, numbers = np.eye(size), iter(range(starts, size))
+        states = {(0, i): (observation.start[i, :starts] - what.reference) @ unit[:starts] for i in range(m)}
+        process = [[math.sqrt(what.step_length) * unit[next(numbers)] for _ in range(m)] for _ in range(steps)]
+        said = {(k, i): step.broadcast and step.broadcast * unit[next(numbers)] for k, i in np.ndindex(steps + 1, m)}
+        link = {(k, i, j): step.link and step.link * unit[next(numbers)] for k in range(steps + 1) for i, j in links}
         order = np.arange(steps * m)
         if observation.timers:
             order = np.argsort(order_events(observation).position.ravel())
         for k, i in np.column_stack(np.unravel_index(order, (steps, m))).tolist():
             graph = int(timed.timers.graphs[k, i])
-            total = weights[graph][i, i] * states[k, i]
+            total = weights[graph][i, i] * states[k, i] + what.noise_gain[graph][i] @ process[k]
             for d, j in enumerate(step.neighbours(graph, i).tolist()):
                 s = int(timed.timers.used[k, i, d])
-                heard = states[k, i] if s < 0 else states[s, j] + broadcast[s, j] + link[s, i, j]
+                heard = states[k, i] if s < 0 else states[s, j] + said[s, j] + link[s, i, j]
                 total = total + weights[graph][i, j] * heard
-            states[k + 1, i] = total + process[k, i]
-        newest = newest_steps(timed)[:steps]
-        self.sampled = np.array([[states[int(newest[k, i]), i] for i in range(m)] for k in range(steps)])
+            states[k + 1, i] = total
+        self.states = np.array([[states[k, i] for i in range(m)] for k in range(steps + 1)])
+        times = np.round(np.arange(steps) * what.step_length * 1e9)
+        newest = (timed.timers.made[None] <= times[:, None, None]).sum(axis=1) - 1
+        self.sampled = self.states[newest, range(m)]
         if what.problem == "consensus":
-            self.sampled -= self.sampled.mean(axis=1, keepdims=True)
+            self.sampled = self.sampled - self.sampled.mean(axis=1, keepdims=True)
 
     def node_errors(self):
         """(m,) expected time means."""
@@ -100,12 +104,14 @@ def means_of(observation):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_expectation_and_variance_given_the_log(case):
+def test_expectation_and_variance_given_the_log(case, monkeypatch):
     """The expectation exactly; the variance, which is a function of the states, in the mean over many replicas.
 
-    It is a mean over 20,000 replicas with relative spread of about 1: 3 % are four standard errors.
+    It is a mean over 20,000 replicas with relative spread of about 1: 3 % are four standard errors. What is in use is
+    found in blocks of one or two steps, and is in files.
     """
-    observation = observed(case, replicas=20_000)
+    monkeypatch.setenv(LARGE_VARIABLE, "1")
+    observation = dataclasses.replace(observed(made(case, replicas=20_000)), block_numbers=300)
     brute, means = Unrolled(observation), means_of(observation)
     frame = observation.prediction.system.frame
     expected = frame @ means.expected_moments @ frame.T
@@ -119,7 +125,7 @@ def test_expectation_and_variance_given_the_log(case):
 
 def test_rounding_changes_no_standard_error(monkeypatch):
     """What was received is not logged: it follows by regression on values that depend linearly on each other."""
-    observation = observed("real time, own", duration=60, replicas=2)
+    observation = observed(made("real time, own", duration=60, replicas=2))
     order, random, completed = order_events(observation), np.random.default_rng(1), pattern_events._completed
 
     def rounded(seen, known, moment, *, centred):
@@ -131,17 +137,14 @@ def test_rounding_changes_no_standard_error(monkeypatch):
     np.testing.assert_allclose(pattern_means(observation, order).covariance, exact.covariance, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("case", [case for case in CASES if CASES[case][0].get("link")])
+@pytest.mark.parametrize("case", ["lockstep, held, noisy", "lockstep, held, delay, tracking", *REAL_TIME[:-1]])
 def test_innovations_are_freed_of_noise_that_is_known(case):
     """Against a Cholesky factor of the covariance of all innovations of an agent."""
-    observation = observed(case, duration=12)
+    observation = observed(made(case, duration=12))
     step, steps = observation.step, observation.steps
     reception = ReceivedValues.of(observation, 0, steps)
     e = residuals(observation, 0, steps, reception)
-    parts = []
-    repeated = RepeatedNoise.of(observation)
-    if repeated is None:
-        pytest.skip("every message is used once")
+    parts, repeated = [], RepeatedNoise.of(observation)
     for first in range(0, steps, 7):  # in blocks
         piece = ReceivedValues.of(observation, first, min(first + 7, steps))
         parts.append(repeated.free(e[first : first + 7], piece))
@@ -166,18 +169,7 @@ def test_innovations_are_freed_of_noise_that_is_known(case):
 @pytest.mark.parametrize("case", CASES)
 def test_right_runs_agree(case):
     """Whole verdicts, one run each: with a right program, one of the nine disagrees with probability 9 %."""
-    observation = message_run(
-        experiment(
-            CASES[case][0],
-            CASES[case][1],
-            pace="realtime" if "real time" in case else "lockstep",
-            duration=60,
-            replicas=2,
-        ),
-        seed=11,
-        **CASES[case][2],
-    )
-    found = compare(observation)
+    found = compare(made(case, 11, duration=60, replicas=2))
     assert found.verdict == "agrees", [test for test in found.tests if test.rejected]
     names = {test.name.removesuffix(", corrected") for test in found.tests}
     assert {"system error", "covariance", "residuals: gains", "residuals: whiteness"} <= names
@@ -189,19 +181,19 @@ LOSSES = {"default": 0.2, "arcs": [[1, 2, 0.4], [3, 4, 0.05]]}
 
 def lossy(noise, seed=3, duration=150, actual=None, **run):
     """A run whose record says ``noise``, and whose messages are lost as ``actual`` says."""
-    claimed = experiment(noise, duration=duration, start="zero", **run)
-    other = experiment(actual or noise, duration=duration, start="zero", **run)
-    return Observation.of(message_run(claimed, seed, actual=other), predict(claimed))
+    claimed = network(noise, duration=duration, start="zero", **run)
+    other = network(actual or noise, duration=duration, start="zero", **run)
+    return observed(message_run(claimed, seed, actual=other))
 
 
 @pytest.mark.parametrize("burst", [None, 4])
 @pytest.mark.parametrize("on_loss", ["own", "hold"])
 def test_losses_by_link_have_their_law(burst, on_loss):
     """P-values of 20 runs: the number below 10 % is binomial, at most 8 but for 6e-5; none below 1e-5."""
-    noise = {"loss": LOSSES if burst is None else {"arcs": LOSSES["arcs"]}, "on_loss": on_loss, "burst": burst}
-    what = experiment({key: value for key, value in noise.items() if value is not None}, duration=100, start="zero")
+    loss = {"loss": LOSSES} if burst is None else {"loss": {"arcs": LOSSES["arcs"]}, "burst": burst}
+    what = network(loss | {"on_loss": on_loss}, duration=100, start="zero")
     prediction = predict(what)
-    found = [loss_test(Observation.of(message_run(what, seed), prediction)).p for seed in range(20)]
+    found = [loss_test(observed(message_run(what, seed), prediction)).p for seed in range(20)]
     assert sum(p < 0.1 for p in found) <= 8
     assert min(found) > 1e-5
 
@@ -240,17 +232,17 @@ def test_in_real_time_losses_are_counted_by_use(pace):
     right = lossy({"loss": 0.3}, pace=pace)
     assert loss_test(right).p > 1e-3
     assert loss_test(lossy({"loss": 0.3}, pace=pace, actual={"loss": 0.25})).p < 1e-3
-    held = LossTally.of(lossy({"loss": 0.3, "on_loss": "hold"}, pace=pace))
-    assert (held is None) == (pace == "realtime")
+    held = lossy({"loss": 0.3, "on_loss": "hold"}, pace=pace)
+    assert (LossTally.of(held) is None) == (pace == "realtime")
 
 
 def test_uses_of_a_message_again_widen_the_law():
     """Late agents use messages twice: 15 runs, the number of p-values below 10 % at most 7 but for 4e-5."""
-    what = experiment({"loss": 0.3}, pace="realtime", duration=60, start="zero")
+    what = network({"loss": 0.3}, pace="realtime", duration=60, start="zero")
     prediction = predict(what)
     found = []
     for seed in range(15):
-        tally = LossTally.of(Observation.of(message_run(what, seed, late=0.6, latency=0.8), prediction))
+        tally = LossTally.of(observed(message_run(what, seed, late=0.6, latency=0.8), prediction))
         assert tally.repeated.sum() > 10
         found.append(tally.test().p)
     assert sum(p < 0.1 for p in found) <= 7
@@ -261,8 +253,8 @@ def test_uses_of_a_message_again_widen_the_law():
 def test_a_link_that_loses_more_is_named(on_loss, burst):
     links = [[1, 2, 0.2], [2, 3, 0.2], [5, 4, 0.2]]
     noise = {"on_loss": on_loss} | ({} if burst is None else {"burst": burst})
-    claimed = experiment(noise | {"loss": {"arcs": links}}, duration=400, start="zero")
-    actual = experiment(noise | {"loss": {"arcs": [links[0], [2, 3, 0.3], links[2]]}}, duration=400, start="zero")
+    claimed = network(noise | {"loss": {"arcs": links}}, duration=400, start="zero")
+    actual = network(noise | {"loss": {"arcs": [links[0], [2, 3, 0.3], links[2]]}}, duration=400, start="zero")
     found = compare(message_run(claimed, 6, actual=actual))
     assert found.verdict == "disagrees"
     first = next(cause for cause in found.causes if cause.kind == "loss")
@@ -272,29 +264,13 @@ def test_a_link_that_loses_more_is_named(on_loss, burst):
     assert "of the messages from agent 2 to agent 3 are lost, not 20 %" in first.words
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_values_in_use_in_blocks_and_in_files(case, monkeypatch):
-    """What is in use, block by block of one or two steps, is what is found for the whole run at once."""
-    observation = observed(case, duration=60)
-    timed = observation if observation.timers else observation.as_timed()
-    whole = period_tables(timed, order_events(timed))
-    monkeypatch.setattr(arrays, "LARGE", 1)
-    observation = dataclasses.replace(observation, block_numbers=300)
-    again = observation if observation.timers else observation.as_timed()
-    split = period_tables(again, order_events(again))
-    assert in_file(split[0].rows)
-    for one, other in zip(split, whole, strict=True):
-        assert np.array_equal(one.rows, other.rows)
-        assert np.array_equal(one.ends, other.ends)
-
-
 def test_the_verdict_in_real_time_is_calibrated():
     """Loss 0.3, link noise 0.3, broadcast 0.2: 20 runs, level 0.1; ``benchmarks/calibration.py --messages`` makes more.
 
     Intervals of the system error cover in 95 % of them: fewer than 15 of 20 with probability 3e-4. At level 0.1, more
     than 8 disagree with probability 6e-5 at most.
     """
-    what = experiment({"loss": 0.3, "link": 0.3, "broadcast": 0.2}, pace="realtime", dt=0.1, duration=30, start="zero")
+    what = network({"loss": 0.3, "link": 0.3, "broadcast": 0.2}, pace="realtime", dt=0.1, duration=30, start="zero")
     covered = alarms = 0
     for seed in range(20):
         found = compare(message_run(what, seed), level=0.1)

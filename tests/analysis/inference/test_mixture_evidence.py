@@ -88,15 +88,6 @@ def test_proportions_begin_at_one_and_their_mean_stays_one() -> None:
     assert found.shape == (13, len(PROPORTION_STRENGTHS))
 
 
-def test_mean_of_logarithms() -> None:
-    logs = np.array([[-2000.0, -2001.0], [3.0, 800.0], [-np.inf, 0.0]])
-    assert log_mean(logs[1]) == pytest.approx(800.0 - np.log(2.0))
-    assert log_mean(logs[0]) == pytest.approx(-2000.0 + np.log((1 + np.exp(-1)) / 2))
-    assert log_mean(logs, axis=1)[2] == pytest.approx(-np.log(2.0))
-    assert log_mean(np.array([np.inf, 0.0])) == np.inf
-    assert log_mean(np.array([-np.inf, -np.inf])) == -np.inf
-
-
 def test_a_fair_game_seldom_wins_much() -> None:
     """Of 2,000 fair games of 1,000 normal samples, watched all the time, at most 5 % ever pass 20 (Ville).
 
@@ -119,7 +110,8 @@ def test_a_bound_that_holds_at_all_times() -> None:
     assert float(bound[-1]) <= 1.01 * min(others)
 
 
-def test_means_of_parts_are_those_of_each() -> None:
+def test_means_of_logarithms() -> None:
+    """However large or small the numbers are; of one array along an axis, of several at once."""
     parts = [
         *np.split(np.random.default_rng(4).normal(scale=400.0, size=(7, 3)), [1, 4]),
         np.array([-np.inf, 2.0]),
@@ -129,4 +121,6 @@ def test_means_of_parts_are_those_of_each() -> None:
         np.array([900.0, 1000.0]),
     ]
     expected = [special.logsumexp(part) - np.log(part.size) for part in parts]
+    assert [log_mean(part.ravel()) for part in parts] == pytest.approx(expected, rel=1e-12)
     assert log_means([part[None] for part in parts])[0] == pytest.approx(expected, rel=1e-12)
+    assert log_mean(parts[2], axis=1) == pytest.approx(special.logsumexp(parts[2], axis=1) - np.log(3))

@@ -9,12 +9,14 @@ import pytest
 import scipy.stats
 from tests.support.watched_run import sums_of
 
-from experiments import Observation, compare, predict, simulate
+import experiments
+from experiments import compare, observed, predict, simulate
 from msg_analysis import Experiment, InputError, NotAvailableError
 from msg_analysis.inference.fault_power import Fault, FaultPower, StepInformation, fault_powers
 from msg_analysis.inference.sample_size import REPLICAS
 from msg_analysis.inference.statistics import simultaneous_half_width
-from msg_analysis.inference.time_means import time_means
+
+ONE_GRAPH = Experiment.parse({"name": "one", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "run": {"duration": 10}})
 
 
 def line_ring(**run: Any) -> Experiment:
@@ -49,16 +51,11 @@ def test_lengths_are_those_of_the_formulas() -> None:
 def test_the_interval_of_a_run_is_the_planned_one() -> None:
     """The standard error that a run itself states, and its interval for all times."""
     experiment = line_ring(duration=4000, replicas=4)
-    plan = experiment.plan()
-    trajectory = simulate(experiment)
-    run = Observation.of(trajectory, predict(experiment))
-    means = time_means(run)
-    measured = math.sqrt(means.system_variances.sum()) / run.steps / plan.precision.error
-    assert measured == pytest.approx(plan.precision.standard_error(run.steps, 4), rel=0.05)
-    any_time = compare(trajectory).any_time
-    assert any_time.half_width is not None
+    plan, found = experiment.plan(), compare(simulate(experiment))
+    measured = found.system_error.standard_error / plan.precision.error
+    assert measured == pytest.approx(plan.precision.standard_error(found.steps, 4), rel=0.05)
     planned = plan.to_json()["file"]["any_time_half_width"] * plan.precision.error
-    assert any_time.half_width == pytest.approx(planned, rel=0.05)
+    assert found.any_time.half_width == pytest.approx(planned, rel=0.05)
 
 
 def test_best_replicas() -> None:
@@ -69,20 +66,17 @@ def test_best_replicas() -> None:
     infinite = math.sqrt(precision.variance.path / 10_000) / precision.error
     assert precision.standard_error(10_000, best) < 1.06 * infinite
     assert precision.standard_error(10_000, best / 2) > 1.05 * precision.standard_error(10_000, REPLICAS[-1])
-    one = Experiment.parse({"name": "one", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "run": {"duration": 10}})
-    assert one.plan().precision.best_replicas(10_000) == REPLICAS[-1]
+    assert ONE_GRAPH.plan().precision.best_replicas(10_000) == REPLICAS[-1]
 
 
 def test_a_budget() -> None:
-    document = line_ring().plan(seconds=60.0, rate=1000.0).to_json()
-    assert document["budget"]["steps"] == 60_000
-    assert document["budget"]["wall_time"] == 60.0
-    assert document["file"]["wall_time"] == 8.0
-    real_time = Experiment.load("line_ring_realtime").plan(seconds=60.0).to_json()
-    assert real_time["rate"] == pytest.approx(100.0)
-    assert real_time["budget"]["steps"] == 6000
-    assert real_time["file"]["wall_time"] == pytest.approx(80.0)
-    assert real_time["file"]["any_time_half_width"] is None
+    found = line_ring().plan(seconds=60.0, rate=1000.0).to_json()
+    numbers = [found["budget"]["steps"], found["budget"]["wall_time"], found["file"]["wall_time"]]
+    assert numbers == [60_000, 60.0, 8.0]
+    found = Experiment.load("line_ring_realtime").plan(seconds=60.0).to_json()
+    numbers = [found["rate"], found["budget"]["steps"], found["file"]["wall_time"]]
+    assert numbers == pytest.approx([100.0, 6000, 80.0])
+    assert found["file"]["any_time_half_width"] is None
 
 
 def test_the_start_costs_steps() -> None:
@@ -115,8 +109,7 @@ def test_noise_is_the_divergence_of_normal_laws() -> None:
 def test_gains_have_the_information_of_a_run() -> None:
     """Of every link: the sum of the squared regressors of a run, over the variance of the noise."""
     experiment = line_ring(duration=4000, replicas=4)
-    prediction = predict(experiment)
-    run = Observation.of(simulate(experiment), prediction)
+    run = observed(experiment)
     sums = sums_of(run)
     (found,) = powers(experiment, Fault("gain", 0.5))
     assert (found.agent, found.sender) in {(0, 4), (4, 0)}  # only the ring has this link
@@ -151,16 +144,9 @@ def test_power_is_that_of_runs() -> None:
 
 
 def test_faults_that_a_law_cannot_have() -> None:
-    quiet = Experiment.parse({"name": "one", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "run": {"duration": 10}})
-    assert [row["kind"] for row in quiet.plan().to_json()["faults"]] == ["noise", "noise", "gain", "gain"]
-    half = {"transition": [[0.2, 0.8], [0.8, 0.2]]}
-    graphs = {"a": {"path": [1, 2, 3]}, "b": {"cycle": [1, 2, 3]}}
-    fast = Experiment.parse(
-        {"name": "f", "time": "discrete", "graphs": graphs, "switching": half, "run": {"duration": 9}}
-    )
-    kept = [(row["kind"], row["factor"]) for row in fast.plan().to_json()["faults"]]
-    assert ("switching", 0.7) in kept
-    assert ("switching", 1.4) not in kept
+    assert [row["kind"] for row in ONE_GRAPH.plan().to_json()["faults"]] == ["noise", "noise", "gain", "gain"]
+    fast = experiments.line_ring(time="discrete", switching={"transition": [[0.2, 0.8], [0.8, 0.2]]})
+    assert [row["factor"] for row in fast.plan().to_json()["faults"] if row["kind"] == "switching"] == [0.7]
 
 
 def test_notes() -> None:
@@ -190,8 +176,7 @@ def test_refused(options: dict[str, float], message: str) -> None:
 def test_refused_too() -> None:
     with pytest.raises(InputError, match="speed: 5 steps per second: in real time these are"):
         Experiment.load("line_ring_realtime").plan(rate=5.0)
-    quiet = {"name": "q", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "noise": {"process": 0.0}}
     with pytest.raises(InputError, match="the predicted system error is 0"):
-        Experiment.parse(quiet | {"run": {"duration": 10, "start": "zero"}}).plan()
+        ONE_GRAPH.with_noise(process=0.0).with_run(start="zero").plan()
     with pytest.raises(NotAvailableError):
         Experiment.load("ros_ws/src/msg_agents_example_protocols/experiments/saturated.yaml").plan()

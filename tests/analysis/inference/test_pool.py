@@ -23,17 +23,15 @@ def law(process=(1.0, 0.5, 2.0), **air):
 AIR = law([1.0] * 3, broadcast=0.3, link=0.2, loss=0.2)
 
 
-def runs(experiment=None, durations=(30.0, 60.0, 20.0), first_seed=1):
-    experiment = experiment or law()
-    return [
-        (f"bag_{seed}", simulate(experiment.with_run(seed=seed, duration=duration)))
-        for seed, duration in enumerate(durations, start=first_seed)
-    ]
+def several(what, durations, first_seed=1):
+    """Runs of one experiment, by name."""
+    laws = [what.with_run(seed=seed, duration=duration) for seed, duration in enumerate(durations, first_seed)]
+    return [(f"bag_{one.run.seed}", simulate(one)) for one in laws]
 
 
 @pytest.fixture(scope="module")
 def three():
-    return runs()
+    return several(law(), (30.0, 60.0, 20.0))
 
 
 def test_every_step_counts_the_same(three):
@@ -89,11 +87,11 @@ def test_document(three):
     assert document["verdict"] == "agrees"
 
 
-@pytest.mark.parametrize("experiment", [law(), AIR], ids=["quiet", "air"])
+@pytest.mark.parametrize("what", [law(), AIR], ids=["quiet", "air"])
 @pytest.mark.usefixtures("predicted_once")
-def test_calibration(experiment):
+def test_calibration(what):
     """p-values of 25 pools of two runs: Kolmogorov-Smirnov at 2e-4 for each of at most 21 tests."""
-    results = [compare_pooled(runs(experiment, (50.0, 70.0), first_seed=10 * i)) for i in range(25)]
+    results = [compare_pooled(several(what, (50.0, 70.0), first_seed=10 * i)) for i in range(25)]
     for place, test in enumerate(results[0].tests):
         assert kolmogorov_smirnov(test.name, [result.tests[place].p for result in results]) > 2e-4, test.name
     assert_few_alarms(results)
@@ -101,9 +99,8 @@ def test_calibration(experiment):
 
 def test_a_fault_that_one_run_does_not_show():
     """10 % more noise variance: seen in twelve runs together."""
-    found = []
-    for name, run in runs(law(np.sqrt(1.05) * np.array([1.0, 0.5, 2.0])), (60.0,) * 12):
-        found.append((name, claimed(run, law().with_run(seed=run.record.experiment.run.seed, duration=60.0))))
+    loud = several(law(np.sqrt(1.05) * np.array([1.0, 0.5, 2.0])), (60.0,) * 12)
+    found = [(name, claimed(run, law().with_run(seed=run.experiment.run.seed, duration=60.0))) for name, run in loud]
     assert compare(found[0][1]).verdict == "agrees"
     pooled = compare_pooled(found)
     assert pooled.verdict == "disagrees"
@@ -122,32 +119,27 @@ def test_paths_start_anew_in_every_run():
 def test_incomplete_runs_are_named(three):
     torn = [three[0], ("torn", cut(three[1][1], 250)), ("stump", cut(three[2][1], 20))]
     pooled = compare_pooled(torn)
-    assert pooled.verdict == "incomplete"
-    assert pooled.exit_code == 3
+    assert (pooled.verdict, pooled.exit_code, pooled.steps, pooled.causes) == ("incomplete", 3, 549, [])
     assert [(m.name, m.steps, m.completeness.complete) for m in pooled.pool.members] == [
         ("bag_1", 300, True),
         ("torn", 249, False),
         ("stump", 0, False),
     ]
-    assert pooled.steps == 549
-    assert pooled.causes == []
     stumps = compare_pooled([(f"stump {i}", cut(run, 20)) for i, (_, run) in enumerate(three)])
     assert (stumps.verdict, stumps.system_error.measured) == ("incomplete", None)
     json.dumps(stumps.to_json(), allow_nan=False)
 
 
 def test_what_is_not_one_experiment_is_refused(three):
-    (first, run), (_, other) = three[:2]
-    with pytest.raises(InputError, match="again: the same run as in bag_1"):
-        compare_pooled([(first, run), ("again", run)])
-    twin = simulate(run.record.experiment)
-    with pytest.raises(InputError, match=r"twin: run\.seed: 1 as in bag_1"):
-        compare_pooled([(first, run), ("twin", twin)])
-    wrong = law([1.0, 0.6, 2.0]).with_run(seed=9)
-    with pytest.raises(InputError, match=r"wrong: noise\.process: \[1\.0, 0\.6, 2\.0\], but \[1"):
-        compare_pooled([(first, run), ("wrong", simulate(wrong))])
-    fewer = simulate(other.record.experiment.with_run(replicas=1))
-    with pytest.raises(InputError, match=r"run\.replicas: 1, but 2"):
-        compare_pooled([(first, run), ("fewer", fewer)])
+    first, run = three[0]
+    others = [
+        (run, "other: the same run as in bag_1"),
+        (simulate(run.experiment), r"other: run\.seed: 1 as in bag_1"),
+        (simulate(law([1.0, 0.6, 2.0]).with_run(seed=9)), r"other: noise\.process: \[1\.0, 0\.6, 2\.0\], but \[1"),
+        (simulate(run.experiment.with_run(seed=2, replicas=1)), r"run\.replicas: 1, but 2"),
+    ]
+    for other, words in others:
+        with pytest.raises(InputError, match=words):
+            compare_pooled([(first, run), ("other", other)])
     with pytest.raises(InputError, match="no bag"):
         compare_pooled([])

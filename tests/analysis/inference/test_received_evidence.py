@@ -3,13 +3,14 @@
 from pathlib import Path
 from typing import Any
 
+import late_timers
 import numpy as np
 import pytest
+from late_timers import busy
 from mcap.reader import make_reader
 from tests.support.watched_run import messages_of, watch, watched, whole_sums
 
 from experiments import Experiment, five, predict, simulate, write_trajectory
-from msg_analysis.inference import online_evidence
 from msg_analysis.inference.online_errors import LiveEstimate
 from msg_analysis.inference.online_evidence import NetworkPath
 
@@ -63,16 +64,16 @@ def test_is_the_evidence_of_the_comparison(name: str) -> None:
     run = simulate(law(duration=20.0, **LAWS[name]))
     disorder = 0.0 if name == "plain" else 30.0  # there, the next graph counts, which comes with the next step
     live, wanted = watched(run, disorder=disorder), whole_sums(run, predict(run.record.experiment))
-    found = live.report()
+    found, families = live.report(), live.evidence.sums.families()
     assert (found.refused, live.evidence.count) == ({}, 400)
     for kind, logarithms in wanted.families().items():
-        assert live.evidence.sums.families()[kind] == pytest.approx(logarithms, rel=1e-8, abs=1e-8), kind
+        assert families[kind] == pytest.approx(logarithms, rel=1e-8, abs=1e-8), kind
     assert found.any_time.log_evidence == pytest.approx(wanted.evidence(), abs=1e-8)
 
 
-def test_late_agents(late_timers: Any) -> None:
+def test_late_agents() -> None:
     """Agents of a run in real time are far apart: values are used that are older, or newer, than the step."""
-    run = late_timers.run(law(**LAWS["real time"]), late=late_timers.busy(0.4, 2.5), slow=late_timers.busy(0.2, 3.0))
+    run = late_timers.run(law(**LAWS["real time"]), late=busy(0.4, 2.5), slow=busy(0.2, 3.0))
     assert (run.used > np.arange(800)[:, None, None]).any()
     live, wanted = watched(run), whole_sums(run, predict(run.record.experiment))
     assert live.report().any_time.log_evidence == pytest.approx(wanted.evidence(), abs=1e-8)
@@ -82,15 +83,14 @@ def test_late_agents(late_timers: Any) -> None:
 def test_steps_that_were_not_seen(name: str) -> None:
     """They are left out, and so are agents that used a value of theirs; the rest is exact."""
     run = simulate(law(duration=200.0, **LAWS[name]).with_run(replicas=4))
-    live = LiveEstimate(run.record)
-    rng, hidden = np.random.default_rng(3), set(range(500, 700))
-    hidden.update(np.flatnonzero(rng.random(4000) < 0.05).tolist())
+    hidden = {*range(500, 700), *np.flatnonzero(np.random.default_rng(3).random(4000) < 0.05).tolist()}
 
-    def add(*message: Any, **options: Any) -> None:
-        if message[1] not in hidden:
-            LiveEstimate.add(live, *message, **options)
+    class WithGaps(LiveEstimate):
+        def add(self, agent: int, step: int, *message: Any, **options: Any) -> None:
+            if step not in hidden:
+                super().add(agent, step, *message, **options)
 
-    object.__setattr__(live, "add", add)
+    live = WithGaps(run.record)
     watch(live, messages_of(run))
     sums = live.evidence.sums
     both = [k for k in range(4000) if k not in hidden and k + 1 not in hidden]
@@ -102,12 +102,11 @@ def test_steps_that_were_not_seen(name: str) -> None:
     assert live.report().any_time.log_evidence < np.log(100.0)
 
 
-def test_values_older_than_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_older_than_what_is_kept() -> None:
     """Which agents are left out depends on losses only, so that the evidence stays fair, and losses all count."""
-    monkeypatch.setattr(online_evidence, "LEAST_KEPT", 8)
-    monkeypatch.setattr(online_evidence, "MOST_KEPT", 8)
     run = simulate(law(duration=200.0, noise={"loss": 0.7, "on_loss": "hold"}))
-    live, wanted = watched(run), whole_sums(run, predict(run.record.experiment))
+    live, wanted = LiveEstimate(run.record, kept=8), whole_sums(run, predict(run.record.experiment))
+    watch(live, messages_of(run))
     sums = live.evidence.sums
     assert (sums.total.samples < wanted.total.samples).all()
     assert (sums.total.samples > 0.5 * wanted.total.samples).all()
@@ -120,10 +119,8 @@ def test_impossible_messages() -> None:
     """Steps with an entry of ``heard`` that cannot be are left out, and counted."""
     run = simulate(law(**LAWS["hold"]))
     run.used[100, 2, 0] = 300  # of a later step
-    live = LiveEstimate(run.record)
-    watch(live, messages_of(run))
-    report = live.report()
-    assert report.refused == {"impossible entry in heard": 1}
+    live = watched(run)
+    assert live.report().refused == {"impossible entry in heard": 1}
     assert 780 < live.evidence.count <= 798  # some wait for its value, which never comes
 
 
@@ -133,38 +130,28 @@ def test_a_run_that_ends_early(name: str) -> None:
     run = simulate(law(**LAWS[name]))
     live = LiveEstimate(run.record)
     live.end_at(500)
-    watch(live, messages_of(run))
-    assert live.evidence.count == 500
-    assert live.report().newest == 500
+    report = watch(live, messages_of(run))
+    assert (live.evidence.count, report.newest) == (500, 500)
 
 
 def test_the_path_of_the_network() -> None:
     """Against counts of the graph of every step, whatever is known when; one period is missing, one comes twice."""
     rng = np.random.default_rng(4)
-    lengths = rng.integers(1, 9, 300)
+    lengths, graphs = rng.integers(1, 9, 300), rng.integers(0, 3, 300)
     ends = np.cumsum(lengths)
-    graphs = rng.integers(0, 3, 300)
-    path, counts, last = NetworkPath(), np.zeros((3, 3), dtype=int), 0
-    missing = 100
+    path, counts, last, missing = NetworkPath(), np.zeros((3, 3), dtype=int), 0, 100
     for number, (end, length, graph) in enumerate(zip(ends.tolist(), lengths.tolist(), graphs.tolist(), strict=True)):
-        times = 0 if number == missing else 2
-        assert all(path.add(end - length, end - 1, graph) for _ in range(times))
-        if rng.random() < 0.3:
-            last = max(last, int(rng.integers(max(0, end - 40), end + 5)))
+        assert all(path.add(end - length, end - 1, graph) for _ in range(0 if number == missing else 2))
+        if rng.random() < 0.3 or end == ends[-1]:
+            last = end - 1 if end == ends[-1] else max(last, int(rng.integers(max(0, end - 40), end + 5)))
             before, after, times = path.passed(last)
             np.add.at(counts, (before, after), times)
-    before, after, times = path.passed(int(ends[-1]) - 1)
-    np.add.at(counts, (before, after), times)
-    every = np.repeat(graphs, lengths)
-    seen = np.ones(len(every), dtype=bool)
-    seen[ends[missing] - lengths[missing] : ends[missing]] = False
-    wanted = np.zeros((3, 3), dtype=int)
-    pairs = seen[:-1] & seen[1:]
-    np.add.at(wanted, (every[:-1][pairs], every[1:][pairs]), 1)
-    assert counts.tolist() == wanted.tolist()
+    every = np.repeat(graphs, lengths).astype(float)
+    every[ends[missing] - lengths[missing] : ends[missing]] = np.nan
+    wanted = [[int(((every[:-1] == a) & (every[1:] == b)).sum()) for b in range(3)] for a in range(3)]
+    assert counts.tolist() == wanted
 
 
 def test_a_contradiction_in_the_path() -> None:
     path = NetworkPath()
-    assert path.add(0, 3, 1)
-    assert not path.add(0, 4, 1)
+    assert [path.add(0, 3, 1), path.add(0, 4, 1)] == [True, False]

@@ -7,30 +7,34 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import Experiment, Observation, Run, line_ring, predict, simulate
+from experiments import Experiment, Run, line_ring, observed, predict, simulate
 from msg_analysis.arithmetic.update_law import to_payload
 from msg_analysis.inference.estimates import Estimate, estimates
-from msg_analysis.inference.online_errors import LiveEstimate, RunningErrors
+from msg_analysis.inference.online_errors import LiveEstimate, LiveReport, RunningErrors
 from msg_analysis.inference.online_steps import WINDOW, Lateness, RecentSteps, StepCollector
 from msg_analysis.inference.time_means import time_means
 from msg_analysis.model.step_model import phases
 
 
-def experiment(**changes: Any) -> Experiment:
+def four(agents: int = 4, **changes: Any) -> Run:
+    """A run of 300 steps."""
     chain = {"generator": [[-1.0, 1.0], [0.5, -0.5]]}
-    graphs = {"a": {"path": [1, 2, 3, 4]}, "b": {"cycle": [1, 2, 3, 4]}}
     run = {"dt": 0.1, "duration": 30, "seed": 5} | changes.pop("run", {})
-    return line_ring(**{"graphs": graphs, "switching": chain} | changes, run=run)
+    return simulate(line_ring(agents, **{"switching": chain} | changes, run=run))
 
 
 def messages(trajectory: Run) -> list[tuple[int, int, int, bytes]]:
     """(agent, step, mode from 1, payload) of every state, in the order of steps."""
     modes = [0, *(trajectory.modes + 1).tolist()]
-    return [
-        (i, k, modes[k], to_payload(trajectory.states[k, i]))
-        for k in range(len(trajectory.states))
-        for i in range(trajectory.states.shape[1])
-    ]
+    return [(i, k, modes[k], to_payload(x)) for k, states in enumerate(trajectory.states) for i, x in enumerate(states)]
+
+
+def report_of(trajectory: Run, **options: bool) -> LiveReport:
+    """What a watcher says that has heard everything."""
+    live = LiveEstimate(trajectory.record, **options)
+    for message in messages(trajectory):
+        live.add(*message)
+    return live.report()
 
 
 def errors_from_zero(experiment: Experiment, steps: int) -> list[float]:
@@ -50,14 +54,15 @@ def numbers(*found: Estimate) -> np.ndarray:
     return np.array(rows, dtype=float)
 
 
+SLOW = {"generator": [[-0.2, 0.2], [0.2, -0.2]], "initial": "ring"}
 CASES = {
     "stationary": {},
     "from zero": {"run": {"start": "zero"}},
     "from known values, first graph given": {
         "run": {"start": [3.0, -1.0, 0.0, 2.0]},
-        "switching": {"generator": [[-0.2, 0.2], [0.2, -0.2]], "initial": "b"},
+        "switching": SLOW,
     },
-    "first graph given": {"switching": {"generator": [[-0.2, 0.2], [0.2, -0.2]], "initial": "b"}},
+    "first graph given": {"switching": SLOW},
     "tracking": {"problem": "tracking", "leaders": {"agents": [2], "gain": 1.0, "reference": 3.0}},
     "grounded": {"problem": "tracking", "leaders": {"agents": [2], "gain": "inf", "reference": 3.0}},
     "loss and noise on the air": {"noise": {"loss": 0.1, "broadcast": 0.2, "link": 0.1}},
@@ -73,9 +78,9 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_the_same_numbers_as_a_comparison(case: str) -> None:
     """Also if it is asked often, and the states of neighbouring steps come in disorder."""
-    trajectory = simulate(experiment(**CASES[case]))
-    prediction = predict(trajectory.record.experiment)
-    system, nodes = estimates(time_means(Observation.of(trajectory, prediction)), prediction.system)
+    trajectory = four(**CASES[case])
+    observation = observed(trajectory)
+    system, nodes = estimates(time_means(observation), observation.prediction.system)
     live, rng = LiveEstimate(trajectory.record, evidence=False), random.Random(1)
     order = sorted(messages(trajectory), key=lambda message: message[1] + 20 * rng.random())
     for number, message in enumerate(order):
@@ -84,15 +89,14 @@ def test_the_same_numbers_as_a_comparison(case: str) -> None:
             live.report()
     report = live.report()
     assert (report.first, report.last, report.steps, report.missing) == (0, 299, 300, 0)
-    assert report.refused == {}
-    assert report.note is None
+    assert (report.refused, report.note) == ({}, None)
     np.testing.assert_allclose(numbers(report.system, *report.nodes), numbers(system, *nodes), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("start", ["stationary", "zero"])
 def test_who_comes_late_expects_what_is_left(start: str) -> None:
     """Nothing before step 20, and nothing of some steps: measured and expected are means over the same steps."""
-    trajectory = simulate(experiment(run={"start": start}))
+    trajectory = four(run={"start": start})
     live = LiveEstimate(trajectory.record)
     for message in messages(trajectory):
         if message[1] >= 20 and not (message[0] == 2 and message[1] in (77, 78, 90)):
@@ -114,13 +118,10 @@ def test_who_comes_late_expects_what_is_left(start: str) -> None:
 @pytest.mark.parametrize("steps", [slice(100, 101), slice(100, None)], ids=["one step", "from a step on"])
 def test_numbers_too_large_to_compute_with(steps: slice) -> None:
     """The square of 1e200 is no number: what is shown is huge, and still a number, the standard errors too."""
-    trajectory = simulate(experiment())
+    trajectory = four()
     trajectory.states[steps, 1] = 1e200
-    live = LiveEstimate(trajectory.record)
     with np.errstate(all="raise"):
-        for message in messages(trajectory):
-            live.add(*message)
-        report = live.report()
+        report = report_of(trajectory)
     assert np.isfinite(numbers(report.system)[:, :5]).all()
     assert np.isfinite(numbers(*report.nodes)).all()
     assert min(estimate.measured or 0.0 for estimate in (report.system, *report.nodes)) > 1e100
@@ -128,13 +129,10 @@ def test_numbers_too_large_to_compute_with(steps: slice) -> None:
 
 def test_many_agents() -> None:
     """Looked at in one step of two: standard errors of the nodes a little off, all else to the last digits."""
-    numbers_of_agents = list(range(1, 26))
-    graphs = {"a": {"path": numbers_of_agents}, "b": {"cycle": numbers_of_agents}}
-    trajectory = simulate(experiment(graphs=graphs, run={"replicas": 1}))
-    prediction = predict(trajectory.record.experiment)
-    means = time_means(Observation.of(trajectory, prediction))
-    system, nodes = estimates(means, prediction.system)
-    errors = RunningErrors(trajectory.record, prediction)
+    trajectory = four(25, run={"replicas": 1})
+    observation = observed(trajectory)
+    system, nodes = estimates(time_means(observation), observation.prediction.system)
+    errors = RunningErrors(trajectory.record, observation.prediction)
     errors.add(np.arange(300), trajectory.modes, trajectory.states[:-1], trajectory.states[1:])
     ours, our_nodes = errors.estimates()
     np.testing.assert_allclose(numbers(ours), numbers(system), rtol=1e-9)
@@ -143,12 +141,9 @@ def test_many_agents() -> None:
 
 
 def test_too_many_agents_for_standard_errors_of_each() -> None:
-    trajectory = simulate(experiment())
+    trajectory = four()
     assert not RunningErrors(trajectory.record, predict(trajectory.record.experiment), most_bytes=100).nodes_tested
-    live = LiveEstimate(trajectory.record, nodes=False)
-    for message in messages(trajectory):
-        live.add(*message)
-    report = live.report()
+    report = report_of(trajectory, nodes=False)
     assert report.note == "too many agents for intervals of the agent errors"
     assert report.system.z is not None
     assert [node.standard_error for node in report.nodes] == [None] * 4
@@ -159,7 +154,7 @@ def test_gaps_leave_the_standard_error_on_the_safe_side() -> None:
     """Half of the steps at random: the standard deviation of z is 0.7, here with an error of 0.06."""
     z, prediction = [], None
     for seed in range(60):
-        trajectory = simulate(experiment(run={"seed": seed, "duration": 20, "replicas": 1}))
+        trajectory = four(run={"seed": seed, "duration": 20, "replicas": 1})
         prediction = prediction or predict(trajectory.record.experiment)
         errors = RunningErrors(trajectory.record, prediction)
         steps = np.flatnonzero(np.random.default_rng(seed).random(200) < 0.5)
@@ -169,16 +164,11 @@ def test_gaps_leave_the_standard_error_on_the_safe_side() -> None:
 
 
 def test_in_real_time_nothing_is_claimed() -> None:
-    trajectory = simulate(experiment(run={"pace": "realtime", "speed": 1.0}))
-    live = LiveEstimate(trajectory.record, evidence=False)
-    for message in messages(trajectory):
-        live.add(*message)
-    report = live.report()
+    trajectory = four(run={"pace": "realtime"})
+    report = report_of(trajectory, evidence=False)
     assert (report.first, report.last, report.steps) == (0, 300, 301)
-    assert report.system.standard_error is None
-    assert report.system.z is None
-    assert report.note is not None
-    assert "real time" in report.note
+    assert report.system.standard_error is report.system.z is None
+    assert "real time" in str(report.note)
     deviations = trajectory.states - trajectory.states.mean(axis=1, keepdims=True)
     assert report.system.measured == pytest.approx((deviations**2).mean(axis=2).sum(axis=1).mean())
     assert report.system.predicted == pytest.approx(predict(trajectory.record.experiment).emulated.system_error)
@@ -193,11 +183,6 @@ def collect(*states: tuple[int, int, int, float]) -> tuple[StepCollector, list[i
     assert here.shape == after.shape == (len(steps), 2, 1 if len(steps) else 0)
     assert len(modes) == len(steps)
     return collector, steps.tolist()
-
-
-def test_a_step_is_ready_with_the_next_one() -> None:
-    assert collect((0, 0, 0, 1.0), (1, 0, 0, 2.0))[1] == []
-    assert collect((0, 0, 0, 1.0), (1, 0, 0, 2.0), (1, 1, 2, 3.0), (0, 1, 2, 3.0))[1] == [0]
 
 
 @pytest.mark.parametrize(
@@ -221,6 +206,7 @@ def test_what_cannot_be_trusted_does_not_count(wrong: tuple[int, int, int, float
 
 
 def test_repetitions_and_who_comes_in_the_middle() -> None:
+    """A step is ready with the next one."""
     good = [(i, k, min(k, 1), 3.0) for k in range(3) for i in (0, 1)]
     collector, steps = collect(*good, good[-1], (0, 1001, 1, 0.0), good[0])
     assert steps == [0, 1]
@@ -250,12 +236,9 @@ def test_waiting_is_bounded() -> None:
 def test_what_was_lost_and_sent_again_counts() -> None:
     """The middleware repairs what was lost on the way, and meanwhile hands on what others send."""
     collector = StepCollector(2, 2, 10**6, lockstep=True)
-    for step in range(5000):
-        collector.add(0, step, 1, bytes(8))
-    for step in range(5000):
-        collector.add(1, step, 1, bytes(8))
-    assert collector.take()[0].tolist() == list(range(4999))
-    assert not collector.refused["too late"]
+    for agent, step in np.ndindex(2, 5000):
+        collector.add(agent, step, 1, bytes(8))
+    assert (collector.take()[0].tolist(), collector.refused["too late"]) == (list(range(4999)), 0)
 
 
 def test_the_newest_steps_are_kept_in_order() -> None:
@@ -277,17 +260,10 @@ def test_the_newest_steps_are_kept_in_order() -> None:
 
 def test_lateness_is_that_of_the_newest_steps_in_wall_time() -> None:
     """Agent i makes x(k) at (k - 1 + phi_i) dt of simulated time, of which there are four units in a second."""
-    experiment = Experiment.parse(
-        {
-            "name": "late",
-            "graphs": {"line": {"path": [1, 2, 3]}},
-            "run": {"dt": 0.1, "duration": 100, "seed": 2, "pace": "realtime", "speed": 4},
-        }
-    )
+    experiment = line_ring(run={"dt": 0.1, "duration": 100, "pace": "realtime", "speed": 4})
     late, phi = Lateness(experiment), phases(experiment)
-    assert late.medians() == [None, None, None]
     late.add(0, 0, 0)  # x(0) has no time
-    assert late.medians()[0] is None
+    assert late.medians() == [None] * 3
     for step in range(1, 1001):
         for agent, delay in ((0, 0.008), (1, 0.02 if step % 2 else 0.04), (2, 1.0 if step <= 1000 - WINDOW else 0.012)):
             late.add(agent, step, round(((step - 1 + phi[agent]) * 0.1 + delay) * 1e9))

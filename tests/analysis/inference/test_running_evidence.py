@@ -6,38 +6,48 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import Experiment, Observation, RunRecord, compare, five, predict, simulate
-from msg_analysis.inference import online_errors
+from experiments import Experiment, Observation, Run, compare, five, new_record, observed, predict, simulate
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.evidence_sums import EvidenceSums
-from msg_analysis.inference.online_errors import LiveEstimate, LiveReport, precision_words, reached
+from msg_analysis.inference.online_errors import (
+    LiveEstimate,
+    LiveReport,
+    RunningErrors,
+    RunningInterval,
+    precision_words,
+    reached,
+)
 from msg_analysis.inference.online_evidence import AnyTime, ReceivedEvidence, RunningEvidence, supports
 from msg_analysis.inference.statistics import RunningBatches, simultaneous_half_width, steps_to_half_width
+from msg_analysis.inference.system_error import ErrorMartingale
 from msg_analysis.model.run_record import Until
 
 
-def experiment(seed: int = 1, duration: float = 100.0, **changes: Any) -> Experiment:
-    return five(seed, duration, run={"replicas": 2} | changes.pop("run", {}), **changes)
+def two_replicas(**changes: Any) -> Experiment:
+    return five(run={"replicas": 2} | changes.pop("run", {}), **changes)
+
+
+def ending(law: Experiment, precision: float) -> Run:
+    """A run of the twin that was to end at this precision."""
+    run = simulate(law)
+    return replace(run, record=replace(run.record, until=Until(precision)))
 
 
 @pytest.mark.parametrize("pieces", [1, 7, 300])
 @pytest.mark.parametrize("missing", [False, True])
 def test_is_the_sum_over_the_whole_run(pieces: int, missing: bool) -> None:
-    law = experiment()
-    run, prediction = simulate(law), predict(law)
+    run, prediction = simulate(two_replicas()), predict(two_replicas())
     seen = RunningEvidence(prediction, 2)
     gaps = [0, 700, 701, 1500] if missing else [0]  # steps that were not seen
     for steps in np.array_split(np.delete(np.arange(1, 2000), gaps), pieces):
         steps = steps[::-1]  # in any order within a piece
         seen.add(steps, run.modes[steps], run.states[steps], run.states[steps + 1])
-    observation, expected = Observation.of(run, prediction), EvidenceSums(prediction, 2)
+    expected = EvidenceSums(prediction, 2)
     # The arrays without the places 0, 700, 701 and 1500 of the steps from 1 on.
     stretches = [(2, 701), (703, 1501), (1502, 2000)] if missing else [(2, 2000)]
     # The graph after a step is needed, but not after the last step of the run.
     for first, end in stretches:
-        part = Observation(
-            prediction, observation.states[first : end + 1], observation.modes[first:end], observation.states[first]
-        )
+        part = Observation(prediction, run.states[first : end + 1], run.modes[first:end], run.states[first])
         expected.add(part, 0, end - first - (end < 2000))
     assert seen.sums.total.counts.tolist() == expected.total.counts.tolist()
     assert seen.report(None).log_evidence == pytest.approx(expected.evidence(), abs=1e-9)
@@ -45,69 +55,54 @@ def test_is_the_sum_over_the_whole_run(pieces: int, missing: bool) -> None:
 
 def test_what_the_states_alone_do_not_give() -> None:
     for changes in ({"noise": {"loss": 0.1}}, {"noise": {"delay": 1}}, {"run": {"pace": "realtime"}}):
-        prediction = predict(experiment(**changes))
+        prediction = predict(two_replicas(**changes))
         assert supports(prediction)
+        assert not supports(prediction, most_bytes=100)
         with pytest.raises(ValueError, match="do not give the evidence"):
             RunningEvidence(prediction, 2)
     with pytest.raises(ValueError, match="the states alone give the evidence"):
-        ReceivedEvidence(predict(experiment()), 2)
+        ReceivedEvidence(predict(two_replicas()), 2)
 
 
 @pytest.mark.parametrize("changes", [{}, {"noise": {"loss": 0.1}}], ids=["plain", "loss"])
-def test_too_many_agents(changes: dict[str, Any]) -> None:
-    """They have their errors, and no evidence."""
-    law = experiment(duration=10, **changes)
-    assert not supports(predict(law), most_bytes=100)
-    live = LiveEstimate(record_of(law, None)[0], evidence=False)
-    assert live.evidence is None
-    assert live.log is None
-    assert live.report().any_time.log_evidence is None
+def test_errors_without_evidence(changes: dict[str, Any]) -> None:
+    live = LiveEstimate(new_record(two_replicas(**changes)), evidence=False)
+    assert (live.evidence, live.log, live.report().any_time.log_evidence) == (None, None, None)
 
 
 def test_the_last_step_of_a_run_that_ends_early() -> None:
     """As in the comparison of the shorter run."""
-    run, prediction = simulate(experiment()), predict(experiment())
+    run, prediction = simulate(two_replicas()), predict(two_replicas())
     seen, expected = RunningEvidence(prediction, 2), EvidenceSums(prediction, 2)
     for steps in np.array_split(np.arange(1500), 7):
         seen.add(steps, run.modes[steps], run.states[steps], run.states[steps + 1])
     seen.end_at(1500)
-    observation = Observation.of(run, prediction)
-    expected.add(Observation(prediction, observation.states[:1501], run.modes[:1500], run.states[0]), 0, 1500)
-    assert seen.count == 1500
-    assert seen.report(None).log_evidence == pytest.approx(expected.evidence(), abs=1e-9)
     later = np.arange(1500, 1600)
     seen.add(later, run.modes[later], run.states[later], run.states[later + 1])
-    assert seen.count == 1500
-
-
-def record_of(law: Experiment, until: Until | None) -> tuple[RunRecord, Any]:
-    run = simulate(law)
-    return RunRecord(run.record.run, law, run.record.start, until=until), run
+    expected.add(Observation(prediction, run.states[:1501], run.modes[:1500], run.states[0]), 0, 1500)
+    assert (seen.count, seen.report(None).log_evidence) == (1500, pytest.approx(expected.evidence(), abs=1e-9))
 
 
 def test_the_interval_is_that_of_the_comparison() -> None:
-    record, run = record_of(experiment(duration=400), Until(0.1))
-    live = LiveEstimate(record)
-    steps = np.arange(8000)
-    live.add_whole(steps, run.modes, run.states[:-1], run.states[1:])
-    half = live.report().any_time.half_width
-    object.__setattr__(run, "record", record)
-    assert half == pytest.approx(compare(run).any_time.half_width, rel=1e-9)
+    run = ending(two_replicas(duration=400), 0.1)
+    live = LiveEstimate(run.record)
+    live.add_whole(np.arange(8000), run.modes, run.states[:-1], run.states[1:])
+    assert live.report().any_time.half_width == pytest.approx(compare(run).any_time.half_width, rel=1e-9)
 
 
-def test_intervals_hold_at_all_times(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_intervals_hold_at_all_times() -> None:
     """Of 40 runs, looked at every 50 steps, at most 5 ever miss: more do with probability 0.014 at a level of 5 %."""
-    law = predict(experiment())
-    monkeypatch.setattr(online_errors, "predict", lambda experiment, _: replace(law, experiment=experiment))
-    missed = 0
+    prediction, missed = predict(two_replicas()), 0
+    variance = ErrorMartingale(prediction, 2).variance
     for seed in range(40):
-        record, run = record_of(experiment(seed=seed), Until(0.2))
-        live = LiveEstimate(record, nodes=False)
+        run = ending(two_replicas(seed=seed), 0.2)
+        errors = RunningErrors(run.record, prediction, nodes=False)
+        interval = RunningInterval(run.record, prediction, variance)
         for steps in np.array_split(np.arange(2000), 40):
-            live.add_whole(steps, run.modes[steps], run.states[steps], run.states[steps + 1])
-            report = live.report()
-            half = report.any_time.half_width
-            if half is not None and abs(report.system.measured - report.system.predicted) > half:
+            interval.add(errors.add(steps, run.modes[steps], run.states[steps], run.states[steps + 1]))
+            system, _ = errors.estimates()
+            half = interval.half_width(system, errors.count)
+            if half is not None and abs(system.measured - system.predicted) > half:
                 missed += 1
                 break
     assert missed <= 5
@@ -163,8 +158,7 @@ def test_when_a_run_may_end() -> None:
 )
 def test_quadratic_forms_are_the_sums_by_what_was_heard(changes: dict[str, Any]) -> None:
     """The sums of runs in which all agents hear the states themselves, in both ways."""
-    law = experiment(duration=100.0, **changes)
-    observation = Observation.of(simulate(law), predict(law))
+    observation = observed(two_replicas(**changes))
     fast, slow = (EvidenceSums(observation.prediction, observation.replicas) for _ in range(2))
     assert fast._quadratic
     slow._quadratic = False

@@ -11,22 +11,6 @@ from msg_analysis.inference.estimates import rank_estimates
 from msg_analysis.inference.statistics import batch_interval, direction_p, holm, pseudo_inverse, quadratic_form
 from msg_analysis.inference.timing import extent, quantiles
 
-Z = np.array([-40.0, -9.0, -1.5, 0.0, 0.3, 2.0, 7.0, 38.0])
-X = np.array([0.0, 1e-3, 0.7, 3.0, 40.0, 900.0])
-TAILS = np.array([1e-12, 1e-3, 0.05, 0.5, 0.999])
-
-
-def test_normal() -> None:
-    np.testing.assert_allclose(ours.log_normal_tail(Z), stats.norm.logsf(Z), rtol=1e-12)
-    np.testing.assert_allclose(ours.two_sided(Z), 2.0 * stats.norm.sf(np.abs(Z)), rtol=1e-12)
-
-
-@pytest.mark.parametrize("dof", [1, 2, 7, 300])
-def test_chi_square(dof: int) -> None:
-    np.testing.assert_allclose(ours.chi2_tail(X, dof), stats.chi2.sf(X, dof), rtol=1e-10)
-    np.testing.assert_allclose(ours.chi2_below(X, dof), stats.chi2.cdf(X, dof), rtol=1e-10)
-    np.testing.assert_allclose(ours.chi2_quantile(TAILS, dof), stats.chi2.isf(TAILS, dof), rtol=1e-10)
-
 
 @pytest.mark.parametrize(("count", "total"), [(0, 9), (9, 9), (1, 4), (250, 1000)])
 def test_interval_of_a_probability(count: int, total: int) -> None:
@@ -45,12 +29,8 @@ def test_interval_of_batch_means() -> None:
 def test_holm() -> None:
     """By hand: 0.01 x 4, 0.02 x 3, 0.03 x 2, 0.04 x 1, each at least the one before; never above 1."""
     np.testing.assert_allclose(holm(np.array([0.04, 0.01, 0.03, 0.02])), [0.06, 0.04, 0.06, 0.06])
-    p = np.array([0.0, 0.5, 0.9, 0.3])
-    adjusted = holm(p)
-    np.testing.assert_allclose(adjusted, [0.0, 1.0, 1.0, 0.9])
-    assert (adjusted >= p).all()
-    assert holm(np.array([])).shape == (0,)
-    assert holm(np.array([0.2])).tolist() == [0.2]
+    np.testing.assert_allclose(holm(np.array([0.0, 0.5, 0.9, 0.3])), [0.0, 1.0, 1.0, 0.9])
+    assert (holm(np.array([])).tolist(), holm(np.array([0.2])).tolist()) == ([], [0.2])
 
 
 RANDOM = np.random.default_rng(1)
@@ -65,7 +45,7 @@ def test_quadratic_form_ignores_dependent_and_dead_entries() -> None:
     chi2, dof = quadratic_form(MIX @ V, MIXED)
     assert dof == 3
     assert chi2 == pytest.approx(V @ scipy.linalg.solve(COVARIANCE, V), rel=1e-8)
-    assert (MIX @ V) @ pseudo_inverse(MIXED) @ (MIX @ V) == pytest.approx(quadratic_form(MIX @ V, MIXED)[0], rel=1e-8)
+    assert (MIX @ V) @ pseudo_inverse(MIXED) @ (MIX @ V) == pytest.approx(chi2, rel=1e-8)
 
 
 def test_p_value_of_a_direction() -> None:
@@ -74,10 +54,8 @@ def test_p_value_of_a_direction() -> None:
     seen = MIX.T @ direction
     deviation = np.sqrt(seen @ COVARIANCE @ seen)
     assert direction_p(direction, MIX @ V, MIXED) == pytest.approx(2 * stats.norm.sf(abs(seen @ V) / deviation))
-    dependent = np.array([5.0, 5e-6, 0.0, -1.0, 0.0])
-    assert direction_p(dependent, MIX @ V, MIXED) is None
-    dead = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
-    assert direction_p(dead, MIX @ V, MIXED) is None
+    for without in ([5.0, 5e-6, 0.0, -1.0, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0]):  # dependent, and dead
+        assert direction_p(np.array(without), MIX @ V, MIXED) is None
     rounding = np.diag([40.0, 1e-29, 1e-30])
     assert direction_p(np.array([0.0, 1.0, 1.0]), np.array([1.0, 1e-12, 0.0]), rounding) is None
 

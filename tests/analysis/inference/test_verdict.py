@@ -39,19 +39,15 @@ def unpredicted() -> Run:
 def test_without_a_prediction(unpredicted: Run) -> None:
     """Errors after the transient, whose end they say, and tests of graphs only."""
     found, steps = compare(unpredicted), len(unpredicted.modes)
-    assert (found.verdict, found.steps) == ("unpredicted", steps)
-    assert found.unpredicted
-    first = found.transient
-    assert first is not None
-    values = unpredicted.values[first:steps]
+    assert (found.verdict, found.steps, bool(found.unpredicted)) == ("unpredicted", steps, True)
+    values = unpredicted.values[found.transient : steps]
     values = values - values.mean(axis=1, keepdims=True)
     squares = (values**2).mean(axis=2)
     assert [node.measured for node in found.node_errors] == pytest.approx(squares.mean(axis=0))
     assert found.system_error.measured == pytest.approx(squares.sum(axis=1).mean())
-    assert found.running["time"][-1] == pytest.approx(steps * found.trajectory.record.experiment.step_length)
-    assert found.running["system_error"][-1] == pytest.approx(found.system_error.measured)
-    assert not found.running["standard_error"].any()
-    assert found.batch is not None
+    last = [found.running[key][-1] for key in ("time", "system_error")]
+    assert last == pytest.approx([steps * unpredicted.experiment.step_length, found.system_error.measured])
+    assert (found.running["standard_error"].any(), found.batch is None) == (False, False)
     assert [test.name for test in found.tests] == ["switching"]
 
 

@@ -9,24 +9,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import document
+from experiments import line_ring
 from msg_analysis import Experiment, Run
 from msg_analysis.common.text import json_text
 from msg_analysis.report.differences import bag_difference, experiment_difference, graph_difference, measured, relative
 from msg_analysis.report.differences import state_difference as of_states
 from msg_analysis.report.documents import describe_transient
 
-DOCUMENT = document(4, name="four", run={"dt": 0.1, "replicas": 3, "seed": 7, "start": "zero"})
+TWIN = line_ring(4, run={"dt": 0.1, "replicas": 3, "seed": 7, "start": "zero"}).simulate()
 
 
-@pytest.fixture(scope="module")
-def run() -> Run:
-    return Experiment.parse(DOCUMENT).simulate()
-
-
-def changed(run: Run, **changes: Any) -> Run:
-    copies = {"states": run.states.copy(), "modes": run.modes.copy()}
-    return dataclasses.replace(run, **(copies | changes))
+def changed(**changes: Any) -> Run:
+    copies = {"states": TWIN.states.copy(), "modes": TWIN.modes.copy()}
+    return dataclasses.replace(TWIN, **(copies | changes))
 
 
 BLOCKS = pytest.mark.parametrize("block", [10**6, 60, 1])
@@ -34,14 +29,13 @@ BLOCKS = pytest.mark.parametrize("block", [10**6, 60, 1])
 
 
 @BLOCKS
-def test_states_that_differ(run: Run, block: int) -> None:
-    other = changed(run)
-    other.states[50, 2, 1] = np.nextafter(run.states[50, 2, 1], np.inf)
+def test_states_that_differ(block: int) -> None:
+    other = changed()
+    other.states[50, 2, 1] = np.nextafter(other.states[50, 2, 1], np.inf)
     other.states[50, 3, 0] += 0.25
     other.states[120, 0, 2] -= 8.0
     other.states[200, 1, 1] += 0.5
-    found = of_states(run, other, block_numbers=block)
-    assert found == {
+    assert of_states(TWIN, other, block_numbers=block) == {
         "compared": 200,
         "why": None,
         "equal": False,
@@ -56,42 +50,41 @@ def test_states_that_differ(run: Run, block: int) -> None:
 
 
 @BLOCKS
-def test_equal_missing_and_shorter(run: Run, block: int) -> None:
-    same = of_states(run, changed(run), block_numbers=block)
-    assert (same["equal"], same["first"], same["last"]) == (True, None, {"step": 200, "difference": 0.0})
-    other = changed(run)
-    other.states[3, 1] = np.nan
-    other.states[200, 0] = np.nan
-    found = of_states(run, other, block_numbers=block)
-    assert (found["equal"], found["first"], found["only_a"], found["only_b"]) == (False, None, 2, 0)
-    assert found["last"] == {"step": 199, "difference": 0.0}
-    assert of_states(other, run, block_numbers=block)["only_b"] == 2
-    assert of_states(other, changed(other), block_numbers=block)["equal"]
-    short = of_states(run, changed(run, states=run.states[:100]), block_numbers=block)
-    assert (short["equal"], short["first"], short["compared"]) == (False, None, 99)
+def test_equal_missing_and_shorter(block: int) -> None:
+    other, short = changed(), changed(states=TWIN.states[:100])
+    other.states[[3, 200], [1, 0]] = np.nan
+    some, last = {"equal": False, "first": None}, {"step": 199, "difference": 0.0}
+    for one, two, found in (
+        (TWIN, changed(), {"equal": True, "first": None, "last": {"step": 200, "difference": 0.0}}),
+        (TWIN, other, some | {"only_a": 2, "only_b": 0, "last": last}),
+        (other, TWIN, some | {"only_a": 0, "only_b": 2, "last": last}),
+        (other, changed(states=other.states.copy()), {"equal": True}),
+        (TWIN, short, some | {"compared": 99}),
+    ):
+        difference = of_states(one, two, block_numbers=block)
+        assert difference | found == difference
 
 
-def test_the_sign_of_zero_is_a_bit_and_other_networks_are_not_compared(run: Run) -> None:
-    other = changed(run)
+def test_the_sign_of_zero_is_a_bit_and_other_networks_are_not_compared() -> None:
+    other = changed()
     other.states[0] = -0.0
-    found = of_states(changed(run), other)
+    found = of_states(TWIN, other)
     assert found["first"] == {"step": 0, "time": 0.0, "agents": [1, 2, 3, 4], "difference": 0.0}
-    found = of_states(run, changed(run, states=run.states[:, :3]))
-    assert (found["compared"], found["equal"]) == (None, None)
-    assert found["why"] == "4 agents with 3 numbers each and 3 agents with 3 numbers each"
+    found = of_states(TWIN, changed(states=TWIN.states[:, :3]))
+    why = "4 agents with 3 numbers each and 3 agents with 3 numbers each"
+    assert (found["compared"], found["equal"], found["why"]) == (None, None, why)
 
 
-def test_graphs(run: Run) -> None:
-    other = changed(run)
-    assert graph_difference(run, other) is None
+def test_graphs() -> None:
+    other, names, used = changed(), ["line", "ring"], TWIN.modes[40]
+    assert graph_difference(TWIN, other) is None
     other.modes[:10] = -1  # not known
-    other.modes[40:42] = 1 - run.modes[40:42]
-    names = ["line", "ring"]
-    used = run.modes[40]
-    assert graph_difference(run, other) == {"step": 40, "a": names[used], "b": names[1 - used], "steps": 2}
-    swapped = dict(DOCUMENT, graphs=dict(reversed(DOCUMENT["graphs"].items())))  # the same graphs, other numbers
-    record = dataclasses.replace(run.record, experiment=Experiment.parse(swapped))
-    assert graph_difference(run, changed(run, record=record, modes=1 - run.modes)) is None
+    other.modes[40:42] = 1 - TWIN.modes[40:42]
+    assert graph_difference(TWIN, other) == {"step": 40, "a": names[used], "b": names[1 - used], "steps": 2}
+    document = TWIN.experiment.to_document()
+    swapped = document | {"graphs": dict(reversed(document["graphs"].items()))}  # the same graphs, other numbers
+    record = dataclasses.replace(TWIN.record, experiment=Experiment.parse(swapped))
+    assert graph_difference(TWIN, changed(record=record, modes=1 - TWIN.modes)) is None
 
 
 def test_numbers_side_by_side() -> None:
@@ -100,36 +93,28 @@ def test_numbers_side_by_side() -> None:
     assert (found["difference"], found["standard_error"], found["z"]) == (2.0, pytest.approx(0.5), pytest.approx(4.0))
     assert measured(one, {"measured": 3.0, "standard_error": None})["z"] is None
     assert measured(None, other)["difference"] is None
-    assert relative(4.0, 3.0)["relative"] == -0.25
-    assert relative(-4.0, -3.0)["relative"] == 0.25
-    assert relative(0.0, 3.0)["relative"] is None
-    assert relative(None, 3.0)["relative"] is None
+    pairs = ((4.0, 3.0), (-4.0, -3.0), (0.0, 3.0), (None, 3.0))
+    assert [relative(*pair)["relative"] for pair in pairs] == [-0.25, 0.25, None, None]
 
 
-def test_two_bags(run: Run, tmp_path: Path) -> None:
+def test_two_bags(tmp_path: Path) -> None:
     """Keys, versions, verdicts and errors; the errors are those of the comparisons, saved or not."""
-    other = Experiment.parse(DOCUMENT | {"run": DOCUMENT["run"] | {"seed": 8, "duration": 40}}).simulate()
+    other = TWIN.experiment.with_run(seed=8, duration=40).simulate()
     other.record.versions["numpy"] = "1.0"
-    paths = [run.save(tmp_path / "a"), other.save(tmp_path / "b")]
+    paths = [TWIN.save(tmp_path / "a"), other.save(tmp_path / "b")]
     found = bag_difference(*paths)
     assert found["keys"] == [{"key": "run.duration", "a": 20.0, "b": 40.0}, {"key": "run.seed", "a": 7, "b": 8}]
-    assert found["versions"] == [{"key": "numpy", "a": run.record.versions["numpy"], "b": "1.0"}]
-    assert found["states"]["compared"] == 200
-    assert found["states"]["first"]["step"] == 1  # both start at zero
-    comparisons = [each.compare() for each in (run, other)]
+    assert found["versions"] == [{"key": "numpy", "a": TWIN.record.versions["numpy"], "b": "1.0"}]
+    assert (found["states"]["compared"], found["states"]["first"]["step"]) == (200, 1)  # both start at zero
+    comparisons = [each.compare() for each in (TWIN, other)]
     assert [found[side]["verdict"] for side in "ab"] == [each.verdict for each in comparisons]
     assert [found[side]["complete"] for side in "ab"] == [True, True]
-    totals = [each.given.to_json()["system_error"] if each.given else {} for each in comparisons]
-    totals = [
-        each.system_error.to_json() if each.system_error.standard_error else total
-        for each, total in zip(comparisons, totals, strict=True)
-    ]
+    totals = [one.system_error if one.system_error.standard_error else one.given.system_error for one in comparisons]
     error = found["errors"]["system"]
-    assert error["difference"] == pytest.approx(totals[1]["measured"] - totals[0]["measured"])
-    deviation = math.sqrt(totals[0]["standard_error"] ** 2 + totals[1]["standard_error"] ** 2)
+    assert error["difference"] == pytest.approx(totals[1].measured - totals[0].measured)
+    deviation = math.hypot(*(total.standard_error for total in totals))
     assert error["z"] == pytest.approx(error["difference"] / deviation)
-    assert len(found["errors"]["agents"]) == 4
-    assert found["errors"]["independent"]
+    assert (len(found["errors"]["agents"]), found["errors"]["independent"]) == (4, True)
 
     document = comparisons[0].to_json()
     (paths[0] / "result.json").write_text(json_text(document | {"verdict": "disagrees"}))
@@ -143,7 +128,7 @@ def test_two_bags(run: Run, tmp_path: Path) -> None:
 
 def four(rate: float = 1.0, **changes: Any) -> Experiment:
     graphs = {"line": {"path": [1, 2, 3, 4]}, "star": {"star": {"center": 2}}}
-    return Experiment.parse(document(4, rate, **{"graphs": graphs, "run": {"dt": 0.1}} | changes))
+    return line_ring(4, rate, **{"graphs": graphs, "run": {"dt": 0.1}} | changes)
 
 
 def test_predictions_rates_and_leaders() -> None:
@@ -172,10 +157,9 @@ def test_one_with_leaders_and_one_without() -> None:
     """The best set of the other is as large, and has the same gain."""
     led = four(problem="tracking", leaders={"agents": [1, 4], "gain": 2.0})
     found = experiment_difference(four(), led)["leaders"]
-    assert found["b"]["agents"] == [1, 4]
-    assert found["b"]["system_error"] == led.leaders().present[0]  # type: ignore[index]
-    assert [len(found[side]["best"]["agents"]) for side in "ab"] == [2, 2]
-    assert [found[side]["best"]["gain"] for side in "ab"] == [2.0, 2.0]
+    assert (found["b"]["agents"], found["b"]["system_error"]) == ([1, 4], led.leaders().present[0])  # type: ignore[index]
+    bests = [found[side]["best"] for side in "ab"]
+    assert [(len(best["agents"]), best["gain"]) for best in bests] == [(2, 2.0), (2, 2.0)]
 
 
 def test_other_sizes_and_laws() -> None:

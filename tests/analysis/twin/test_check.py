@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 
 from experiments import Run, check, flipped, line_ring, simulate, stored
-from msg_analysis.common import arrays
-from msg_analysis.common.arrays import in_file
 from msg_analysis.twin.check import Check
 
 
@@ -26,22 +24,6 @@ def noisy() -> Run:
 def checked(run: Run, directory: Path, **changes: object) -> Check:
     """Of a bag of the run with these changes."""
     return check(stored(dataclasses.replace(run, **changes), directory))
-
-
-def test_a_long_run(tmp_path: Path, twin: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Logged and computed states are in files and compared in pieces, here of ten steps."""
-    monkeypatch.setattr(arrays, "LARGE", 1)
-    monkeypatch.setattr(arrays, "BLOCK_NUMBERS", 60)
-    again = simulate(twin.record.experiment, record=twin.record)
-    assert in_file(again.states)
-    assert np.array_equal(again.states, twin.states)
-    changed = flipped(flipped(twin.states, 237, 1, 0), 310, 0, 1)
-    changed[100, 2] = np.nan
-    logged = stored(dataclasses.replace(twin, states=changed), tmp_path)
-    assert in_file(logged.states)
-    outcome = check(logged)
-    assert outcome.difference.startswith("agent 2 at step 237, replica 1: ")
-    assert outcome.missing == 1
 
 
 @pytest.mark.parametrize("kind", ["twin", "noisy"])
@@ -66,20 +48,16 @@ def test_the_first_of_several_is_named(twin: Run, tmp_path: Path) -> None:
     assert checked(twin, tmp_path, states=changed).difference.startswith("agent 2 at step 29, replica 2:")
 
 
-def test_wrong_graph(twin: Run, tmp_path: Path) -> None:
-    modes, names = twin.modes.copy(), ["line", "ring"]
-    modes[40:50] = 1 - modes[40:50]
-    expected = f"graph of step 40: logged {names[modes[40]]}, the seed gives {names[twin.modes[40]]}"
-    assert checked(twin, tmp_path, modes=modes).difference == expected
-
-
-@pytest.mark.parametrize(("state_step", "first"), [(40, "agent 1"), (41, "graph")])
-def test_state_or_graph_whichever_came_first(twin: Run, tmp_path: Path, state_step: int, first: str) -> None:
-    """x(40) is older than the choice of g(40), x(41) comes out of it."""
+@pytest.mark.parametrize(
+    ("step", "first"), [(40, "agent 1 at step 40"), (41, "graph of step 40: logged {}, the seed gives {}")]
+)
+def test_wrong_graph_and_state(twin: Run, tmp_path: Path, step: int, first: str) -> None:
+    """Whichever came first is named: x(40) is older than the choice of g(40), x(41) comes out of it."""
     modes = twin.modes.copy()
-    modes[40] = 1 - modes[40]
-    outcome = checked(twin, tmp_path, states=flipped(twin.states, state_step, 0, 0), modes=modes)
-    assert outcome.difference.startswith(first)
+    modes[40:50] = 1 - modes[40:50]
+    difference = checked(twin, tmp_path, states=flipped(twin.states, step, 0, 0), modes=modes).difference
+    names = [["line", "ring"][one[40]] for one in (modes, twin.modes)]
+    assert difference.startswith(first.format(*names))
 
 
 def test_missing_states_are_counted_and_do_not_differ(twin: Run, noisy: Run, tmp_path: Path) -> None:
@@ -91,11 +69,6 @@ def test_missing_states_are_counted_and_do_not_differ(twin: Run, noisy: Run, tmp
     published[300:, 1], states[350:, 2] = np.nan, np.nan
     outcome = checked(noisy, tmp_path / "noisy", published=published, states=states)
     assert (outcome.difference, outcome.missing) == (None, 101 + 51)
-
-
-def test_another_seed_differs_at_once(twin: Run, tmp_path: Path) -> None:
-    other = simulate(twin.record.experiment.with_run(seed=6))
-    assert checked(twin, tmp_path, states=other.states).difference.startswith("agent 1 at step 0")
 
 
 def test_published(noisy: Run, tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import Experiment, Observation, check, compare, flipped, line_ring, new_record, simulate, stored
-from msg_analysis.common import arrays
-from msg_analysis.common.arrays import in_file
+from experiments import Experiment, check, flipped, line_ring, new_record, simulate, stored
+from msg_analysis.common.arrays import LARGE_VARIABLE, in_file
+from msg_analysis.inference.verdict import compare_run
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.reception import MessagesUsed
 
@@ -35,7 +35,7 @@ RUNS: dict[str, dict[str, Any]] = {
 }
 
 
-def experiment(case: str, steps: int, replicas: int = 2, agents: int = 5) -> Experiment:
+def long_run(case: str, steps: int, replicas: int = 2, agents: int = 5) -> Experiment:
     changes = RUNS[case]
     run = {"duration": 0.05 * steps, "replicas": replicas, "seed": 5} | changes.get("run", {})
     return line_ring(agents, **changes | {"run": run})
@@ -44,9 +44,9 @@ def experiment(case: str, steps: int, replicas: int = 2, agents: int = 5) -> Exp
 @pytest.mark.parametrize("case", RUNS)
 def test_the_same_in_files(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twin, bag and check; a bit that is turned over behind two blocks of steps is found."""
-    what = experiment(case, 600)
+    what = long_run(case, 600)
     twin = simulate(what)
-    monkeypatch.setattr(arrays, "LARGE", 1)
+    monkeypatch.setenv(LARGE_VARIABLE, "1")
     again = simulate(what, record=twin.record)
     for name in ("states", "published", "lost", "used", "made", "agent_modes"):
         one, other = getattr(twin, name), getattr(again, name)
@@ -61,8 +61,8 @@ def test_the_same_in_files(case: str, tmp_path: Path, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize("case", ["held", "noisy", "real time", "protocol"])
 def test_check_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice the steps need hardly more memory: 8 bytes of each step for its graph, and as much for a copy."""
-    monkeypatch.setattr(arrays, "LARGE", 1)
-    runs = [simulate(experiment(case, steps, replicas=4, agents=3)) for steps in (768, 1_280)]
+    monkeypatch.setenv(LARGE_VARIABLE, "1")
+    runs = [simulate(long_run(case, steps, replicas=4, agents=3)) for steps in (768, 1_280)]
     short, long = (_peak(lambda run=run: check(run)) for run in runs)
     assert long - short < 512 * 32
 
@@ -70,14 +70,11 @@ def test_check_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize("case", ["real time", "protocol in real time"])
 def test_comparison_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice the steps need at most some numbers more for each; its states alone have 192 bytes."""
-    monkeypatch.setattr(arrays, "LARGE", 1)
-    monkeypatch.setattr("msg_analysis.inference.observation.BLOCK_NUMBERS", 4_000)
-    whole = Observation.of
-    monkeypatch.setattr(Observation, "of", lambda *of: dataclasses.replace(whole(*of), block_numbers=400))
-    runs = [simulate(experiment(case, steps, replicas=8, agents=3)) for steps in (100, 200)]
+    monkeypatch.setenv(LARGE_VARIABLE, "1")
+    runs = [simulate(long_run(case, steps, replicas=8, agents=3)) for steps in (100, 200)]
     for run in runs:  # what is kept for comparisons to come
-        compare(run)
-    short, long = (_peak(lambda run=run: compare(run)) for run in runs)
+        compare_run(run, block_numbers=400)
+    short, long = (_peak(lambda run=run: compare_run(run, block_numbers=400)) for run in runs)
     assert long - short < 100 * 96
 
 
@@ -94,7 +91,7 @@ def _peak(work: Callable[[], object]) -> int:
 @pytest.mark.parametrize("case", ["lost", "late", "held", "real time"])
 def test_messages_of_a_part_of_the_steps(case: str) -> None:
     """In any cuts they are those of the whole run."""
-    what = experiment(case, 700)
+    what = long_run(case, 700)
     model = new_record(what).model
     modes = mode_path(what, model.initial)
     whole = MessagesUsed(what, model)

@@ -15,7 +15,6 @@ from processors import another_processor
 import experiments
 from experiments import Experiment, RunRecord, new_record, read_bag, simulate, write_trajectory
 from msg_analysis.errors import InputError
-from msg_analysis.twin import simulate as twin_start
 
 PATH_AND_STAR = {"path": {"path": [1, 2, 3, 4, 5, 6]}, "star": {"star": {"center": 2}}}
 SWITCHING = {"generator": [[-1, 1], [2, -2]]}
@@ -29,6 +28,12 @@ CASES: dict[str, dict[str, Any]] = {
     "consensus": {"noise": {"process": CORRELATED}},
     "tracking": {"problem": "tracking", "leaders": {"agents": [3], "gain": 1.0, "reference": 2.0}},
     "grounded": {"problem": "tracking", "leaders": {"agents": [3], "gain": "inf", "reference": 2.0}},
+    "too large for a past": {
+        "problem": "tracking",
+        "leaders": {"agents": [3], "gain": "inf", "reference": 2.0},
+        "noise": {"process": CORRELATED},
+        "run": {"replicas": 11_000, "duration": 0.05},
+    },
     "on air": {"noise": {"process": 1.0, "broadcast": 0.3, "link": 0.2, "loss": 0.1}},
     "real time": {"run": {"pace": "realtime"}},
     "discrete": DISCRETE,
@@ -44,16 +49,16 @@ for file in map(Path, sys.argv[1:]):
 """
 
 
-def document(changes: dict[str, Any]) -> dict[str, Any]:
+def document(case: str) -> dict[str, Any]:
+    changes = CASES[case]
     run = {"duration": 15, "seed": 7} | changes.get("run", {})
     return experiments.document(**{"graphs": PATH_AND_STAR, "switching": SWITCHING} | changes | {"run": run})
 
 
 def test_a_run_is_the_same_on_another_processor(tmp_path: Path) -> None:
-    other, files = another_processor(), []
-    for name, changes in CASES.items():
-        files.append(tmp_path / f"{name.replace(' ', '_')}.yaml")
-        files[-1].write_text(yaml.safe_dump(document(changes)))
+    other, files = another_processor(), [tmp_path / f"{case.replace(' ', '_')}.yaml" for case in CASES]
+    for file, case in zip(files, CASES, strict=True):
+        file.write_text(yaml.safe_dump(document(case)))
     environment = os.environ | other | {"PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", WRITE, *files], env=environment, check=True)
     for file in files:
@@ -64,37 +69,33 @@ def test_a_run_is_the_same_on_another_processor(tmp_path: Path) -> None:
         assert np.array_equal(again.states, theirs.states), file.stem
 
 
-def test_a_long_past_is_replaced_by_a_rounded_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On another processor too: the rounding is far above what linear algebra differs by."""
-    other, file = another_processor(), tmp_path / "net.yaml"
-    file.write_text(yaml.safe_dump(document(CASES["grounded"] | {"noise": {"process": CORRELATED}})))
-    code = "from msg_analysis.twin import simulate as twin_start; twin_start.MAX_PAST = 0\n" + WRITE
-    environment = os.environ | other | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    subprocess.run([sys.executable, "-c", code, file], env=environment, check=True)
-    monkeypatch.setattr(twin_start, "MAX_PAST", 0)
-    start = new_record(Experiment.load(file)).start
-    assert np.array_equal(read_bag(file.with_suffix("")).record.start, start)
-    assert (start[2] == 2.0).all()  # the grounded leader
-    assert len(np.unique(start)) == 1 + 5 * 2
+@pytest.mark.parametrize("case", ["grounded", "too large for a past"])
+def test_a_grounded_leader_starts_on_the_reference(case: str) -> None:
+    """So many states have no past, whatever their number of steps: theirs are drawn, and rounded to a grid."""
+    start = new_record(Experiment.parse(document(case))).start
+    assert (start[2] == 2.0).all()
+    assert len(np.unique(start[:, :2])) == 1 + 5 * 2
+    scaled = start * 2.0**20
+    assert (scaled == np.rint(scaled)).all() == (case == "too large for a past")
 
 
 @pytest.mark.parametrize("case", ["discrete", "discrete tracking", "a protocol"])
 def test_the_record_carries_the_matrices(case: str, tmp_path: Path) -> None:
-    record = new_record(Experiment.parse(document(CASES[case])))
+    record = new_record(Experiment.parse(document(case)))
     write_trajectory(simulate(record.experiment, record=record), tmp_path / "bag")
     again = read_bag(tmp_path / "bag").record
     assert np.array_equal(again.matrices.weights, record.matrices.weights)
     assert np.array_equal(again.matrices.noise_gain, record.matrices.noise_gain)
     assert np.array_equal(again.step_model.nominal, record.step_model.nominal)
-    entries = json.loads(record.to_json())["step"]["weights"][0]
-    assert {(i - 1, j - 1): value for i, j, value in entries} == {
-        (int(i), int(j)): record.matrices.weights[0, i, j] for i, j in np.argwhere(record.matrices.weights[0])
-    }
+    weights = np.zeros_like(record.matrices.weights[0])
+    for i, j, value in json.loads(record.to_json())["step"]["weights"][0]:
+        weights[i - 1, j - 1] = value
+    assert np.array_equal(weights, record.matrices.weights[0])
 
 
 def test_what_follows_from_the_experiment_is_not_in_the_record() -> None:
     """So a record that is changed by hand, as in the tutorial, is a run of the changed experiment."""
-    record = new_record(Experiment.parse(document(CASES["consensus"])))
+    record = new_record(Experiment.parse(document("consensus")))
     assert "step" not in json.loads(record.to_json())
     louder = json.loads(record.to_json())
     louder["experiment"]["noise"]["process"] = 2.0
@@ -115,12 +116,6 @@ def test_what_follows_from_the_experiment_is_not_in_the_record() -> None:
     ],
 )
 def test_wrong_matrices(change: dict[str, Any], complaint: str) -> None:
-    text = json.loads(new_record(Experiment.parse(document(CASES["discrete"]))).to_json()) | {"step": change}
+    text = json.loads(new_record(Experiment.parse(document("discrete"))).to_json()) | {"step": change}
     with pytest.raises(InputError, match=complaint):
         RunRecord.from_json(json.dumps(text), "here")
-
-
-def test_a_grounded_leader_starts_on_the_reference() -> None:
-    record = new_record(Experiment.parse(document(CASES["grounded"])))
-    assert (record.start[2] == 2.0).all()
-    assert len(np.unique(record.start)) == 1 + 5 * 2
