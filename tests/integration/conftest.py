@@ -222,11 +222,9 @@ class Network:
 
     @classmethod
     def completed(cls, run: Command) -> dict[str, Any]:
-        """Wait for the end of ``msg-agents run --json``: all is there, once, and as the twin says.
-
-        Its result comes back, and what it noted on the way. Whether a run agrees with the prediction depends on its
-        seed only, so most runs are not analysed.
-        """
+        """Wait for the end of ``msg-agents run --json``: all is there, once, and as the twin says."""
+        # Its result comes back, and what it noted on the way. Whether a run agrees with the prediction depends on its
+        # seed only, so most runs are not analysed.
         stdout, stderr = cls.ended(run)
         assert stdout.count("\n") == 1
         result: dict[str, Any] = json.loads(stdout)
@@ -259,10 +257,8 @@ class Network:
     wait_for = staticmethod(wait_for)
 
     def wait_until_moving(self, out: str = "runs") -> None:
-        """The run is in the middle: what is there of the bag is more than its head.
-
-        The recorder writes once a second, so runs of fewer than some thousand steps may be over by then.
-        """
+        """The run is in the middle: what is there of the bag is more than its head."""
+        # The recorder writes once a second, so runs of fewer than some thousand steps may be over by then.
         self.wait_for(lambda: self.recorded_bytes(out) > 50_000, 60, "recorded states")
 
     def wait_for_steps(self) -> Path:

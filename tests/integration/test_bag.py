@@ -127,11 +127,9 @@ def _metadata(bag: Path) -> None:
 
 
 def test_compressed_and_split(network: Any) -> None:
-    """What is asked for on the command line is what is recorded; nothing is lost at the seams.
-
-    The result is printed, as one object in a line, and kept with a report.
-    The files are in the order of time, and each has the experiment, and the graph of every step between its states.
-    """
+    """What is asked for on the command line is what is recorded; nothing is lost at the seams."""
+    # The result is printed, as one object in a line, and kept with a report.
+    # The files are in the order of time, and each has the experiment, and the graph of every step between its states.
     file = network.file(run={"processes": 2, "replicas": 32})
     options = ("--out", network.directory / "runs", "--compression", "lz4", "--split-size", "0.1", "--json")
     result = network.completed(network.start("run", file, *options))

@@ -59,10 +59,8 @@ def namespaces(network: Any) -> set[int]:
 
 
 def holders(inodes: set[int], mark: str) -> list[str]:
-    """What still holds one of these namespaces: a process in it, or a descriptor of it.
-
-    Not a process of another test: the kernel gives the number of a removed namespace to a new one.
-    """
+    """What still holds one of these namespaces: a process in it, or a descriptor of it."""
+    # Not a process of another test: the kernel gives the number of a removed namespace to a new one.
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
@@ -237,10 +235,8 @@ def test_without_rights_nothing_is_started(network: Any) -> None:
 
 
 def test_a_limited_rate(network: Any) -> None:
-    """Where users can make namespaces, without rights: by the command that the error names.
-
-    It is run in one namespace more, in which the user is not root.
-    """
+    """Where users can make namespaces, without rights: by the command that the error names."""
+    # It is run in one namespace more, in which the user is not root.
     unshared = ["unshare", "--user", "--map-root-user", "--net"]
     possible = subprocess.run([*unshared, "true"], capture_output=True).returncode == 0
     hosts = {"left": {"agents": [1, 2]}, "right": {"agents": ["3-5"]}}

@@ -52,11 +52,9 @@ def joining(stack: ExitStack, when: str, domain: int) -> dict[str, subprocess.Po
 
 
 def test_others_see_every_process(network: Any, domain: int) -> None:
-    """Those that were there before the run and those that come during it, with our profile and in ROS's own range.
-
-    Of a run in which no process knows more than half of the others. In real time, agents hear each other with best
-    effort if nothing is said of it; all else is reliable.
-    """
+    """Those that were there before the run and those that come during it, with our profile and in ROS's own range."""
+    # Of a run in which no process knows more than half of the others. In real time, agents hear each other with best
+    # effort if nothing is said of it; all else is reliable.
     graphs = {"line": {"path": [1, 2, 3, 4, 5]}, "none": {"edges": []}}
     # Few steps, and large states, which are soon seen in the bag.
     file = network.file(graphs=graphs, run={"pace": "realtime", "duration": 2000, "replicas": 128})
@@ -78,10 +76,8 @@ def test_others_see_every_process(network: Any, domain: int) -> None:
 
 
 def test_a_domain_without_a_port_for_the_relay(network: Any, domain: int) -> None:
-    """Where others have all its numbers, the processes look for each other; the result is the same.
-
-    One process per agent: the twin says, from the experiment alone, what they record.
-    """
+    """Where others have all its numbers, the processes look for each other; the result is the same."""
+    # One process per agent: the twin says, from the experiment alone, what they record.
     what = network.experiment(run={"processes": "one_per_agent"})
     with ExitStack() as stack:
         for number in range(FIRST_RELAYED):

@@ -61,10 +61,8 @@ def script(text: str, place: Path, patch: pytest.MonkeyPatch) -> None:
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("name", ["index", "tutorial", "protocols"])
 def test_page(name: str, network, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its files, then its commands; the shell block with a bag is run before the first command that reads this bag.
-
-    A domain that the page chooses is replaced by the test's own, as other tests run at the same time.
-    """
+    """Its files, then its commands; the shell block with a bag is run before the first command that reads this bag."""
+    # A domain that the page chooses is replaced by the test's own, as other tests run at the same time.
     page, place = DOCS / f"{name}.md", network.directory
     written = files(page) | {f"{experiment}.yaml": text for experiment, text in experiments(page).items()}
     for file, text in written.items():

@@ -152,10 +152,8 @@ def test_hosts_of_unlike_processors(lan: Lan) -> None:
 
 
 def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: random.Random) -> None:
-    """Its cable is pulled, or its interface goes down: everybody waits, then all goes on, and nothing is lost.
-
-    The demo network across three hosts equals the twin to the last bit, and agrees with the prediction.
-    """
+    """Its cable is pulled, or its interface goes down: everybody waits, then all goes on, and nothing is lost."""
+    # The demo network across three hosts equals the twin to the last bit, and agrees with the prediction.
     prepare(lan, 200)
     host, cable = rng.choice(NAMES), rng.random() < 0.5
     hosts = lan.start_all("--write-report", "never")
@@ -173,10 +171,8 @@ def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: rand
 
 @pytest.mark.timeout(300)
 def test_a_host_that_leaves_takes_the_others_with_it(lan: Lan) -> None:
-    """Ctrl-C on one of them: they say who has gone. Exit code 3 everywhere.
-
-    They say so themselves, so nobody waits for a lease of a minute, or for the timeout of the others.
-    """
+    """Ctrl-C on one of them: they say who has gone. Exit code 3 everywhere."""
+    # They say so themselves, so nobody waits for a lease of a minute, or for the timeout of the others.
     prepare(lan, 5000)
     hosts = lan.start_all("--no-analyse", "--timeout", "1000")
     lan.network.wait_until_moving("base")

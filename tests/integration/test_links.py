@@ -103,10 +103,8 @@ def test_a_protocol_that_is_not_linear_in_real_time(network: Any) -> None:
 
 
 def test_killed_agents_hold_again_what_they_held(network: Any) -> None:
-    """Bursts of 200 messages: an agent that comes back needs values from long before it was killed.
-
-    Of four processes, one of a single agent and the one of two agents are killed.
-    """
+    """Bursts of 200 messages: an agent that comes back needs values from long before it was killed."""
+    # Of four processes, one of a single agent and the one of two agents are killed.
     held = MESSAGES["all"] | {"delay": 2, "loss": 0.5, "burst": 200}
     run = {"duration": 250, "replicas": 16, "processes": 4}
     file = network.file(noise={"process": 1.0, **held}, run=run)

@@ -88,10 +88,8 @@ def test_a_replay_without_its_start_is_known_from_a_file(network: Any, domain: i
 
 
 def test_a_running_network_is_watched_to_its_end(network: Any, domain: int) -> None:
-    """From the first step that it gets whole, it misses none: its number is that of the bag, to every printed digit.
-
-    The run begins when it sees the watcher, and may be over before the watcher reads its states: then once more.
-    """
+    """From the first step that it gets whole, it misses none: its number is that of the bag, to every printed digit."""
+    # The run begins when it sees the watcher, and may be over before the watcher reads its states: then once more.
     for attempt in range(3):
         live = network.start("live", "--reliable")
         assert "waiting for one" in live.stderr.readline()
@@ -214,10 +212,8 @@ def by_space(array: dict[str, Any], namespace: str) -> list[dict[str, Any]]:
 
 
 def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The last picture is that of the last step: its links, by networkx, and its states, by the bag.
-
-    In real time, a process that had to wait for the processor may step under an outdated graph, which it logs.
-    """
+    """The last picture is that of the last step: its links, by networkx, and its states, by the bag."""
+    # In real time, a process that had to wait for the processor may step under an outdated graph, which it logs.
     with free_domain() as domain:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         script = PICTURES.replace("{LAST}", str(STEPS))

@@ -80,10 +80,8 @@ def equals_the_twin(what: Experiment, trajectory: Run | None) -> None:
 
 @pytest.mark.parametrize("processes", [1, 2])
 def test_a_chain_that_jumps_in_nearly_every_step(network: Any, processes: int) -> None:
-    """Agents that use up a thousand holding periods before their next report is due say so, and get more.
-
-    The leader is held at the reference: it waits for nobody. Agents of one process wait for no message.
-    """
+    """Agents that use up a thousand holding periods before their next report is due say so, and get more."""
+    # The leader is held at the reference: it waits for nobody. Agents of one process wait for no message.
     result = network.run(
         network.experiment(
             problem="tracking",

@@ -199,10 +199,8 @@ def test_the_terminal_is_left_as_it_was(domain: int, twin_bag: Path, terminal: A
 def test_stopped_and_continued(
     network: Any, domain: int, twin_bag: Path, terminal: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ctrl-Z twice, `fg`, `bg` and `fg`, under a shell: while it stands the terminal is as the shell left it.
-
-    The time that it stands is no time of the bag. A shell that restores nothing by itself shows most.
-    """
+    """Ctrl-Z twice, `fg`, `bg` and `fg`, under a shell: while it stands the terminal is as the shell left it."""
+    # The time that it stands is no time of the bag. A shell that restores nothing by itself shows most.
     # Fast DDS 2.14 sometimes leaves the port of a process that stood in shared memory, which is not the matter here.
     monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
     screen = terminal("/bin/sh", "-i")

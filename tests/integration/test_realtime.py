@@ -106,12 +106,10 @@ def test_a_busy_machine_is_no_wrong_theory(network: Any) -> None:
     assert comparison.timing.missed_share <= 0.01 or comparison.laws.sequential.supported is False
 
 
-def test_sojourns_of_one_step(network: Any) -> None:
-    """They are over before they arrive: agents go on with the next ones, and nothing is refused.
-
-    Between two graphs of 1.3 steps on average, an agent that had missed one would have kept its graph for ever. With
-    two processes; the verdict as above.
-    """
+def test_holding_times_of_one_step(network: Any) -> None:
+    """They are over before they arrive: agents go on with the next ones, and nothing is refused."""
+    # Between two graphs of 1.3 steps on average, an agent that had missed one would have kept its graph for ever. With
+    # two processes; the verdict as above.
     fast = {"switching": {"generator": [[-20.0, 20.0], [20.0, -20.0]]}}
     result = network.run(network.experiment(**fast, run={**UNDISTURBED, "speed": 10, "duration": 20, "processes": 2}))
     assert result.rejected_messages == []
@@ -165,10 +163,8 @@ def test_killed_and_back(network: Any, repetition: int) -> None:
 
 @pytest.mark.timeout(150)
 def test_an_agent_stands_still_and_the_clock_is_set_back(network: Any) -> None:
-    """Each by three seconds: the run says that it is behind, and catches up; then, that no step is due, and waits.
-
-    The clock is that of all processes of the run, whose log is possible.
-    """
+    """Each by three seconds: the run says that it is behind, and catches up; then, that no step is due, and waits."""
+    # The clock is that of all processes of the run, whose log is possible.
     clock = SetClock(network.directory)
     file = network.file(run=REALTIME | {"duration": 35, "processes": 2})
     run = network.execute(*network.recording(file), "--json", **clock.environment)

@@ -28,10 +28,8 @@ from msg_analysis.twin.simulate import new_record
 
 
 def test_another_run_and_nonsense(network: Any) -> None:
-    """Another run of the same experiment, complete and well-formed: its states, graph, progress, record and end.
-
-    Bytes that are no message, and messages of this run that cannot be.
-    """
+    """Another run of the same experiment, complete and well-formed: its states, graph, progress, record and end."""
+    # Bytes that are no message, and messages of this run that cannot be.
     record = new_record(network.experiment(run={"processes": 2}))
     other = new_record(network.experiment(run={"processes": 2, "seed": 8}))
     forged = of_another_run(record.run.bytes, other) + nonsense(record.run.bytes)
@@ -98,10 +96,8 @@ def nonsense(run: bytes) -> list[Forgery]:
 
 
 def test_a_forged_state_is_noticed_and_nothing_is_concluded(network: Any) -> None:
-    """Right run, right agent, a step that is to come, another value: whoever hears it first believes it.
-
-    Who of the two is right nobody can know. But all notice, and the state counts as missing.
-    """
+    """Right run, right agent, a step that is to come, another value: whoever hears it first believes it."""
+    # Who of the two is right nobody can know. But all notice, and the state counts as missing.
     record = new_record(network.experiment(run={"processes": 2}))
     trajectory, _, refused = run_beside(network, record, [states(record.run.bytes, 2)[5]])
     assert refused["agent_3", "agent_2/state", "contradicts an earlier copy"] == 1
@@ -294,10 +290,8 @@ def test_steering_and_states_that_are_not_finite(network: Any) -> None:
 
 
 def test_steering_and_other_messages_in_real_time(network: Any) -> None:
-    """Before simulated time has begun: other epochs, states of other runs and layouts, what nobody can have yet.
-
-    How many of the states are refused is not known: agents read only the newest of those that wait for them.
-    """
+    """Before simulated time has begun: other epochs, states of other runs and layouts, what nobody can have yet."""
+    # How many of the states are refused is not known: agents read only the newest of those that wait for them.
     record = record_of(network, "realtime")
     run, other = record.run.bytes, new_record(record.experiment).run.bytes
     forged = [message for agent in range(1, 6) for message in states(other, agent)]

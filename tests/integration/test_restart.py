@@ -62,11 +62,9 @@ def wait_for_more(network: Any, steps: Path, more: int) -> None:
 
 @pytest.mark.timeout(300)
 def test_killed_and_back(network: Any, repetition: int, rng: random.Random, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At any moment from the birth of the processes on: all of a fault at once, or also who has just come back.
-
-    The faults happen in any order, each when all are back from the one before it. The fork server is killed at last:
-    what it has forked goes on; an agent is started without it.
-    """
+    """At any moment from the birth of the processes on: all of a fault at once, or also who has just come back."""
+    # The faults happen in any order, each when all are back from the one before it. The fork server is killed at last:
+    # what it has forked goes on; an agent is started without it.
     protocol = install("slow", SLOW, network.directory, monkeypatch)
     monkeypatch.syspath_prepend(network.directory / "packages")
     file, kills = network.file(protocol=protocol, run=RUN), sum(map(len, FAULTS)) + 1
@@ -125,10 +123,8 @@ def test_budget(network: Any) -> None:
 
 
 def test_who_comes_back_repeats_only_what_peers_may_lack(network: Any) -> None:
-    """Not the thousands of states that it keeps, neither by itself nor for latched requests of earlier restarts.
-
-    Restarts are allowed by default.
-    """
+    """Not the thousands of states that it keeps, neither by itself nor for latched requests of earlier restarts."""
+    # Restarts are allowed by default.
     file = network.file(run={"duration": 200, "processes": 5})
     with free_domain() as domain:
         run = network.record(file, "--domain", str(domain), "--await", "listener", "--json")

@@ -80,10 +80,8 @@ def back_on(network: Any, victim: Any, cores: set[int]) -> None:
 
 
 def test_processes_of_one_agent_that_hear_all_others(network: Any) -> None:
-    """Each keeps to one core, where there are more of them than cores; so does the one that comes back.
-
-    Nobody waits for the planned end of the run, so it cannot be over too early.
-    """
+    """Each keeps to one core, where there are more of them than cores; so does the one that comes back."""
+    # Nobody waits for the planned end of the run, so it cannot be over too early.
     run = {"duration": 1000, "start": "zero", "processes": "one_per_agent", "replicas": 16}
     process = network.record(network.file(**complete(9), run=run), "--restarts", "1", "--json")
     steps = network.wait_for_steps()
@@ -112,10 +110,8 @@ def test_processes_that_hear_most_of_a_network(
     of_first: list[int],
     of_last: list[int],
 ) -> None:
-    """They read batches, on the node of their first agent, and no topic of single agents. None keeps to a core.
-
-    A process is killed and comes back: all is there, and as the twin says.
-    """
+    """They read batches, on the node of their first agent, and no topic of single agents. None keeps to a core."""
+    # A process is killed and comes back: all is there, and as the twin says.
     readers = {
         "/states": sorted(["recorder", *(f"agent_{i}" for i in of_batches)]),
         "/agent_1/state": sorted(f"agent_{i}" for i in of_first),

@@ -83,10 +83,8 @@ def test_a_worker_is_killed_in_the_middle(network: Any, cluster: tuple[str, list
 
 @pytest.mark.timeout(300)  # waits of several sweeps, on a machine that has much else to do
 def test_networks_interrupted_killed_and_resumed(network: Any) -> None:
-    """Sweeps in one directory: ended by SIGTERM, killed, resumed with a network that fails, resumed without.
-
-    The false-alarm rate of the verdict is 1 %, with fixed seeds: none.
-    """
+    """Sweeps in one directory: ended by SIGTERM, killed, resumed with a network that fails, resumed without."""
+    # The false-alarm rate of the verdict is 1 %, with fixed seeds: none.
     out = network.directory / "out"
 
     def started(*durations: int, workers: tuple[str, ...] = ()) -> Any:

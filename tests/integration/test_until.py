@@ -103,10 +103,8 @@ def test_killed_processes(network: Any, repetition: int, rng: random.Random) -> 
 
 
 def test_evidence_ends_a_run_whose_switcher_is_killed(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The observer is told of a law with a third of the noise: ``decided`` ends the run by the evidence against it.
-
-    The switcher is killed when it has announced the end; the next one announces the same step.
-    """
+    """The observer is told of a law with a third of the noise: ``decided`` ends the run by the evidence against it."""
+    # The switcher is killed when it has announced the end; the next one announces the same step.
     experiment = network.experiment(run=LONG)
     other = network.experiment(run=LONG, noise={"process": 0.6})
     announced = []
@@ -135,10 +133,8 @@ def test_evidence_ends_a_run_whose_switcher_is_killed(network: Any, monkeypatch:
 
 
 def test_is_watched_to_its_end(network: Any, domain: int) -> None:
-    """On plain links, with a process per agent: while it runs, and when its bag in two files is played again.
-
-    The watcher knows where it ends.
-    """
+    """On plain links, with a process per agent: while it runs, and when its bag in two files is played again."""
+    # The watcher knows where it ends.
 
     def watched(other: Any) -> dict[str, Any]:
         stdout, stderr = live.communicate(timeout=100)

@@ -73,10 +73,8 @@ def _follow(page: Any, address: str) -> Log:
 
 
 def test_page_of_a_run(network: Any, terminal: Any, page: Any) -> None:
-    """Steps, graph, states and errors come in; the end is told, with the verdict and the numbers of the comparison.
-
-    The panel goes to stderr, a terminal: stdout, which is elsewhere, is one object.
-    """
+    """Steps, graph, states and errors come in; the end is told, with the verdict and the numbers of the comparison."""
+    # The panel goes to stderr, a terminal: stdout, which is elsewhere, is one object.
     file, out = network.file(run={"processes": 2}), network.directory / "result"
     options = ("--out", network.directory / "runs", "--json", "--web", "0")
     log = Log(page)
@@ -116,10 +114,8 @@ def test_page_of_a_run(network: Any, terminal: Any, page: Any) -> None:
 
 
 def test_page_of_a_run_in_time(network: Any, page: Any) -> None:
-    """While it goes on, on a phone: the active graph and the numbers change; another browser closes, nothing stops.
-
-    A stopped agent turns grey and its silence is told; a killed one is an event, and its return.
-    """
+    """While it goes on, on a phone: the active graph and the numbers change; another browser closes, nothing stops."""
+    # A stopped agent turns grey and its silence is told; a killed one is an event, and its return.
     page.set_viewport_size({"width": 390, "height": 800})
     run = network.start("run", _long(network), "--out", network.directory / "runs", "--web", "0")
     log = _follow(page, address := _address(run))

@@ -44,10 +44,9 @@ LONGEST = 60  # s of a job
 
 
 class ForkedCommand:
-    """A running command, with what tests use of ``subprocess.Popen``; its stdout and stderr are pipes of text.
+    """A running command, with what tests use of ``subprocess.Popen``; its stdout and stderr are pipes of text."""
 
-    ``terminal``: the streams are this one instead, and ``stdout`` a file; ``first``: what the process does before.
-    """
+    # ``terminal``: the streams are this one instead, and ``stdout`` a file; ``first``: what the process does before.
 
     def __init__(
         self,
@@ -151,11 +150,9 @@ def _become(
 
 
 def outcomes(jobs: Sequence[Job], folder: Path, **environment: str) -> list[tuple[int, str, str]]:
-    """Exit code, stdout and stderr of each job, with this folder to work in and additions to the environment.
-
-    A job is a program, its arguments, and where it runs: with a stdout that is a "pipe" or a "terminal", or one of
-    ``FILES`` or ``SURROUNDINGS``.
-    """
+    """Exit code, stdout and stderr of each job, with this folder to work in and additions to the environment."""
+    # A job is a program, its arguments, and where it runs: with a stdout that is a "pipe" or a "terminal", or one of
+    # ``FILES`` or ``SURROUNDINGS``.
     everything = {**os.environ, "MPLBACKEND": "agg", **environment}
     return [_outcome(program, arguments, kind, everything, folder) for program, arguments, kind in jobs]
 

@@ -28,10 +28,8 @@ def lost_messages(random, probability, burst, count):
 
 
 def message_run(experiment: Experiment, seed: int, *, actual=None, late=0.0, latency=0.0) -> Run:
-    """A run of an experiment, by the law of ``actual`` if that is another one; start zero or given.
-
-    ``late`` and ``latency``: mean of exponential times, in steps, by which steps are late and messages under way.
-    """
+    """A run of an experiment, by the law of ``actual`` if that is another one; start zero or given."""
+    # ``late`` and ``latency``: mean of exponential times, in steps, by which steps are late and messages under way.
     law, random = actual or experiment, np.random.default_rng(seed)
     record = new_record(experiment)
     m, steps, dt, replicas = law.agents, law.steps, law.step_length, law.run.replicas
