@@ -260,13 +260,6 @@ def test_leaders_json(method: str) -> None:
     assert document["supermodular"]
 
 
-def test_orders_of_the_third_example() -> None:
-    document = leaders(EXPERIMENTS / "leader_knife_edge.yaml", "--count", "1")
-    assert [entry["agents"] for entry in document["sets"]] == [[3], [1], [4], [5], [2]]
-    assert round(document["sets"][0]["system_error"], 5) == 1.63896
-    assert document["bound"] == {"system_error": document["sets"][0]["system_error"], "gap": 0.0}
-
-
 def test_laws_and_gains() -> None:
     held = leaders(LINE_RING, "--count", "1")["sets"][0]["system_error"]
     assert leaders(LINE_RING, "--count", "1", "--law", "emulated")["sets"][0]["system_error"] > held

@@ -115,7 +115,7 @@ def test_the_graph_is_compared_with_the_record() -> None:
     assert rules.graph(b"") == Refusal.UNDECODABLE
 
 
-def test_old_sojourns_are_forgotten() -> None:
+def test_old_holding_periods_are_forgotten() -> None:
     rules = RunRules(SWITCHING)
     rules.forget(500)
     for holding in PATH:

@@ -1,4 +1,4 @@
-"""The two-topology closed forms against Kronecker algebra as printed, the coupled solver, and many digits."""
+"""The two-topology closed forms against the coupled solver and many digits; as printed: benchmarks/errata.py."""
 
 import dataclasses
 from decimal import localcontext
@@ -26,39 +26,6 @@ def with_rate(system, rate):
     pi = system.stationary
     flow = rate * np.array([[-pi[1], pi[1]], [pi[0], -pi[0]]])
     return dataclasses.replace(system, chain=flow if system.time == "continuous" else np.eye(2) + flow)
-
-
-def printed_consensus(experiment):
-    """(static, E) per agent, by the formula of the paper with its pseudo-inverses and m^2 x m^2 matrices."""
-    m = experiment.agents
-    eye, projector = np.eye(m), np.eye(m) - 1 / m
-    both = np.kron(projector, projector)
-    q = (projector @ experiment.noise_gain[0] @ experiment.noise_gain[0].T @ projector).ravel()
-    inverses = []
-    for graph in experiment.graph_list:
-        z = projector @ graph.laplacian @ projector
-        inverses.append(np.linalg.pinv(np.kron(z, eye) + np.kron(eye, z), rcond=1e-11))
-    one, two = inverses
-    pi = experiment.chain.stationary
-    beta = experiment.chain.matrix[0, 1] + experiment.chain.matrix[1, 0]
-    omega = both @ (pi[1] * one + pi[0] * two)
-    inner = np.linalg.solve(np.eye(m * m) + beta * omega, both @ (two @ q - one @ q))
-    static, error = [], []
-    for agent in range(m):
-        h = np.outer(eye[agent], eye[agent]).ravel()
-        static.append(h @ (pi[0] * one @ q + pi[1] * two @ q))
-        error.append(static[-1] - beta * pi[0] * pi[1] * h @ (two - one) @ inner)
-    return np.array(static), np.array(error)
-
-
-@MODELS
-@given(seeds, st.integers(2, 5))
-def test_consensus_is_the_formula_of_the_paper(seed, m):
-    experiment = network(seed, m, 2, directed=False)
-    static, error = printed_consensus(experiment)
-    found = two_topology(systems.continuous(experiment))
-    np.testing.assert_allclose(found.static, static, rtol=1e-9)
-    np.testing.assert_allclose(found.node_errors, error, rtol=1e-9)
 
 
 @MODELS
