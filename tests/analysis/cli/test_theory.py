@@ -2,6 +2,8 @@
 
 import csv
 import dataclasses
+import functools
+import itertools
 import json
 from pathlib import Path
 
@@ -308,7 +310,8 @@ def test_no_guarantee_says_why(tmp_path: Path) -> None:
 
 
 def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(console, "_LINE_PERIOD", 0.0)
+    clock = itertools.count(0.0, 20.0).__next__
+    monkeypatch.setattr(console, "SolveProgress", functools.partial(console.SolveProgress, clock=clock))
     result = call("leaders", LINE_RING, "--count", "2", "--method", "swap", "--json")
     assert json.loads(result.stdout)["sets"]
     assert "line_ring: greedy: 1 of 10, smallest system error" in result.stderr

@@ -153,22 +153,20 @@ def test_short_work_shows_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr() == ("", "")
 
 
-def test_long_work_says_how_far_it_is(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_work_says_how_far_it_is(capfd: pytest.CaptureFixture[str]) -> None:
     """A line every ten seconds where there is no terminal."""
     now = [100.0]
-    monkeypatch.setattr("msg_analysis.cli.console.time.monotonic", lambda: now[0])
-    with WorkProgress() as progress, watched(progress):
+    with WorkProgress(lambda: now[0]) as progress, watched(progress):
         for second in range(25):
             now[0] = 100.0 + second
             tell("reading x.mcap", second, 25)
     assert capfd.readouterr().err == "reading x.mcap: 40 %\nreading x.mcap: 80 %\n"
 
 
-def test_a_sweep_says_what_is_left(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sweep_says_what_is_left(capfd: pytest.CaptureFixture[str]) -> None:
     """At the mean speed of what is new: 40 of 100 points were there before, each takes a second and a half."""
     now = [100.0]
-    monkeypatch.setattr("msg_analysis.cli.console.time.monotonic", lambda: now[0])
-    with SweepProgress("sweep") as progress:
+    with SweepProgress("sweep", lambda: now[0]) as progress:
         progress.done(40, 100, 0)
         for done in range(41, 101):
             now[0] = 100.0 + 1.5 * (done - 40)

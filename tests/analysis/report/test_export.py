@@ -13,11 +13,9 @@ import pytest
 from click.testing import Result
 from programs import run as call
 from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from experiments import document
 from msg_analysis import Experiment, InputError, NotAvailableError, Run, read_bag
-from msg_analysis.messages.messages import ACTIVE_GRAPH, AGENT_STATE
 from msg_analysis.report import export as export_files
 
 DOCUMENT = document(names=["one, 1", 'two "2"', "three"], run={"duration": 15, "seed": 4})
@@ -53,13 +51,10 @@ NAMES = [f"{table}.{form}" for form in ("csv", "parquet") for table in ("states"
 
 
 @pytest.fixture(scope="module")
-def messages(bag: Path) -> tuple[dict[tuple[int, int], Any], dict[int, int]]:
+def messages(bag: Path, typestore: Any) -> tuple[dict[tuple[int, int], Any], dict[int, int]]:
     """Of rosbags: states by step and agent, and the graph of each step."""
-    types = get_typestore(Stores.ROS2_JAZZY)
-    for kind in (AGENT_STATE, ACTIVE_GRAPH):
-        types.register(get_types_from_msg(kind.schema.split("\n====")[0], kind.full_name))
     states, graphs = {}, {}
-    with AnyReader([bag], default_typestore=types) as reader:
+    with AnyReader([bag], default_typestore=typestore) as reader:
         for connection, _, raw in reader.messages():
             if connection.topic.endswith("/state"):
                 message: Any = reader.deserialize(raw, connection.msgtype)

@@ -182,6 +182,11 @@ def test_what_kills_its_workers_is_given_up_and_the_others_are_done() -> None:
     assert found == {number: number**3 for number in range(30) if number != 13}
 
 
+def test_a_scheduler_that_does_not_answer() -> None:
+    with pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: no answer: expected the address"):
+        Workers(scheduler="tcp://127.0.0.1:9", patience=0.2).__enter__()
+
+
 def test_columns_and_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     in_this_process(monkeypatch)
     over = {"noise.process": [1.0, [1, 2, 1, 1, 1]], "switching.generator": [[[-1, 1], [1, -1]], [[-9, 9], [9, -9]]]}

@@ -12,11 +12,7 @@ from hypothesis import strategies as st
 from switching_systems import generator, laplacian, system
 
 from msg_analysis.errors import InputError
-from msg_analysis.theory import packed_symmetric as symmetric
-from msg_analysis.theory import solvers
-from msg_analysis.theory.coupled_equations import AveragedEquations, CoupledEquations
 from msg_analysis.theory.jump_system import JumpSystem, held
-from msg_analysis.theory.krylov import plain_conjugate_gradients
 from msg_analysis.theory.lyapunov import LocalSolves
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.solvers import DenseSolver, IterativeSolver
@@ -94,6 +90,7 @@ def test_what_is_chosen():
     def method(model):
         solver = MomentSolver(model)
         solver.steady()
+        assert solver.report.iterations < 30
         return solver.report.method, solver.report.preconditioner
 
     assert method(system(random, 8, reversible)) == ("cg", "two-level")
@@ -116,66 +113,6 @@ def test_graphs_that_rather_alternate_do_not_use_the_average():
     assert solver.report.preconditioner == "two-level"
     moved = 0.5 * model.noise + model.matrices @ second @ model.matrices.transpose(0, 2, 1)
     np.testing.assert_allclose(np.tensordot(chain.T, moved, axes=1), second, rtol=1e-9, atol=1e-9 * second.max())
-
-
-@pytest.mark.parametrize("dt", [None, 0.01])
-@pytest.mark.parametrize("reversible", [True, False])
-def test_the_averaged_equations_are_the_equations_in_other_coordinates(dt, reversible):
-    """(I + S) U is the right-hand side that X = M^-1/2 U solves, by the equations written out."""
-    random = np.random.default_rng(15)
-    model = system(random, 14, generator(random, 3, 3.0, reversible=reversible), dt=dt)
-    averaged = AveragedEquations(CoupledEquations(model))
-    assert averaged.definite == reversible
-    inside = random.standard_normal((2, 3, 13, 13)).astype(np.float32)
-    inside += inside.swapaxes(-1, -2)
-    x, scale = np.zeros(inside.shape), np.array([1.0, 1e3])
-    averaged.leave(inside, scale, x)
-    law, z = model.stationary, model.matrices
-    weighted = law[:, None, None] * x
-    if dt is None:
-        right = z @ weighted + weighted @ z - np.einsum("ji,qjab->qiab", model.chain, weighted)
-    else:
-        right = weighted - np.einsum("ji,qjab->qiab", model.chain, z @ weighted @ z)
-    expected = averaged.enter(right / law[:, None, None], scale)
-    limit = 1e-5 * np.abs(expected).max()
-    np.testing.assert_allclose(averaged.apply(inside), expected, rtol=0, atol=limit)
-    assert averaged.definite == (np.abs(_matrix(averaged) - _matrix(averaged).T).max() < 1e-5)
-    rough = averaged.apply(inside, 1.0)
-    assert np.abs(rough - expected).max() < (limit if dt is None else 0.05 * np.abs(expected).max())
-    same = np.broadcast_to(np.eye(13), inside.shape)
-    almost = same.copy()
-    almost[:, 0, 0, 0] += 1e-9  # not recognised as equal in all graphs
-    np.testing.assert_allclose(averaged.enter(same, scale), averaged.enter(almost, scale), rtol=1e-5, atol=1e-5)
-
-
-def _matrix(averaged):
-    """I + S for diagonal unknowns: enough to see whether it is symmetric."""
-    columns = []
-    for i, a in np.ndindex(3, 13):
-        unit = np.zeros((1, 3, 13, 13), np.float32)
-        unit[0, i, a, a] = 1.0
-        columns.append(np.diagonal(averaged.apply(unit)[0], axis1=1, axis2=2).ravel().copy())
-    return np.array(columns).T
-
-
-def test_plain_conjugate_gradients_solve_several_systems_at_once():
-    """Against numpy; a right-hand side that is zero gives zero."""
-    random = np.random.default_rng(16)
-    root = random.standard_normal((18, 18))
-    matrix = root @ root.T / 18 + np.eye(18)
-    right = random.standard_normal((3, 2, 3, 3))
-    right[1] = 0.0
-    asked = []
-
-    def apply(x, accuracy):
-        asked.append(accuracy)
-        return (x.reshape(3, 18) @ matrix).reshape(x.shape)
-
-    found, used = plain_conjugate_gradients(apply, right.copy(), np.full(3, 1e-12), 50)
-    assert used == len(asked) <= 25
-    assert asked == sorted(asked)
-    np.testing.assert_allclose(found.reshape(3, 18), np.linalg.solve(matrix, right.reshape(3, 18).T).T, atol=1e-10)
-    assert plain_conjugate_gradients(apply, right.copy(), np.full(3, 1e-12), 4)[1] == 4
 
 
 PERIODIC = np.roll(np.eye(4), 1, axis=1)
@@ -265,19 +202,15 @@ def test_drift_that_pushes_away_is_refused():
         MomentSolver(model).steady()
 
 
-def test_no_convergence_is_an_error_or_a_dense_solve(monkeypatch):
-    monkeypatch.setattr(solvers, "MAX_ITERATIONS", 2)
-    monkeypatch.setattr(solvers, "MAX_RELATIVE_ERROR", 1e-14)
+def test_no_convergence_is_an_error_or_a_dense_solve():
     random = np.random.default_rng(12)
     model = system(random, 12, generator(random, 4), "directed")
-    with pytest.raises(InputError, match="iterations do not converge"):
-        IterativeSolver(model).steady()
     unknowns = 4 * 11 * 12 // 2
-    solver = MomentSolver(model, most_dense=unknowns)
+    solver = MomentSolver(model, most_dense=unknowns, most_iterations=2)
     solver.steady()
     assert solver.report.method == "dense"
     with pytest.raises(InputError, match="iterations do not converge"):
-        MomentSolver(model, most_dense=unknowns - 1).steady()
+        MomentSolver(model, most_dense=unknowns - 1, most_iterations=2).steady()
 
 
 def test_many_forms_are_solved_in_batches():
@@ -286,15 +219,3 @@ def test_many_forms_are_solved_in_batches():
     forms = np.stack([a + a.T for a in random.standard_normal((7, 8, 8))])
     together = IterativeSolver(model).dual(forms)
     np.testing.assert_allclose(IterativeSolver(model, chunk=400).dual(forms), together, rtol=1e-10, atol=1e-12)
-
-
-@pytest.mark.parametrize("d", [0, 1, 2, 5])
-def test_packed_matrices_keep_the_inner_product_and_adjoints(d):
-    w, *others = np.random.default_rng(1).standard_normal((3, d, d))
-    a, b = (other + other.T for other in others)
-    assert symmetric.pack(a).shape == (symmetric.size(d),)
-    np.testing.assert_allclose(symmetric.unpack(symmetric.pack(a), d), a, rtol=1e-15)
-    assert symmetric.pack(a) @ symmetric.pack(b) == pytest.approx(np.trace(a @ b), abs=1e-12)
-    lyapunov = symmetric.lyapunov(w)
-    np.testing.assert_allclose(lyapunov @ symmetric.pack(a), symmetric.pack(w @ a + a @ w.T), atol=1e-12)
-    np.testing.assert_allclose(lyapunov.T @ symmetric.pack(a), symmetric.pack(w.T @ a + a @ w), atol=1e-12)
