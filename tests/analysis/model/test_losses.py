@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from experiments import Experiment, line_ring
 from msg_analysis.experiment.problems import ExperimentError
-from msg_analysis.model.reception import NOTHING, Air, Losses, loss_probabilities
+from msg_analysis.model.reception import Air, Losses, loss_probabilities
 
 BLOCK = 256
 
@@ -132,20 +132,6 @@ def test_the_law_of_bursts(loss: float, burst: float | None) -> None:
     assert runs.mean() == pytest.approx(mean, abs=5 * max(runs.std(), 1e-9) / np.sqrt(len(runs)))
 
 
-def test_links_are_independent_and_long_enough_bursts_end() -> None:
-    what = lossy({"loss": 0.5, "burst": 100.0})
-    chain = Losses(what)
-    one, other = (np.concatenate([chain.block(*link, number) for number in range(2000)]) for link in ((0, 1), (1, 0)))
-    assert abs(np.corrcoef(one[::1000], other[::1000])[0, 1]) < 4 / np.sqrt(512)
-
-
-def test_without_bursts_or_with_just_their_length_losses_are_the_same() -> None:
-    """Mean length 1 / (1 - p): a power of 2, for which the probabilities are exact."""
-    plain, bursts = Losses(lossy({"loss": 0.5})), Losses(lossy({"loss": 0.5, "burst": 2.0}))
-    for number in range(-2, 5):
-        assert np.array_equal(plain.block(2, 1, number), bursts.block(2, 1, number))
-
-
 NOISES = st.one_of(
     st.builds(lambda p: {"loss": p}, st.floats(0.01, 0.95)),
     st.builds(lambda p, b: {"loss": p, "burst": p / (1 - p) * 1.01 + b}, st.floats(0.01, 0.95), st.floats(1, 600)),
@@ -169,14 +155,6 @@ def test_any_block_alone_is_the_same(noise: dict[str, Any], seed: int, blocks: l
         expected = sources[number * BLOCK : (number + 1) * BLOCK]
         assert air.sources(1, 2, number).tolist() == expected
         assert Air(what).sources(1, 2, number).tolist() == expected
-
-
-@given(noise=NOISES, seed=st.integers(0, 9), number=st.integers(0, 3))
-def test_own_values_stand_for_lost_ones(noise: dict[str, Any], seed: int, number: int) -> None:
-    what = lossy(noise, run={"seed": seed})
-    lost = Losses(what).block(0, 2, number)
-    steps = number * BLOCK + np.arange(BLOCK)
-    assert Air(what).sources(0, 2, number).tolist() == np.where(lost, NOTHING, steps).tolist()
 
 
 def test_probabilities_are_stationary() -> None:
