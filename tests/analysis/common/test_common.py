@@ -86,7 +86,7 @@ def test_commands_refuse_hostile_text(tmp_path: Path) -> None:
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag/metadata.yaml").write_text(f"{bomb(9)}\nrosbag2_bagfile_information: {{files: *q8}}\n")
     places, out = [str(tmp_path / "bomb"), str(tmp_path / "bag"), "/dev/zero"], ["--out", str(tmp_path / "out")]
-    commands = [["info"], ["predict"], ["simulate", *out], ["compare"], ["tabulate"], ["sweep", *out]]
+    commands = [["info"], ["simulate", *out], ["compare"], ["tabulate"], ["sweep", *out]]
     jobs = [["msg-analysis", [word, place, *more], "memory"] for word, *more in commands for place in places]
     for job, (code, stdout, stderr) in zip(jobs, many_commands.outcomes(jobs, tmp_path, NO_COLOR="1"), strict=True):
         assert (code, stdout) == (2, ""), (job, stderr)

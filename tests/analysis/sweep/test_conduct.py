@@ -13,7 +13,6 @@ import pytest
 import yaml
 
 import experiments
-from experiments import Experiment, simulate
 from msg_analysis.errors import InputError
 from msg_analysis.sweeps import workers as conducting
 from msg_analysis.sweeps.grid import load_sweep
@@ -69,16 +68,6 @@ def test_ctrl_c_while_an_outcome_is_written(tmp_path: Path, monkeypatch: pytest.
         with pytest.raises(KeyboardInterrupt):
             run_jobs([Job.of("predict", document(rate)) for rate in (0.5, 1.0)], store)
         assert len(store.outcomes) == (tmp_path / JOURNAL).read_bytes().count(b"\n") == 1
-
-
-def test_simulated_runs_are_those_of_the_twin() -> None:
-    """Mean square of the disagreement, by numpy."""
-    what = document(seed=5)
-    outcome = evaluate(Job.of("simulate", what))
-    states = simulate(Experiment.parse(what)).values[:-1]
-    deviations = states - states.mean(axis=1, keepdims=True)
-    assert outcome.result["system_error"]["measured"] == pytest.approx(float((deviations**2).sum(axis=1).mean()))
-    assert outcome.result["steps"] == 1000
 
 
 def test_what_fails_fails_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,8 +8,7 @@ import pytest
 
 from experiments import line_ring, predict, simulate
 from msg_analysis.model.graph_path import past_modes
-from msg_analysis.model.reception import ideal_uses
-from msg_analysis.model.step_model import build_run_model, build_step_model, phases, sequential
+from msg_analysis.model.step_model import build_run_model, build_step_model, phases
 
 CORRELATED = [[1.0, 0.3, 0.0, 0.0], [0.0, 0.5, 0.2, 0.0], [0.0, 0.0, 2.0, 0.0], [0.1, 0.0, 0.0, 0.7]]
 GRAPHS = {"a": {"path": [1, 2, 3, 4]}, "b": {"arcs": [[1, 2], [2, 3, 2.0], [3, 1], [1, 3], [3, 4], [4, 1]]}}
@@ -52,14 +51,6 @@ def test_a_period_is_its_micro_steps(case):
         np.testing.assert_allclose(found, x, atol=1e-13)
         np.testing.assert_allclose(run.noise[mode], run.noise_gain[mode] @ run.noise_gain[mode].T, atol=1e-15)
     np.testing.assert_allclose(run.weights.sum(axis=2), 1.0 - run.offsets / (what.reference or 1.0), atol=1e-14)
-
-
-def test_who_is_due_first_does_not_hear_the_others():
-    step = build_step_model(CASES["consensus"])
-    run = sequential(step, np.array([0.9, 0.1, 0.5, 0.3]))
-    np.testing.assert_array_equal(run.weights[:, 1], step.weights[:, 1])
-    uses = ideal_uses(step, np.array([0.9, 0.1, 0.5, 0.3]))
-    assert uses[0].tolist() == [[1, -1], [0, 0], [1, 1], [0, -1]]
 
 
 @pytest.mark.parametrize("case", CASES)

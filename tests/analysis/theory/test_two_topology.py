@@ -17,7 +17,7 @@ from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.graph_indices import MAX_UNKNOWNS, two_topology
 from msg_analysis.theory.moments import MomentSolver
 
-MODELS = settings(max_examples=25, deadline=None, derandomize=True)
+MODELS = settings(max_examples=40, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
 
 
@@ -35,12 +35,21 @@ def with_rate(system, rate):
     st.sampled_from(["consensus", "tracking", "grounded"]),
     st.sampled_from(["continuous", "emulated", "discrete"]),
     st.booleans(),
+    st.booleans(),
 )
-def test_closed_form_is_the_solution_of_the_coupled_equations(seed, m, problem, law, directed):
+def test_closed_form_is_the_solution_of_the_coupled_equations(seed, m, problem, law, directed, uneven):
+    """Uneven: noise, and in steps losses, depend on the graph."""
     gain, time = np.inf if problem == "grounded" else 0.7, "discrete" if law == "discrete" else "continuous"
     kind = "consensus" if problem == "consensus" else "tracking"
     experiment = network(seed, m, 2, problem=kind, gain=gain, time=time, directed=directed, dt=0.01)
     system = systems.continuous(experiment) if law == "continuous" else predict(experiment).system
+    random, d = np.random.default_rng(seed), system.dimension
+    if uneven:
+        f = random.standard_normal((2, d, d))
+        system = dataclasses.replace(system, noise=f @ f.transpose(0, 2, 1))
+    if uneven and law != "continuous":
+        most = 0.01 if law == "discrete" else 1e-4  # for steps that are still stable
+        system = dataclasses.replace(system, loss_variance=random.uniform(0.0, most, (2, m, m)))
     covariance = system.lifted(MomentSolver(system).steady().sum(axis=0))
     found = two_topology(system)
     np.testing.assert_allclose(found.node_errors, np.diag(covariance), rtol=1e-9, atol=1e-13)
@@ -48,21 +57,6 @@ def test_closed_form_is_the_solution_of_the_coupled_equations(seed, m, problem, 
     held = [MomentSolver(systems.held(system, mode)).steady()[0] for mode in range(2)]
     static = sum(share * np.diag(system.lifted(c)) for share, c in zip(system.stationary, held, strict=True))
     np.testing.assert_allclose(found.static, static, rtol=1e-9, atol=1e-13)
-
-
-@MODELS
-@given(seeds, st.integers(2, 5), st.sampled_from(["continuous", "discrete"]))
-def test_noise_and_loss_that_depend_on_the_graph(seed, m, time):
-    random = np.random.default_rng(seed)
-    experiment = network(seed, m, 2, time=time, directed=False, dt=0.01)
-    system = systems.continuous(experiment) if time == "continuous" else predict(experiment).system
-    d = system.dimension
-    f = random.standard_normal((2, d, d))
-    system = dataclasses.replace(system, noise=f @ f.transpose(0, 2, 1))
-    if time == "discrete":
-        system = dataclasses.replace(system, loss_variance=random.uniform(0.0, 0.01, (2, m, m)))
-    covariance = system.lifted(MomentSolver(system).steady().sum(axis=0))
-    np.testing.assert_allclose(two_topology(system).node_errors, np.diag(covariance), rtol=1e-9, atol=1e-12)
 
 
 def exact_error(z, pi, q, beta):
