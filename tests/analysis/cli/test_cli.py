@@ -74,12 +74,11 @@ def test_bad_files_are_errors_of_the_user(command: str, tmp_path: Path) -> None:
     assert "nope.yaml: no such file" in missing.stderr
 
 
-def test_real_time_is_predicted_in_turn(tmp_path: Path) -> None:
-    file = tmp_path / "file.yaml"
-    file.write_text("name: a\ngraphs: {line: {path: [1, 2]}}\nrun: {pace: realtime}\n")
-    assert "sequential steps" in call("predict", file).stdout
-    for path, law in ((file, "sequential"), (LINE_RING, "synchronous")):
-        assert json.loads(call("predict", path, "--json").stdout)["emulated"]["law"] == law
+def test_real_time_is_predicted_in_turn() -> None:
+    assert "sequential steps" in call("predict", LINE_RING, "--set", "run.pace=realtime").stdout
+    for pace, law in (("realtime", "sequential"), ("lockstep", "synchronous")):
+        result = call("predict", LINE_RING, "--set", f"run.pace={pace}", "--json")
+        assert json.loads(result.stdout)["emulated"]["law"] == law
 
 
 def test_simulate_writes_a_bag_and_never_overwrites(bag: Path) -> None:

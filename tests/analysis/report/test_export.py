@@ -170,23 +170,19 @@ def test_mistakes(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         result = export(*arguments)
         assert (result.exit_code, result.stdout) == (2, "")
         assert words in result.stderr
-    run = read_bag(bag)
-    with pytest.raises(InputError, match="to_dataframe: 'nodes': expected one of states, graphs, errors"):
-        run.to_dataframe("nodes")  # type: ignore[arg-type]
-    monkeypatch.setitem(sys.modules, "pandas", None)  # as if it were not installed
-    with pytest.raises(NotAvailableError, match=r"pandas is not installed: .*: pip install pandas"):
-        run.to_dataframe()
-
-
-def test_rerun_is_not_installed(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is told before anything is read or written."""
-    monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.setitem(sys.modules, "rerun", None)  # as if it were not installed, which is told first
     result = export(bag, "--csv", "--rrd", "--out", tmp_path / "data")
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr == (
         "error: --rrd: rerun-sdk is not installed: expected it for recordings of Rerun: pip install rerun-sdk\n"
     )
     assert not (tmp_path / "data").exists()
+    run = read_bag(bag)
+    with pytest.raises(InputError, match="to_dataframe: 'nodes': expected one of states, graphs, errors"):
+        run.to_dataframe("nodes")  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(NotAvailableError, match=r"pandas is not installed: .*: pip install pandas"):
+        run.to_dataframe()
 
 
 def test_files_are_replaced_whole_or_not_at_all(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

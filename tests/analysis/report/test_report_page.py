@@ -190,8 +190,7 @@ EVIL = "</script><img src=http://x onerror=alert(1)>"
 
 def test_rows_links_and_data(tmp_path: Path) -> None:
     """Newest first; the experiment of a bag is in it once, however many runs have it."""
-    document = {"name": "pair", "graphs": {"line": {"path": [1, 2, 3]}}, "run": {"dt": 0.1, "duration": 5, "seed": 7}}
-    run = Experiment.parse(document | {"run": document["run"] | {"start": "zero"}}).simulate()
+    run = line_ring(run={"dt": 0.1, "duration": 5, "seed": 7, "start": "zero"}).simulate()
     names = ("pair 1_20261125_120000", "pair_20261126_120000")
     for name in names:
         run.save(tmp_path / "runs" / name)
@@ -229,11 +228,9 @@ def test_hostile_names_of_runs(tmp_path: Path) -> None:
 
 
 def test_long_values_are_short_and_differ(tmp_path: Path) -> None:
-    document = {"name": "ring", "graphs": {"ring": {"cycle": list(range(1, 151))}}, "run": {"dt": 0.1, "duration": 1}}
     for name, last in (("a", [149, 150]), ("b", [150, 149])):
-        document["graphs"] = {"ring": {"cycle": [*range(1, 149), *last]}}
-        document["run"] = {"dt": 0.1, "duration": 1, "start": "zero"}
-        Experiment.parse(document).simulate().save(tmp_path / name)
+        ring = {"ring": {"cycle": [*range(1, 149), *last]}}
+        line_ring(graphs=ring, switching={}, run={"duration": 1, "start": "zero"}).simulate().save(tmp_path / name)
     data = json.loads(Page(render_runs(list_runs(tmp_path), tmp_path, tmp_path)).data)
     values = [each["graphs.ring.cycle"] for each in data["documents"] if "name" in each]
     assert len(set(values)) == 2

@@ -7,21 +7,16 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from experiments import TRACKING, line_ring, predict
 from msg_analysis import Experiment, InputError
-from msg_analysis.theory.prediction import predict
 from msg_analysis.theory.spectrum import spectrum
-
-
-def one_graph() -> Experiment:
-    run = {"dt": 0.1, "duration": 100}
-    graph = {"ring": {"cycle": [1, 2, 3, 4]}}
-    leaders = {"agents": [1], "gain": 0.5}
-    return Experiment.parse({"name": "one", "problem": "tracking", "leaders": leaders, "graphs": graph, "run": run})
 
 
 def test_one_graph_is_a_vector_autoregression() -> None:
     """R(l) = W^l C, and the density (1 - W z)^-1 N (1 - W z)^-* at z = exp(-i w)."""
-    prediction = predict(one_graph())
+    prediction = predict(
+        line_ring(4, graphs={"ring": {"cycle": [1, 2, 3, 4]}}, switching={}, run={"dt": 0.1}, **TRACKING)
+    )
     weights, noise = prediction.step.weights[0], prediction.step.noise[0]
     steady = scipy.linalg.solve_discrete_lyapunov(weights, noise)
     frequencies = np.array([0.0, 0.3, 1.0, 4.9, 5.0])
@@ -102,8 +97,7 @@ def test_in_python_and_without_noise() -> None:
     assert found.to_json()["lags"] == [0.0, 0.05]
     assert "Spectrum of 'line_ring'" in repr(found)
     assert [len(axes.get_lines()) for axes in found.plot().axes] == [7, 6]
-    quiet = {"name": "q", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "noise": {"process": 0.0}}
-    found = spectrum(predict(Experiment.parse(quiet | {"run": {"duration": 10, "start": "zero"}})))
+    found = spectrum(predict(line_ring(noise={"process": 0.0})))
     assert not found.system_autocovariance.any()
     assert not found.system_density.any()
 
