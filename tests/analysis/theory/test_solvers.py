@@ -9,11 +9,10 @@ import pytest
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from switching_systems import generator, laplacian, system
+from switching_systems import generator, system
 
 from msg_analysis.errors import InputError
 from msg_analysis.theory.jump_system import JumpSystem, held
-from msg_analysis.theory.lyapunov import LocalSolves
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.solvers import DenseSolver, IterativeSolver
 
@@ -146,30 +145,6 @@ def test_one_graph_is_the_h2_norm(kind):
     root = np.linalg.cholesky(model.noise[0])
     plant = control.ss(-model.matrices[0], root, np.eye(6), np.zeros((6, 6)))
     assert np.trace(MomentSolver(model).steady()[0]) == pytest.approx(control.system_norm(plant, 2) ** 2, rel=1e-8)
-
-
-@pytest.mark.parametrize("time", ["continuous", "discrete"])
-@pytest.mark.parametrize("kind", ["symmetric", "directed", "chain"])
-def test_single_graphs_are_scipys(time, kind):
-    """The building block, in both directions, with a rate of leaving."""
-    random = np.random.default_rng(10)
-    drift = np.stack([laplacian(random, 9, kind)[1:, 1:] * 0.1 for _ in range(2)])
-    right = np.stack([a @ a.T for a in random.standard_normal((2, 8, 8))])
-    leaving = np.array([0.5, 0.125])
-    solves = LocalSolves(time, drift, leaving)
-    assert (solves.eigenvectors is None) == (kind == "chain")
-    for local, matrices in ((solves, drift), (solves.transposed(), drift.transpose(0, 2, 1))):
-        found, moved = local(right)
-        for x, y, d, f, a in zip(found, moved, matrices, right, leaving, strict=True):
-            if time == "continuous":
-                expected = scipy.linalg.solve_continuous_lyapunov(d + 0.5 * a * np.eye(8), f)
-                after = expected
-            else:
-                w = np.eye(8) - d
-                expected = scipy.linalg.solve_discrete_lyapunov(np.sqrt(1.0 - a) * w, f)
-                after = w @ expected @ w.T
-            np.testing.assert_allclose(x, expected, rtol=1e-8, atol=1e-10)
-            np.testing.assert_allclose(y, after, rtol=1e-8, atol=1e-10)
 
 
 def test_union_that_does_not_connect_is_refused():
