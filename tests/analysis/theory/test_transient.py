@@ -185,27 +185,11 @@ def test_sixty_agents_in_continuous_time():
     np.testing.assert_allclose(found.system_error, expected, rtol=1e-9)
     rates = asymptotic_rates(system)
     assert rates.second_moment == pytest.approx(2 * values[0], rel=1e-6)
+    assert rates.graph is None
     both = systems.continuous(experiment)
     settled = settling_time(both, steady_of(both), point_start(both, np.zeros(m)))
     at = transient.transient(both, point_start(both, np.zeros(m)), np.array([settled]), steady_of(both))
     assert at.system_error[0] / np.trace(steady_of(both).sum(axis=0)) == pytest.approx(0.95, rel=1e-8)
-
-
-def test_uniform_grids_of_many_times():
-    system = systems.continuous(Experiment.parse(LINE_RING))
-    steady, start = steady_of(system), point_start(system, np.arange(5.0))
-    times = 0.1 * np.arange(301)
-    found = transient.transient(system, start, times, steady)
-    for k in (1, 77, 300):
-        one = transient.transient(system, start, times[k : k + 1], steady)
-        np.testing.assert_allclose(found.moments[k], one.moments[0], rtol=1e-11, atol=1e-13)
-
-
-@pytest.mark.parametrize("times", [[], [-1.0], [1.0, 0.5], [np.nan]])
-def test_times_that_are_none(times):
-    system = systems.continuous(Experiment.parse(LINE_RING))
-    with pytest.raises(InputError, match="ascending"):
-        transient.transient(system, point_start(system, np.zeros(5)), np.array(times))
 
 
 def test_delay_and_loss():
@@ -223,16 +207,14 @@ def test_delay_and_loss():
     np.testing.assert_allclose(found.node_errors[2], prediction.emulated.node_errors, rtol=1e-10)
 
 
-def test_memory_of_large_systems():
-    system = systems.continuous(Experiment.parse(LINE_RING))
-    stack = transient.joint_stack(point_start(system, np.zeros(5)))
-    with pytest.raises(InputError, match=r"2 graphs of 5 agents need 0.0 GB in continuous time"):
-        RationalFlow(system, stack, 1.0, decays=False, most_bytes=1.0)
-
-
 def test_what_is_refused():
     prediction = predict(Experiment.parse(LINE_RING))
     system, start = prediction.system, point_start(prediction.system, np.zeros(5))
+    for times in ([], [-1.0], [1.0, 0.5], [np.nan]):
+        with pytest.raises(InputError, match="ascending"):
+            transient.transient(system, start, np.array(times))
+    with pytest.raises(InputError, match=r"2 graphs of 5 agents need 0.0 GB in continuous time"):
+        RationalFlow(system, transient.joint_stack(start), 1.0, decays=False, most_bytes=1.0)
     with pytest.raises(InputError, match="whole numbers of steps"):
         transient.transient(system, start, np.array([0.5]), prediction.steady)
     with pytest.raises(InputError, match="settling fraction"):
@@ -262,17 +244,6 @@ def test_settling_time_is_the_last_crossing(law, place):
     assert found in (0.0, last + 1) or abs(at / error - 1) == pytest.approx(0.05, rel=1e-6)
     # Without the matrix of the whole, as large systems do it.
     assert settling_time(system, steady, start, most_unknowns=1) == pytest.approx(found, rel=1e-9)
-
-
-def test_settling_of_one_pair_in_closed_form():
-    """Two agents, one edge: the disagreement has variance (1 - exp(-4 t)) / 4, settled at log(20) / 4."""
-    document = LINE_RING | {"graphs": {"pair": {"path": [1, 2]}}, "switching": {}}
-    system = systems.continuous(Experiment.parse(document))
-    steady = steady_of(system)
-    assert settling_time(system, steady, point_start(system, np.zeros(2))) == pytest.approx(np.log(20) / 4, rel=1e-9)
-    rates = asymptotic_rates(system)
-    assert (rates.mean, rates.second_moment) == (pytest.approx(2.0), pytest.approx(4.0))
-    assert rates.graph is None
 
 
 def test_settled_from_the_start_and_slow_graphs():
