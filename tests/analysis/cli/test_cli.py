@@ -78,14 +78,6 @@ def test_real_time_is_predicted_in_turn() -> None:
         assert json.loads(result.stdout)["emulated"]["law"] == law
 
 
-def test_simulate_writes_a_bag_and_never_overwrites(bag: Path) -> None:
-    before = {file: file.read_bytes() for file in bag.iterdir()}
-    result = call("simulate", LINE_RING, "--out", bag)
-    assert result.exit_code == 2
-    assert f"{bag}: exists already" in result.stderr
-    assert {file: file.read_bytes() for file in bag.iterdir()} == before
-
-
 def test_simulate_names_the_bag_after_the_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert call("simulate", LINE_RING, "--duration", "1").stdout == "line_ring_twin\n"

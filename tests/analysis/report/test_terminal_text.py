@@ -167,6 +167,8 @@ def test_experiment_explained() -> None:
     shares = [1, 0.25, 0.125]  # detailed balance: share times rate is equal both ways
     assert [graph["stationary"] for graph in document["graphs"]] == pytest.approx([s / sum(shares) for s in shares])
     assert document["memory"]["states"] == 1001 * 4 * 2 * 8
+    (alone,) = describe_experiment(Experiment.parse({"name": "one", "graphs": {"line": {"path": [1, 2]}}}))["graphs"]
+    assert (alone["mean_holding_time"], alone["stationary"]) == (None, 1.0)  # it is never left
     output = shown(tables.print_experiment, document)
     for part in ("tracking of 4 agents in continuous time", "gain inf", "1000 of 0.05", "1>2 (0.5)", "1-2, 2-3, 3-4"):
         assert part in output
@@ -189,13 +191,6 @@ def test_noise_by_graph_and_delay_explained() -> None:
     output = " ".join(shown(tables.print_experiment, document).split())
     assert "line: 1.0; ring: [0.5, 1.0, 1.0, 2.0]; arcs: matrix 4 x 4" in output
     assert "delay 2" in output
-
-
-def test_one_graph_that_is_never_left() -> None:
-    plain = {"name": "one", "graphs": {"line": {"path": [1, 2]}}}
-    (graph,) = describe_experiment(Experiment.parse(plain))["graphs"]
-    assert graph["mean_holding_time"] is None
-    assert graph["stationary"] == 1.0
 
 
 def test_bag() -> None:

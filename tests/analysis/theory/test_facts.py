@@ -23,8 +23,8 @@ def switching_among(graphs, *, agents, time="continuous", seed=0, chain=None, **
     return line_ring(agents=agents, graphs=graphs, time=time, switching=switching, run=run, **changes)
 
 
-def facts_of(*graphs, **changes):
-    return {fact.name: fact for fact in check_facts(switching_among(*graphs, **changes))}
+def facts_of(graphs, **changes):
+    return {fact.name: fact for fact in check_facts(switching_among(graphs, **changes))}
 
 
 def closed_classes(graph):

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from switching_systems import network
 
-from experiments import predict
+from experiments import line_ring, predict
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.theory.graph_indices import error_bounds, graph_indices
 
@@ -75,3 +75,15 @@ def test_no_bounds_where_they_do_not_hold(directed, noise, reason):
     bounds = error_bounds(predict(network(2, 4, 2, directed=directed).with_noise(**noise)))
     assert (bounds.lower, bounds.upper) == (None, None)
     assert reason in bounds.note
+
+
+def test_in_discrete_time_the_averaged_graph_is_no_lower_bound():
+    """Two agents whose disagreement is multiplied by .95 and .85 in turn do better than with .9 all the time."""
+    weights = [-np.log(0.95) / 2, -np.log(0.85) / 2]
+    graphs = {"weak": {"edges": [[1, 2, weights[0]]]}, "strong": {"edges": [[1, 2, weights[1]]]}}
+    switching = {"transition": [[0.001, 0.999], [0.999, 0.001]]}
+    prediction = predict(line_ring(time="discrete", graphs=graphs, switching=switching))
+    assert prediction.emulated.system_error < 1 / (1 - 0.9**2) - 0.05
+    bounds = error_bounds(prediction)
+    assert bounds.lower is None
+    assert prediction.emulated.system_error < bounds.upper

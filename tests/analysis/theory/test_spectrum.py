@@ -1,7 +1,6 @@
 """Autocovariance and density: one graph in closed form, brute force, and integrals."""
 
 import itertools
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,24 +30,16 @@ def test_one_graph_is_a_vector_autoregression() -> None:
     assert found.times == pytest.approx([0.0, 0.1, 0.7, 4.0])
 
 
-LAWS: dict[str, dict[str, Any]] = {
-    "line_ring": {},
-    "tracking": {},
-    "discrete": {},
-    "lossy_links": {},
-    "line_ring_realtime": {},
-    "delay": {"noise": {"process": 1.0, "delay": 3}},
-    "hold": {"noise": {"process": 1.0, "loss": 0.4, "on_loss": "hold", "broadcast": 0.2}},
+NAMES = "line_ring", "tracking", "discrete", "lossy_links", "line_ring_realtime"
+LAWS = {name: Experiment.load(name) for name in NAMES} | {
+    "delay": line_ring(5, 0.5, noise={"delay": 3}),
+    "hold": line_ring(5, 0.5, noise={"loss": 0.4, "on_loss": "hold", "broadcast": 0.2}),
 }
-
-
-def of(law: str) -> Experiment:
-    return Experiment.parse(Experiment.load(law if "noise" not in LAWS[law] else "line_ring").to_document() | LAWS[law])
 
 
 @pytest.mark.parametrize("law", LAWS)
 def test_lag_0_and_the_integral_are_the_predicted_covariance(law: str) -> None:
-    prediction = predict(of(law))
+    prediction = predict(LAWS[law])
     frequencies = np.linspace(0.0, 0.5 / prediction.step.dt, 4001)
     found = spectrum(prediction, np.array([0]), frequencies)
     assert found.covariances[0] == pytest.approx(prediction.emulated.covariance, rel=1e-12, abs=1e-14)
@@ -61,7 +52,7 @@ def test_lag_0_and_the_integral_are_the_predicted_covariance(law: str) -> None:
 @pytest.mark.parametrize("law", LAWS)
 def test_the_sum_over_all_paths(law: str) -> None:
     """E[e(k + l) e(k)^T]: every path of so many graphs, with its probability."""
-    prediction = predict(of(law))
+    prediction = predict(LAWS[law])
     system, lag = prediction.system, 4
     expected = np.zeros((system.dimension,) * 2)
     for path in itertools.product(range(system.modes), repeat=lag):
@@ -76,7 +67,7 @@ def test_the_sum_over_all_paths(law: str) -> None:
 
 @pytest.mark.parametrize("law", LAWS)
 def test_the_density_is_the_sum_over_lags(law: str) -> None:
-    prediction = predict(of(law))
+    prediction = predict(LAWS[law])
     lags = np.arange(4000)
     frequency = 0.37
     found = spectrum(prediction, lags, np.array([frequency]))
@@ -85,7 +76,7 @@ def test_the_density_is_the_sum_over_lags(law: str) -> None:
 
 
 def test_default_lags_end_where_little_is_left() -> None:
-    found = spectrum(predict(of("line_ring")))
+    found = spectrum(predict(LAWS["line_ring"]))
     assert found.lags[0] == 0
     assert len(found.lags) <= 200
     assert abs(found.system_autocovariance[-1]) == pytest.approx(0.01 * found.system_autocovariance[0], rel=0.05)
@@ -93,7 +84,7 @@ def test_default_lags_end_where_little_is_left() -> None:
 
 
 def test_in_python_and_without_noise() -> None:
-    found = of("line_ring").spectrum([0, 1], [0.0, 1.0])
+    found = LAWS["line_ring"].spectrum([0, 1], [0.0, 1.0])
     assert found.to_json()["lags"] == [0.0, 0.05]
     assert "Spectrum of 'line_ring'" in repr(found)
     assert [len(axes.get_lines()) for axes in found.plot().axes] == [7, 6]
@@ -103,7 +94,7 @@ def test_in_python_and_without_noise() -> None:
 
 
 def test_refused() -> None:
-    prediction = predict(of("line_ring"))
+    prediction = predict(LAWS["line_ring"])
     for lags in ([], [-1, 2], [3, 3]):
         with pytest.raises(InputError, match="lags: expected ascending whole numbers"):
             spectrum(prediction, np.array(lags, dtype=np.int64))
