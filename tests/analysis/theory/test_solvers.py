@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from switching_systems import generator, system
 
 from msg_analysis.errors import InputError
+from msg_analysis.theory.coupled_equations import AveragedEquations, CoupledEquations
 from msg_analysis.theory.jump_system import JumpSystem, held
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.solvers import DenseSolver, IterativeSolver
@@ -74,12 +75,14 @@ def test_large_systems_in_single_precision_are_as_accurate(rate, dt, reversible)
     random = np.random.default_rng(4)
     model = system(random, 90, generator(random, 3, rate, reversible=reversible), dt=dt)
     solver = IterativeSolver(model)
-    measured, dual = solver.steady(), solver.dual(np.eye(89)[None])
+    forms = np.stack([np.eye(89), np.zeros((89, 89))])
+    measured, (dual, nothing) = solver.steady(), solver.dual(forms)
+    assert not nothing.any()
     reference = IterativeSolver(model, single_from=1000)
     expected = reference.steady()
     assert reference.report.preconditioner == "two-level"
     np.testing.assert_allclose(measured, expected, rtol=1e-11, atol=1e-11 * expected.max())
-    np.testing.assert_allclose(dual, reference.dual(np.eye(89)[None]), rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(dual, reference.dual(forms)[0], rtol=1e-10, atol=1e-10)
 
 
 def test_what_is_chosen():
@@ -112,6 +115,15 @@ def test_graphs_that_rather_alternate_do_not_use_the_average():
     assert solver.report.preconditioner == "two-level"
     moved = 0.5 * model.noise + model.matrices @ second @ model.matrices.transpose(0, 2, 1)
     np.testing.assert_allclose(np.tensordot(chain.T, moved, axes=1), second, rtol=1e-9, atol=1e-9 * second.max())
+
+
+def test_right_sides_that_are_equal_in_all_graphs_are_like_others():
+    random = np.random.default_rng(15)
+    averaged = AveragedEquations(CoupledEquations(system(random, 14, generator(random, 3, reversible=True))))
+    same, scale = np.broadcast_to(np.eye(13), (2, 3, 13, 13)), np.array([1.0, 1e3])
+    almost = same.copy()
+    almost[:, 0, 0, 0] += 1e-9  # not recognised as equal
+    np.testing.assert_allclose(averaged.enter(same, scale), averaged.enter(almost, scale), rtol=1e-5, atol=1e-5)
 
 
 PERIODIC = np.roll(np.eye(4), 1, axis=1)
