@@ -240,13 +240,9 @@ ROOT = Path(__file__).parents[3]
 EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"
 
 
-def leaders(*arguments: str | Path) -> dict:
-    return document_of("leaders", *arguments)
-
-
 @pytest.mark.parametrize("method", ["auto", "exhaustive", "greedy", "swap"])
 def test_leaders_json(method: str) -> None:
-    document = leaders(LINE_RING, "--count", "2", "--method", method, "--top", "2")
+    document = document_of("leaders", LINE_RING, "--count", "2", "--method", method, "--top", "2")
     assert document["method"] == ("exhaustive" if method == "auto" else method)
     best = document["sets"][0]
     assert set(best) == {"agents", "system_error", "joint_centrality"}
@@ -259,27 +255,27 @@ def test_leaders_json(method: str) -> None:
 
 
 def test_laws_and_gains() -> None:
-    held = leaders(LINE_RING, "--count", "1")["sets"][0]["system_error"]
-    assert leaders(LINE_RING, "--count", "1", "--law", "emulated")["sets"][0]["system_error"] > held
-    weak = leaders(LINE_RING, "--count", "1", "--gain", "0.5")
+    held = document_of("leaders", LINE_RING, "--count", "1")["sets"][0]["system_error"]
+    assert document_of("leaders", LINE_RING, "--count", "1", "--law", "emulated")["sets"][0]["system_error"] > held
+    weak = document_of("leaders", LINE_RING, "--count", "1", "--gain", "0.5")
     assert weak["gain"] == 0.5
     assert weak["sets"][0]["system_error"] > held
-    assert leaders(EXPERIMENTS / "discrete.yaml", "--count", "1")["law"] == "discrete"
+    assert document_of("leaders", EXPERIMENTS / "discrete.yaml", "--count", "1")["law"] == "discrete"
 
 
 def test_leaders_of_the_file() -> None:
     """Their number and gain unless others are given, and what they achieve beside the best."""
     tracking = EXPERIMENTS / "tracking.yaml"
-    document = leaders(tracking)
+    document = document_of("leaders", tracking)
     assert (document["count"], document["gain"]) == (2, 0.7)
     predicted = Experiment.load(tracking).predict().continuous
     assert document["present"]["agents"] == [1, 4]
     assert document["present"]["system_error"] == pytest.approx(predicted.system_error, rel=1e-9)
     assert document["sets"][0]["system_error"] < document["present"]["system_error"]
-    other = leaders(tracking, "--count", "1", "--gain", "inf")
+    other = document_of("leaders", tracking, "--count", "1", "--gain", "inf")
     assert (other["count"], other["gain"], other["present"]["agents"]) == (1, "inf", [1, 4])
     assert "leaders now: 1, 4" in call("leaders", tracking).stdout
-    assert leaders(LINE_RING, "--count", "1")["present"] is None
+    assert document_of("leaders", LINE_RING, "--count", "1")["present"] is None
 
 
 def test_leaders_text() -> None:
@@ -299,7 +295,7 @@ def test_no_guarantee_says_why() -> None:
     result = call("leaders", *correlated)
     assert result.exit_code == 0
     assert "none: the noise of some agents is negatively correlated" in " ".join(result.stdout.split())
-    assert leaders(*correlated)["bound"] == {"system_error": None, "gap": None}
+    assert document_of("leaders", *correlated)["bound"] == {"system_error": None, "gap": None}
 
 
 def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:

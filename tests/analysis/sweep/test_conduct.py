@@ -90,7 +90,7 @@ def test_what_fails_fails_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         assert [job.id for job in done[3:]] == [jobs[1].id]
 
 
-def test_defects_fail_alone_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_defects_fail_alone_too() -> None:
     outcome = evaluate(Job("x", "predict", "{}", 0.01))
     assert outcome.status == FAILED
     outcome = evaluate(Job("x", "predict", "nonsense", 0.01))
