@@ -236,10 +236,6 @@ def test_spectrum_of_runs_that_are_not_tested(tmp_path):
     assert run.completeness.complete
 
 
-ROOT = Path(__file__).parents[3]
-EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"
-
-
 @pytest.mark.parametrize("method", ["auto", "exhaustive", "greedy", "swap"])
 def test_leaders_json(method: str) -> None:
     document = document_of("leaders", LINE_RING, "--count", "2", "--method", method, "--top", "2")
@@ -260,21 +256,20 @@ def test_laws_and_gains() -> None:
     weak = document_of("leaders", LINE_RING, "--count", "1", "--gain", "0.5")
     assert weak["gain"] == 0.5
     assert weak["sets"][0]["system_error"] > held
-    assert document_of("leaders", EXPERIMENTS / "discrete.yaml", "--count", "1")["law"] == "discrete"
+    assert document_of("leaders", "discrete", "--count", "1")["law"] == "discrete"
 
 
 def test_leaders_of_the_file() -> None:
     """Their number and gain unless others are given, and what they achieve beside the best."""
-    tracking = EXPERIMENTS / "tracking.yaml"
-    document = document_of("leaders", tracking)
+    document = document_of("leaders", "tracking")
     assert (document["count"], document["gain"]) == (2, 0.7)
-    predicted = Experiment.load(tracking).predict().continuous
+    predicted = Experiment.load("tracking").predict().continuous
     assert document["present"]["agents"] == [1, 4]
     assert document["present"]["system_error"] == pytest.approx(predicted.system_error, rel=1e-9)
     assert document["sets"][0]["system_error"] < document["present"]["system_error"]
-    other = document_of("leaders", tracking, "--count", "1", "--gain", "inf")
+    other = document_of("leaders", "tracking", "--count", "1", "--gain", "inf")
     assert (other["count"], other["gain"], other["present"]["agents"]) == (1, "inf", [1, 4])
-    assert "leaders now: 1, 4" in call("leaders", tracking).stdout
+    assert "leaders now: 1, 4" in call("leaders", "tracking").stdout
     assert document_of("leaders", LINE_RING, "--count", "1")["present"] is None
 
 

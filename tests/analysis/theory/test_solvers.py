@@ -14,6 +14,7 @@ from switching_systems import generator, system
 from msg_analysis.errors import InputError
 from msg_analysis.theory.coupled_equations import AveragedEquations, CoupledEquations
 from msg_analysis.theory.jump_system import JumpSystem, held
+from msg_analysis.theory.krylov import plain_conjugate_gradients
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.solvers import DenseSolver, IterativeSolver
 
@@ -124,6 +125,13 @@ def test_right_sides_that_are_equal_in_all_graphs_are_like_others():
     almost = same.copy()
     almost[:, 0, 0, 0] += 1e-9  # not recognised as equal
     np.testing.assert_allclose(averaged.enter(same, scale), averaged.enter(almost, scale), rtol=1e-5, atol=1e-5)
+
+
+def test_plain_conjugate_gradients_end_after_so_many_iterations():
+    def apply(x, accuracy):
+        return np.arange(1.0, 19.0).reshape(1, 2, 3, 3) * x
+
+    assert plain_conjugate_gradients(apply, np.ones((1, 2, 3, 3)), np.full(1, 1e-12), 4)[1] == 4
 
 
 PERIODIC = np.roll(np.eye(4), 1, axis=1)

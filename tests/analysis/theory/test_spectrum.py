@@ -13,9 +13,8 @@ from msg_analysis.theory.spectrum import spectrum
 
 def test_one_graph_is_a_vector_autoregression() -> None:
     """R(l) = W^l C, and the density (1 - W z)^-1 N (1 - W z)^-* at z = exp(-i w)."""
-    prediction = predict(
-        line_ring(4, graphs={"ring": {"cycle": [1, 2, 3, 4]}}, switching={}, run={"dt": 0.1}, **TRACKING)
-    )
+    ring = {"ring": {"cycle": [1, 2, 3, 4]}}
+    prediction = predict(line_ring(graphs=ring, switching={}, run={"dt": 0.1}, **TRACKING))
     weights, noise = prediction.step.weights[0], prediction.step.noise[0]
     steady = scipy.linalg.solve_discrete_lyapunov(weights, noise)
     frequencies = np.array([0.0, 0.3, 1.0, 4.9, 5.0])
