@@ -13,7 +13,7 @@ import signal
 import stat
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -210,7 +210,7 @@ _REFRESH = 0.1  # s between two updates of a bar
 class _Progress:
     """Progress display, a context manager."""
 
-    def __init__(self, title: str, *, time_left: bool) -> None:
+    def __init__(self, title: str, *, time_left: bool, clock: Callable[[], float]) -> None:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
         from rich.text import Text
 
@@ -237,7 +237,8 @@ class _Progress:
         self._title = title
         self._task = self._bar.add_task(title, total=None, words="")
         self._time_left = time_left
-        self._begun = self._told = time.monotonic()
+        self._clock = clock
+        self._begun = self._told = clock()
         self._first: int | None = None  # done when the work began, by an earlier call for example
         self._newest = (0, 0, self._begun)  # done, of how many, when
         self._shown = 0.0
@@ -250,7 +251,7 @@ class _Progress:
         """The time so far, and what is left at the mean speed so far, once it is known."""
         from msg_analysis.common.text import duration_text
 
-        now = time.monotonic()
+        now = self._clock()
         text = f"{duration_text(now - self._begun)} so far"
         done, total, when = self._newest
         new = done - (self._first or 0)
@@ -262,10 +263,10 @@ class _Progress:
     def _show(self, title: str, done: int, total: int, text: str, in_short: str) -> None:
         if self._first is None:
             self._first = done
-        self._newest = done, total, time.monotonic()
+        self._newest = done, total, self._clock()
         self._bar.update(self._task, completed=done, total=total, description=title, words=in_short)
-        if not self._console.is_terminal and time.monotonic() - self._told >= _LINE_PERIOD:
-            self._told = time.monotonic()
+        if not self._console.is_terminal and self._clock() - self._told >= _LINE_PERIOD:
+            self._told = self._clock()
             self._console.print(f"{title}: {text}" + (f", {self._times()}" if self._time_left else ""))
 
     def __exit__(
@@ -277,8 +278,8 @@ class _Progress:
 class SweepProgress(_Progress):
     """Progress of a sweep, a context manager."""
 
-    def __init__(self, title: str) -> None:
-        super().__init__(title, time_left=True)
+    def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(title, time_left=True, clock=clock)
 
     def done(self, done: int, total: int, failed: int = 0) -> None:
         """Show how many points are done, and how many of these failed; a ``SweepProgress`` of ``run_jobs``."""
@@ -289,8 +290,8 @@ class SweepProgress(_Progress):
 class SolveProgress(_Progress):
     """Progress of a search: a ``SearchProgress`` of ``theory.leaders.search``, and a context manager."""
 
-    def __init__(self, title: str) -> None:
-        super().__init__(title, time_left=False)
+    def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(title, time_left=False, clock=clock)
 
     def __call__(self, stage: str, done: int, total: int, best: float) -> None:
         """Show stage, evaluations done and to do, and the smallest system error so far; see ``SearchProgress``."""
@@ -302,15 +303,15 @@ class SolveProgress(_Progress):
 class WorkProgress(_Progress):
     """How far long work is, in percent: a ``common.long_work.Watch``, and a context manager; nothing in short work."""
 
-    def __init__(self) -> None:
-        super().__init__("", time_left=False)
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__("", time_left=False, clock=clock)
 
     def __enter__(self) -> Self:
         return self
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show what is being done, and how much of it is done."""
-        now = time.monotonic()
+        now = self._clock()
         if now - self._begun < _SHORT or now - self._shown < _REFRESH:
             return
         self._shown = now

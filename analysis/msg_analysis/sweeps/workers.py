@@ -41,7 +41,7 @@ QUEUED = 2  # tasks sent per thread of the workers: one that is worked on, one t
 NOTICE = 0.5  # s between two checks of a worker whether the work is being ended
 # Signals that end a sweep as Ctrl-C does: that of a cluster's queue, and that of a terminal that is closed.
 ENDING = (signal.SIGTERM, signal.SIGHUP)
-_CONNECT = 10.0  # s
+PATIENCE = 10.0  # s until a scheduler answers
 NETWORK_TIMEOUT = 60.0  # s that running networks have to end in order
 # Less of what Dask does besides the work, which costs time on two cores.
 _QUIET = {
@@ -92,9 +92,9 @@ def warm_up() -> None:
 class Workers:
     """Worker processes of this machine (None: one per CPU), or those of the Dask scheduler at an address."""
 
-    def __init__(self, count: int | None = None, scheduler: str | None = None) -> None:
+    def __init__(self, count: int | None = None, scheduler: str | None = None, *, patience: float = PATIENCE) -> None:
         self._count = count or count_cores()
-        self._scheduler = scheduler
+        self._scheduler, self._patience = scheduler, patience
         self._client: Any = None  # of Dask, from ``__enter__`` on
         self._cluster: Any = None
         self._stop_name = f"msg-sweep-stop-{uuid.uuid4().hex}"
@@ -113,7 +113,7 @@ class Workers:
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         if self._scheduler:
             try:
-                self._client = distributed.Client(self._scheduler, timeout=_CONNECT, name="msg-analysis")
+                self._client = distributed.Client(self._scheduler, timeout=self._patience, name="msg-analysis")
             except (OSError, ValueError, TypeError) as error:
                 reason = str(error).partition(":")[0] if isinstance(error, ValueError) else "no answer"
                 wanted = "expected the address of a Dask scheduler: for example tcp://127.0.0.1:8786"

@@ -19,7 +19,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.coupled_equations import MAX_RELATIVE_ERROR, SolverReport
 from msg_analysis.theory.jump_system import JumpSystem
-from msg_analysis.theory.solvers import DenseSolver, IterativeSolver
+from msg_analysis.theory.solvers import MAX_ITERATIONS, DenseSolver, IterativeSolver
 
 MARGIN = 8.0  # of the estimated effect of rounding, see docs/accuracy.md
 MAX_KEPT = 1_000_000  # numbers of adjoint solutions that a solver keeps, at most
@@ -44,6 +44,7 @@ class MomentSolver:
         guess: FloatArray | None = None,
         most_dense: int = MAX_FALLBACK,
         most_kept: int = MAX_KEPT,
+        most_iterations: int = MAX_ITERATIONS,
     ) -> None:
         if guess is not None and guess.shape != system.matrices.shape:
             raise InputError(
@@ -56,7 +57,10 @@ class MomentSolver:
         unknowns = system.modes * packed_symmetric.size(system.dimension)
         self._dense_too = unknowns <= most_dense
         self._solver: DenseSolver | IterativeSolver
-        self._solver = IterativeSolver(system, guess) if unknowns else DenseSolver(system)
+        if unknowns:
+            self._solver = IterativeSolver(system, guess, most_iterations=most_iterations)
+        else:
+            self._solver = DenseSolver(system)
 
     def steady(self) -> FloatArray:
         """(n, d, d): C_i = E[y y^T; mode i] in the steady state."""

@@ -173,9 +173,16 @@ class IterativeSolver:
     """Steady moments and duals of one system; starts from ``guess`` (n, d, d), steady moments of a similar one."""
 
     def __init__(
-        self, system: JumpSystem, guess: FloatArray | None = None, *, chunk: int = CHUNK, single_from: int = SINGLE_FROM
+        self,
+        system: JumpSystem,
+        guess: FloatArray | None = None,
+        *,
+        chunk: int = CHUNK,
+        single_from: int = SINGLE_FROM,
+        most_iterations: int = MAX_ITERATIONS,
     ) -> None:
         self._chunk, self._equations = chunk, CoupledEquations(system, single_from=single_from)
+        self._most_iterations = most_iterations
         self._averaged = averaged_equations(self._equations)
         self._adjoint: CoupledEquations | None = None
         self._averaged_adjoint: AveragedEquations | None = None
@@ -190,7 +197,7 @@ class IterativeSolver:
             right = self._equations.after_jump(right)
         weights = system.stationary[:, None, None]
         guess = None if self._guess is None else self._guess[None] / weights
-        x, self.report = _solve(self._equations, self._averaged, right, guess)
+        x, self.report = _solve(self._equations, self._averaged, right, guess, self._most_iterations)
         return np.asarray(np.multiply(weights, x[0], out=x[0]))
 
     def dual(self, forms: FloatArray) -> FloatArray:
@@ -204,7 +211,7 @@ class IterativeSolver:
         for first in range(0, len(forms), together):
             chunk = forms[first : first + together, None]
             right = np.broadcast_to(chunk, (len(chunk), *system.matrices.shape)).copy()
-            y, _ = _solve(self._adjoint, self._averaged_adjoint, right, None)
+            y, _ = _solve(self._adjoint, self._averaged_adjoint, right, None, self._most_iterations)
             if system.time == "discrete":
                 y = right + self._adjoint.moved(y)
             result[first : first + together] = y
@@ -212,16 +219,20 @@ class IterativeSolver:
 
 
 def _solve(
-    equations: CoupledEquations, averaged: AveragedEquations | None, right: FloatArray, guess: FloatArray | None
+    equations: CoupledEquations,
+    averaged: AveragedEquations | None,
+    right: FloatArray,
+    guess: FloatArray | None,
+    most: int,
 ) -> tuple[FloatArray, SolverReport]:
-    """Solve A X = B for (q, n, d, d) right-hand sides."""
+    """Solve A X = B for (q, n, d, d) right-hand sides, in about so many iterations at most."""
     x = None if guess is None or not guess.any() else 0.5 * (guess + guess.swapaxes(-1, -2))
     if averaged is not None:
         x, report = _by_average(equations, averaged, right, x)
         if not report.error <= TOLERANCE:
-            x, report = _by_graphs(equations, right, x if np.isfinite(x).all() else None, report.iterations)
+            x, report = _by_graphs(equations, right, x if np.isfinite(x).all() else None, report.iterations, most)
     else:
-        x, report = _by_graphs(equations, right, x, 0)
+        x, report = _by_graphs(equations, right, x, 0, most)
     # Not ">": NaN must be refused, too.
     if not report.error <= MAX_RELATIVE_ERROR:
         raise InputError(singular_message(f", or too ill-conditioned ({report.iterations} iterations do not converge)"))
@@ -261,7 +272,7 @@ def _by_average(
 
 
 def _by_graphs(
-    equations: CoupledEquations, right: FloatArray, x: FloatArray | None, iterations: int
+    equations: CoupledEquations, right: FloatArray, x: FloatArray | None, iterations: int, most: int
 ) -> tuple[FloatArray, SolverReport]:
     """With the two-level preconditioner, until the error is small, a cycle hardly reduces it, or iterations run out."""
     inner = equations.inner
@@ -279,7 +290,7 @@ def _by_graphs(
             error = _error(step, x)
             worst = float(error.max(initial=0.0))
             iterations += 1
-            if worst <= TOLERANCE or iterations >= MAX_ITERATIONS or not worst <= 0.7 * before:
+            if worst <= TOLERANCE or iterations >= most or not worst <= 0.7 * before:
                 return x, SolverReport(method, preconditioner, iterations, left, backward, worst)
             before = worst
         known = True
@@ -289,7 +300,7 @@ def _by_graphs(
             change, used = inner.precondition(scaled)[0], 1
         else:
             size = weighted_norm(x, equations.weights) / scale[:, 0, 0, 0]
-            change, used = _improved(inner, scaled, size, error, MAX_ITERATIONS)
+            change, used = _improved(inner, scaled, size, error, most)
         x, iterations = x + change * scale, iterations + used
 
 

@@ -16,8 +16,6 @@ from experiments import changed, claimed, golden, simulate, write_trajectory
 from msg_analysis.report.saved_results import print_results
 from msg_analysis.runs import read_result
 
-EXPERIMENT = Path(__file__).parents[3] / "analysis/msg_analysis/experiment/bundled/leader_smallest.yaml"
-
 
 def call(*arguments: object) -> Result:
     return run("msg-analysis", *arguments)
@@ -27,12 +25,11 @@ def call(*arguments: object) -> Result:
 def bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Two runs with leader 1, one with leader 2."""
     directory = tmp_path_factory.mktemp("bags")
-    other = directory / "other.yaml"
-    other.write_text(EXPERIMENT.read_text(encoding="utf-8").replace("agents: [1]", "agents: [2]"), encoding="utf-8")
-    made = []
-    for seed, experiment in ((1, EXPERIMENT), (2, EXPERIMENT), (3, other)):
-        made.append(directory / f"bag_{seed}")
-        assert call("simulate", experiment, "--seed", seed, "--duration", 20, "--out", made[-1]).exit_code == 0
+    made = [directory / f"bag_{seed}" for seed in (1, 2, 3)]
+    for seed, bag in enumerate(made, start=1):
+        leader = ("--set", f"leaders.agents=[{1 if seed < 3 else 2}]")
+        words = call("simulate", "leader_smallest", *leader, "--seed", seed, "--duration", 20, "--out", bag)
+        assert words.exit_code == 0
     return made
 
 

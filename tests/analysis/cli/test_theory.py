@@ -2,6 +2,8 @@
 
 import csv
 import dataclasses
+import functools
+import itertools
 import json
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from msg_analysis.cli import console
 from msg_analysis.paper import examples
 
 LINE_RING = str(GOLDEN / "line_ring.yaml")
+FROM_ZERO = {"run": {"start": "zero"}}
 NO_TIMES = ["soon", "0:1", "1:0:0.5", "0,nan"]
 
 
@@ -29,18 +32,17 @@ def document_of(*arguments):
     return json.loads(result.stdout)
 
 
-@pytest.fixture
-def from_zero(tmp_path):
-    """The line and the ring, started at zero."""
-    file = tmp_path / "zero.yaml"
-    file.write_text(Path(LINE_RING).read_text().replace("seed: 7", "seed: 7, start: zero"))
-    return str(file)
+def written(directory, **changes):
+    """A file of the line and the ring with other values of these keys."""
+    file = directory / "file.yaml"
+    file.write_text(json.dumps(Experiment.load(LINE_RING).to_document() | changes))
+    return file
 
 
-def test_transient_tends_to_the_prediction(from_zero):
-    prediction = predict(Experiment.load(from_zero))
+def test_transient_tends_to_the_prediction(tmp_path):
+    prediction = predict(Experiment.load(LINE_RING))
     for law, moments in {"emulated": prediction.emulated, "continuous": prediction.continuous_moments}.items():
-        document = document_of("transient", from_zero, "--times", "0:50:0.5", "--law", law)
+        document = document_of("transient", written(tmp_path, **FROM_ZERO), "--times", "0:50:0.5", "--law", law)
         assert document["law"] == law
         assert document["times"] == pytest.approx(np.arange(0.0, 50.1, 0.5).tolist())
         assert document["system_error"][0] == 0.0
@@ -69,9 +71,9 @@ def test_transient_with_moments_and_unreduced():
         assert grown["system_second_moment"] == pytest.approx(expected.tolist(), rel=1e-10)
 
 
-def test_transient_tables(tmp_path, from_zero):
+def test_transient_tables(tmp_path):
     file = tmp_path / "table.csv"
-    result = call("transient", from_zero, "--times", "0:5:1", "--csv", file)
+    result = call("transient", written(tmp_path, **FROM_ZERO), "--times", "0:5:1", "--csv", file)
     assert result.exit_code == 0
     assert "from zero" in result.stdout
     with file.open() as lines:
@@ -84,11 +86,7 @@ def test_transient_tables(tmp_path, from_zero):
 
 
 def test_without_noise_nothing_settles(tmp_path):
-    file = tmp_path / "quiet.yaml"
-    file.write_text(
-        Path(LINE_RING).read_text().replace("process: 1.0", "process: 0.0").replace("seed: 7", "start: zero")
-    )
-    document = document_of("transient", str(file), "--times", "0,1")
+    document = document_of("transient", written(tmp_path, noise={"process": 0}, **FROM_ZERO), "--times", "0,1")
     assert document["settling"] == {"fraction": 0.05, "from_start": None, "from_zero": None}
     assert document["system_error"] == [0.0, 0.0]
 
@@ -121,10 +119,8 @@ def test_refused(command, file, options, message):
 
 def test_facts_of_a_large_network(tmp_path):
     """The lemmas are left out, with the reason; what scales is there."""
-    file = tmp_path / "large.yaml"
-    labels = str(list(range(1, 41)))
-    text = Path(LINE_RING).read_text().replace("[1, 2, 3, 4, 5]", labels)
-    file.write_text(text)
+    everybody = list(range(1, 41))
+    file = written(tmp_path, agents=40, graphs={"line": {"path": everybody}, "ring": {"cycle": everybody}})
     document = document_of("facts", file)
     assert document["facts"] is None
     assert "3200 rows" in document["notes"][0]
@@ -168,8 +164,10 @@ def test_plan(tmp_path):
     assert "not known: --speed gives the wall time" in call("plan", LINE_RING).stdout
 
 
-def test_plan_of_a_start(from_zero):
-    text = " ".join(call("plan", from_zero, "--budget", "1s", "--speed", "20").stdout.split())
+def test_plan_of_a_start():
+    text = " ".join(
+        call("plan", LINE_RING, "--set", "run.start=zero", "--budget", "1s", "--speed", "20").stdout.split()
+    )
     assert "warm-up" in text
     assert "ends before the effect of the start does" in text
 
@@ -238,17 +236,9 @@ def test_spectrum_of_runs_that_are_not_tested(tmp_path):
     assert run.completeness.complete
 
 
-ROOT = Path(__file__).parents[3]
-EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"
-
-
-def leaders(*arguments: str | Path) -> dict:
-    return document_of("leaders", *arguments)
-
-
 @pytest.mark.parametrize("method", ["auto", "exhaustive", "greedy", "swap"])
 def test_leaders_json(method: str) -> None:
-    document = leaders(LINE_RING, "--count", "2", "--method", method, "--top", "2")
+    document = document_of("leaders", LINE_RING, "--count", "2", "--method", method, "--top", "2")
     assert document["method"] == ("exhaustive" if method == "auto" else method)
     best = document["sets"][0]
     assert set(best) == {"agents", "system_error", "joint_centrality"}
@@ -260,35 +250,27 @@ def test_leaders_json(method: str) -> None:
     assert document["supermodular"]
 
 
-def test_orders_of_the_third_example() -> None:
-    document = leaders(EXPERIMENTS / "leader_knife_edge.yaml", "--count", "1")
-    assert [entry["agents"] for entry in document["sets"]] == [[3], [1], [4], [5], [2]]
-    assert round(document["sets"][0]["system_error"], 5) == 1.63896
-    assert document["bound"] == {"system_error": document["sets"][0]["system_error"], "gap": 0.0}
-
-
 def test_laws_and_gains() -> None:
-    held = leaders(LINE_RING, "--count", "1")["sets"][0]["system_error"]
-    assert leaders(LINE_RING, "--count", "1", "--law", "emulated")["sets"][0]["system_error"] > held
-    weak = leaders(LINE_RING, "--count", "1", "--gain", "0.5")
+    held = document_of("leaders", LINE_RING, "--count", "1")["sets"][0]["system_error"]
+    assert document_of("leaders", LINE_RING, "--count", "1", "--law", "emulated")["sets"][0]["system_error"] > held
+    weak = document_of("leaders", LINE_RING, "--count", "1", "--gain", "0.5")
     assert weak["gain"] == 0.5
     assert weak["sets"][0]["system_error"] > held
-    assert leaders(EXPERIMENTS / "discrete.yaml", "--count", "1")["law"] == "discrete"
+    assert document_of("leaders", "discrete", "--count", "1")["law"] == "discrete"
 
 
 def test_leaders_of_the_file() -> None:
     """Their number and gain unless others are given, and what they achieve beside the best."""
-    tracking = EXPERIMENTS / "tracking.yaml"
-    document = leaders(tracking)
+    document = document_of("leaders", "tracking")
     assert (document["count"], document["gain"]) == (2, 0.7)
-    predicted = Experiment.load(tracking).predict().continuous
+    predicted = Experiment.load("tracking").predict().continuous
     assert document["present"]["agents"] == [1, 4]
     assert document["present"]["system_error"] == pytest.approx(predicted.system_error, rel=1e-9)
     assert document["sets"][0]["system_error"] < document["present"]["system_error"]
-    other = leaders(tracking, "--count", "1", "--gain", "inf")
+    other = document_of("leaders", "tracking", "--count", "1", "--gain", "inf")
     assert (other["count"], other["gain"], other["present"]["agents"]) == (1, "inf", [1, 4])
-    assert "leaders now: 1, 4" in call("leaders", tracking).stdout
-    assert leaders(LINE_RING, "--count", "1")["present"] is None
+    assert "leaders now: 1, 4" in call("leaders", "tracking").stdout
+    assert document_of("leaders", LINE_RING, "--count", "1")["present"] is None
 
 
 def test_leaders_text() -> None:
@@ -302,20 +284,18 @@ def test_leaders_text() -> None:
     assert "Single leaders" in call("leaders", LINE_RING, "--count", "1").stdout
 
 
-def test_no_guarantee_says_why(tmp_path: Path) -> None:
-    file = tmp_path / "correlated.yaml"
-    file.write_text(
-        "name: correlated\ngraphs: {g: {path: [1, 2, 3, 4]}}\n"
-        "noise: {process: [[1, 0, 0, 0], [-1, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}\n"
-    )
-    result = call("leaders", file, "--count", "2", "--method", "greedy")
+def test_no_guarantee_says_why() -> None:
+    gains = "[[1, 0, 0, 0, 0], [-1, 1, 0, 0, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 1]]"
+    correlated = LINE_RING, "--set", f"noise.process={gains}", "--count", "2", "--method", "greedy"
+    result = call("leaders", *correlated)
     assert result.exit_code == 0
     assert "none: the noise of some agents is negatively correlated" in " ".join(result.stdout.split())
-    assert leaders(file, "--count", "2", "--method", "greedy")["bound"] == {"system_error": None, "gap": None}
+    assert document_of("leaders", *correlated)["bound"] == {"system_error": None, "gap": None}
 
 
 def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(console, "_LINE_PERIOD", 0.0)
+    clock = itertools.count(0.0, 20.0).__next__
+    monkeypatch.setattr(console, "SolveProgress", functools.partial(console.SolveProgress, clock=clock))
     result = call("leaders", LINE_RING, "--count", "2", "--method", "swap", "--json")
     assert json.loads(result.stdout)["sets"]
     assert "line_ring: greedy: 1 of 10, smallest system error" in result.stderr

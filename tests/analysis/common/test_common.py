@@ -86,7 +86,7 @@ def test_commands_refuse_hostile_text(tmp_path: Path) -> None:
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag/metadata.yaml").write_text(f"{bomb(9)}\nrosbag2_bagfile_information: {{files: *q8}}\n")
     places, out = [str(tmp_path / "bomb"), str(tmp_path / "bag"), "/dev/zero"], ["--out", str(tmp_path / "out")]
-    commands = [["info"], ["predict"], ["simulate", *out], ["compare"], ["tabulate"], ["sweep", *out]]
+    commands = [["info"], ["simulate", *out], ["compare"], ["tabulate"], ["sweep", *out]]
     jobs = [["msg-analysis", [word, place, *more], "memory"] for word, *more in commands for place in places]
     for job, (code, stdout, stderr) in zip(jobs, many_commands.outcomes(jobs, tmp_path, NO_COLOR="1"), strict=True):
         assert (code, stdout) == (2, ""), (job, stderr)
@@ -153,22 +153,20 @@ def test_short_work_shows_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     assert capfd.readouterr() == ("", "")
 
 
-def test_long_work_says_how_far_it_is(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_long_work_says_how_far_it_is(capfd: pytest.CaptureFixture[str]) -> None:
     """A line every ten seconds where there is no terminal."""
     now = [100.0]
-    monkeypatch.setattr("msg_analysis.cli.console.time.monotonic", lambda: now[0])
-    with WorkProgress() as progress, watched(progress):
+    with WorkProgress(lambda: now[0]) as progress, watched(progress):
         for second in range(25):
             now[0] = 100.0 + second
             tell("reading x.mcap", second, 25)
     assert capfd.readouterr().err == "reading x.mcap: 40 %\nreading x.mcap: 80 %\n"
 
 
-def test_a_sweep_says_what_is_left(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sweep_says_what_is_left(capfd: pytest.CaptureFixture[str]) -> None:
     """At the mean speed of what is new: 40 of 100 points were there before, each takes a second and a half."""
     now = [100.0]
-    monkeypatch.setattr("msg_analysis.cli.console.time.monotonic", lambda: now[0])
-    with SweepProgress("sweep") as progress:
+    with SweepProgress("sweep", lambda: now[0]) as progress:
         progress.done(40, 100, 0)
         for done in range(41, 101):
             now[0] = 100.0 + 1.5 * (done - 40)

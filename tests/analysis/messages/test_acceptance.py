@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments import RunRecord, line_ring, new_record
-from msg_analysis.messages.acceptance import Refusal, RunRules, decode_of_run, sign, state_frame, state_receiver
+from msg_analysis.messages.acceptance import Refusal, RunRules, sign, state_frame, state_receiver
 from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, encode_string
 from msg_analysis.messages.topics import END, PROGRESS, RESEND
 from msg_analysis.model.graph_path import HoldingPeriod, holding_periods
@@ -62,13 +62,6 @@ def test_refused_states(data: bytes, reason: str) -> None:
     assert bool(taken) == (reason == "of the receiver")
 
 
-def test_messages_of_the_run() -> None:
-    progress = Progress(1, RUN, 2, 3)
-    assert decode_of_run(Progress, progress.encode(), RUN) == progress
-    assert decode_of_run(Progress, progress.encode(), OTHER) == Refusal.OTHER_RUN
-    assert decode_of_run(Progress, progress.encode()[:-1], RUN) == Refusal.UNDECODABLE
-
-
 @pytest.mark.parametrize(("changes", "listed"), [({}, 0), ({"noise": {"loss": 0.1}}, 1)])
 def test_longest_message(changes: dict[str, Any], listed: int) -> None:
     """Only where messages may be lost, or in real time, does a state list what was heard."""
@@ -115,7 +108,7 @@ def test_the_graph_is_compared_with_the_record() -> None:
     assert rules.graph(b"") == Refusal.UNDECODABLE
 
 
-def test_old_sojourns_are_forgotten() -> None:
+def test_old_holding_periods_are_forgotten() -> None:
     rules = RunRules(SWITCHING)
     rules.forget(500)
     for holding in PATH:

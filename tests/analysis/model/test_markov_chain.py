@@ -116,7 +116,7 @@ def test_holding_times_are_exponential() -> None:
     assert scipy.stats.kstest(held, "expon", args=(0, -1 / chain.matrix[0, 0])).pvalue > 1e-4
 
 
-def test_sojourns_cover_every_step_once() -> None:
+def test_holding_periods_cover_every_step_once() -> None:
     case = setup("continuous", 5 * generator_of(4, 3), 500)
     found = list(holding_periods(case, case.chain.stationary))
     assert [s.sequence for s in found] == list(range(len(found)))

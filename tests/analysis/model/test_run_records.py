@@ -11,7 +11,6 @@ from euler import Euler, EulerSteps, experiment
 from pydantic import Field
 
 from experiments import (
-    Experiment,
     RunRecord,
     check,
     compare,
@@ -26,9 +25,7 @@ from msg_analysis.model.run_record import Until
 from msg_analysis.protocol import Parameters
 from msg_analysis.report.documents import describe_bag
 
-
-def planned() -> Experiment:
-    return line_ring(run={"duration": 40, "seed": 3})
+PLANNED = line_ring(run={"duration": 40, "seed": 3})
 
 
 @pytest.mark.parametrize(
@@ -49,7 +46,7 @@ def test_mistakes_of_until(text: str) -> None:
 
 def test_the_record_of_a_run_that_has_ended() -> None:
     """The random numbers of a shorter run are the first ones of the longer run, so it is a twin of its own."""
-    record = RunRecord.from_json(json.dumps(json.loads(new_record(planned()).to_json()) | {"until": "1%"}), "somewhere")
+    record = RunRecord.from_json(json.dumps(json.loads(new_record(PLANNED).to_json()) | {"until": "1%"}), "somewhere")
     assert record.until == Until(0.01)
     assert (record.planned, record.planned_steps) == (None, 800)
     ended = record.ended(333)
@@ -62,7 +59,7 @@ def test_the_record_of_a_run_that_has_ended() -> None:
 
 
 def test_damaged_records() -> None:
-    document = json.loads(new_record(planned()).to_json())
+    document = json.loads(new_record(PLANNED).to_json())
     with pytest.raises(InputError, match="planned_steps: 800: expected more than the 800 made"):
         RunRecord.from_json(json.dumps(document | {"planned_steps": 800}), "x")
     with pytest.raises(InputError, match="x: until: 'soon': expected a precision"):

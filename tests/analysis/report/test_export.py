@@ -13,11 +13,9 @@ import pytest
 from click.testing import Result
 from programs import run as call
 from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from experiments import document
 from msg_analysis import Experiment, InputError, NotAvailableError, Run, read_bag
-from msg_analysis.messages.messages import ACTIVE_GRAPH, AGENT_STATE
 from msg_analysis.report import export as export_files
 
 DOCUMENT = document(names=["one, 1", 'two "2"', "three"], run={"duration": 15, "seed": 4})
@@ -53,13 +51,10 @@ NAMES = [f"{table}.{form}" for form in ("csv", "parquet") for table in ("states"
 
 
 @pytest.fixture(scope="module")
-def messages(bag: Path) -> tuple[dict[tuple[int, int], Any], dict[int, int]]:
+def messages(bag: Path, typestore: Any) -> tuple[dict[tuple[int, int], Any], dict[int, int]]:
     """Of rosbags: states by step and agent, and the graph of each step."""
-    types = get_typestore(Stores.ROS2_JAZZY)
-    for kind in (AGENT_STATE, ACTIVE_GRAPH):
-        types.register(get_types_from_msg(kind.schema.split("\n====")[0], kind.full_name))
     states, graphs = {}, {}
-    with AnyReader([bag], default_typestore=types) as reader:
+    with AnyReader([bag], default_typestore=typestore) as reader:
         for connection, _, raw in reader.messages():
             if connection.topic.endswith("/state"):
                 message: Any = reader.deserialize(raw, connection.msgtype)
@@ -175,23 +170,19 @@ def test_mistakes(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         result = export(*arguments)
         assert (result.exit_code, result.stdout) == (2, "")
         assert words in result.stderr
-    run = read_bag(bag)
-    with pytest.raises(InputError, match="to_dataframe: 'nodes': expected one of states, graphs, errors"):
-        run.to_dataframe("nodes")  # type: ignore[arg-type]
-    monkeypatch.setitem(sys.modules, "pandas", None)  # as if it were not installed
-    with pytest.raises(NotAvailableError, match=r"pandas is not installed: .*: pip install pandas"):
-        run.to_dataframe()
-
-
-def test_rerun_is_not_installed(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is told before anything is read or written."""
-    monkeypatch.setitem(sys.modules, "rerun", None)
+    monkeypatch.setitem(sys.modules, "rerun", None)  # as if it were not installed, which is told first
     result = export(bag, "--csv", "--rrd", "--out", tmp_path / "data")
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr == (
         "error: --rrd: rerun-sdk is not installed: expected it for recordings of Rerun: pip install rerun-sdk\n"
     )
     assert not (tmp_path / "data").exists()
+    run = read_bag(bag)
+    with pytest.raises(InputError, match="to_dataframe: 'nodes': expected one of states, graphs, errors"):
+        run.to_dataframe("nodes")  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(NotAvailableError, match=r"pandas is not installed: .*: pip install pandas"):
+        run.to_dataframe()
 
 
 def test_files_are_replaced_whole_or_not_at_all(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

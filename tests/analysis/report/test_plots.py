@@ -281,8 +281,3 @@ def test_colours_are_read_and_have_their_own_in_the_dark() -> None:
         (plot_style.DARK_SCALE, plot_style.DARK[plot_style.BLACK]),
     ):
         assert min(_contrast(colour, ink) for colour in scale) >= 4.5
-    assert len(set(plot_style.DARK.values())) == len(plot_style.DARK)
-    assert {*plot_style.LINES, *plot_style.GRAPHS, plot_style.INK, plot_style.GREY, plot_style.PALE} <= set(
-        plot_style.DARK
-    )
-    assert set(plot_style.LINES) == set(plot_style.GRAPHS)

@@ -3,24 +3,21 @@
 import dataclasses
 import json
 import re
-import uuid
 from datetime import UTC, datetime, timedelta
 from functools import cache
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from experiments import Completeness, Run, RunRecord, compare, late, line_ring, simulate
+from experiments import Completeness, compare, late, line_ring, simulate
 from msg_analysis import Experiment, InputError
 from msg_analysis.inference.comparison import Comparison
-from msg_analysis.inference.counts import SwitchingTest
-from msg_analysis.inference.estimates import CovarianceTest, Estimate
-from msg_analysis.inference.question import Test as FamilyTest
-from msg_analysis.inference.residuals import ResidualTests
 from msg_analysis.report import page as report_page
+from msg_analysis.report.drawings import plus_minus
 from msg_analysis.report.list_pages import render_runs, write_runs_page
 from msg_analysis.report.page import render, write_report
 from msg_analysis.runs import RunEntry, list_runs
@@ -63,47 +60,6 @@ class Page(HTMLParser):
             self.data += data
 
 
-def _trajectory(agents: int, steps: int, **names: str) -> Run:
-    run = {"dt": 0.1, "duration": steps * 0.1, "start": "zero"}
-    ring = {"cycle" if agents > 2 else "path": list(range(1, agents + 1))}
-    graphs = {"line": {"path": list(range(1, agents + 1))}, "ring": ring}
-    experiment = line_ring(agents, 0.5, graphs=graphs, run=run)
-    if names:
-        graphs = tuple(dataclasses.replace(g, name=names.get(g.name, g.name)) for g in experiment.graph_list)
-        experiment = dataclasses.replace(experiment, graph_list=graphs)
-    rng = np.random.default_rng(0)
-    states = rng.standard_normal((steps + 1, agents, 2))
-    record = RunRecord(uuid.UUID(int=5), experiment, states[0])
-    modes = np.repeat(rng.integers(0, 2, steps // 4 + 1), 4)[:steps]
-    expected = (steps + 1) * agents
-    return Run(record, states, modes, Completeness(expected, expected, 0))
-
-
-def _comparison(trajectory: Run) -> Comparison:
-    """Made-up numbers, all of them there."""
-    agents = trajectory.states.shape[1]
-    rng = np.random.default_rng(1)
-    covariance = np.cov(rng.standard_normal((agents, 4 * agents)))
-    nodes = [Estimate(0.3 + i / 100, 0.31, 0.01, 0.5, 0.6, 1.0) for i in range(agents)]
-    tests = [FamilyTest("system error", 0.4, 1.0, rejected=False)]
-    tests += [FamilyTest(f"error of agent {i + 1}", 0.6, 1.0, rejected=False) for i in range(agents)]
-    time = np.linspace(0.1, 20, 50)
-    return Comparison(
-        trajectory=trajectory,
-        level=0.01,
-        steps=len(trajectory.modes),
-        system_error=Estimate(1.234567, 1.3, 0.05, -1.31, 0.19),
-        node_errors=nodes,
-        covariance=CovarianceTest(covariance, covariance * 1.01, 9.0, 10, 0.53),
-        innovations=ResidualTests(0.5, 0.5, None),
-        switching=SwitchingTest(np.array([[7, 1], [2, 9]]), np.array([[6.5, 1.5], [2.5, 8.5]]), 0.7),
-        continuous_error=1.25,
-        batch=(1.1, 1.4),
-        tests=tests,
-        running={"time": time, "system_error": 1.3 + 1 / time, "standard_error": 0.3 / np.sqrt(time)},
-    )
-
-
 def _page(comparison: Comparison, path: Path) -> Page:
     write_report(comparison, path)
     return _checked(path.read_text(encoding="utf-8"))
@@ -121,44 +77,41 @@ def _checked(text: str) -> Page:
     return page
 
 
+def _short(**changes: Any) -> Experiment:
+    return line_ring(**changes, run={"dt": 0.1, "duration": 40, "start": "zero"})
+
+
 @cache
-def _made_up(agents: int) -> tuple[Comparison, str]:
-    """A comparison of made-up numbers, and its report."""
-    comparison = _comparison(_trajectory(agents, 60))
+def _agreeing(agents: int) -> tuple[Comparison, str]:
+    """A comparison and its report."""
+    graphs = {"line": {"path": list(range(1, agents + 1))}, "grid": {"grid": [1, agents]}}
+    comparison = compare(simulate(_short(graphs=graphs)))
     return comparison, render(comparison)
-
-
-def _plots(page: Page) -> int:
-    return page.classes.count("plot")
 
 
 @pytest.mark.parametrize("agents", [2, 5, 100])
 def test_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agents: int) -> None:
-    comparison, text = _made_up(agents)
+    comparison, text = _agreeing(agents)
     monkeypatch.setattr(report_page, "render", lambda *_, **__: text)
+    (tmp_path / "report.html").write_text("old")
     page = _page(comparison, tmp_path / "report.html")
     assert "The run agrees with the prediction." in page.text
     assert str(comparison.trajectory.record.run) in page.text
-    assert "1.235 ± 0.098 (95 %)" in page.text
-    assert "z = −1.31" in page.text
-    for i in range(agents):
-        assert f"{0.3 + i / 100:#.4g}" in page.text
-    assert _plots(page) == 11
+    error = comparison.system_error
+    assert f"{plus_minus(error.measured, error.interval)} (95 %)" in page.text
+    assert f"z = {error.z:+.2f}".replace("-", "−") in page.text
+    for node in comparison.node_errors:
+        assert plus_minus(node.measured, (None, None)) in page.text
+    assert page.classes.count("plot") == 13
     assert page.tags.count("svg") == 3  # two graphs and the chain
+    with pytest.raises(InputError, match="cannot be written"):
+        write_report(comparison, tmp_path / "nowhere" / "report.html")
     assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
-
-
-def test_report_of_a_real_comparison(tmp_path: Path) -> None:
-    trajectory = _trajectory(3, 400)  # white noise is not what the law gives
-    page = _page(compare(trajectory), tmp_path / "report.html")
-    assert "The run disagrees with the prediction." in page.text
-    assert "tests: " in page.text
-    assert "p = 0" in page.text
 
 
 @pytest.mark.parametrize("first_gap", [5, 250])
 def test_incomplete(tmp_path: Path, first_gap: int) -> None:
-    trajectory = _trajectory(3, 400)
+    trajectory = simulate(_short())
     trajectory.states[first_gap, 1] = np.nan
     count = Completeness(expected=1203, received=1202, missing=1, refused={"torn file": 1})
     trajectory = dataclasses.replace(trajectory, completeness=count)
@@ -176,7 +129,7 @@ def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_what_became_of_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Only where something did; texts from outside are texts."""
-    comparison, quiet = _made_up(2)
+    comparison, quiet = _agreeing(2)
     assert "Network" not in Page(quiet).text
     without_figures(monkeypatch)
     rejected = {"node": "agent_1", "topic": "<b>graph", "reason": "other run", "count": 1234}
@@ -190,22 +143,12 @@ def test_what_became_of_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_hostile_names(tmp_path: Path) -> None:
     evil = "<script>alert(1)</script>$\\frac$&\"'"
-    trajectory = _trajectory(3, 60, line=evil)
+    trajectory = simulate(_short(graphs={evil: {"path": [1, 2, 3]}}, switching={}))
     trajectory.record.versions["<b>numpy"] = "</pre><img src=http://x>"
-    page = _page(_comparison(trajectory), tmp_path / "report.html")
+    page = _page(compare(trajectory), tmp_path / "report.html")
     assert evil in page.text
     assert page.tags.count("script") == 3
     assert page.tags.count("img") == 0
-
-
-def test_replaces_and_leaves_nothing_half_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    comparison, text = _made_up(2)
-    monkeypatch.setattr(report_page, "render", lambda *_, **__: text)
-    (tmp_path / "report.html").write_text("old")
-    _page(comparison, tmp_path / "report.html")
-    with pytest.raises(InputError, match="cannot be written"):
-        write_report(comparison, tmp_path / "nowhere" / "report.html")
-    assert [file.name for file in tmp_path.iterdir()] == ["report.html"]
 
 
 def in_real_time(nanoseconds: int) -> Comparison:
@@ -222,7 +165,7 @@ def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     texts = ("Real time", "lateness [ms]", "600 of 600 (100 %)", "Models", "predicted, logged pattern")
     for text in texts:
         assert text in page.text
-    assert _plots(page) == 16
+    assert page.classes.count("plot") == 16
     without_figures(monkeypatch)
     on_time = in_real_time(0)
     write_report(on_time, tmp_path / "report.html")
@@ -233,7 +176,7 @@ def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_lockstep_has_no_timing_and_no_runs_no_rows(tmp_path: Path) -> None:
-    page = Page(_made_up(5)[1])
+    page = Page(_agreeing(5)[1])
     assert "Real time" not in page.text
     assert "predicted, steps of the run" in page.text
     assert "0 runs" in Page(render_runs([], tmp_path, tmp_path)).text
@@ -247,8 +190,7 @@ EVIL = "</script><img src=http://x onerror=alert(1)>"
 
 def test_rows_links_and_data(tmp_path: Path) -> None:
     """Newest first; the experiment of a bag is in it once, however many runs have it."""
-    document = {"name": "pair", "graphs": {"line": {"path": [1, 2, 3]}}, "run": {"dt": 0.1, "duration": 5, "seed": 7}}
-    run = Experiment.parse(document | {"run": document["run"] | {"start": "zero"}}).simulate()
+    run = line_ring(run={"dt": 0.1, "duration": 5, "seed": 7, "start": "zero"}).simulate()
     names = ("pair 1_20261125_120000", "pair_20261126_120000")
     for name in names:
         run.save(tmp_path / "runs" / name)
@@ -286,11 +228,9 @@ def test_hostile_names_of_runs(tmp_path: Path) -> None:
 
 
 def test_long_values_are_short_and_differ(tmp_path: Path) -> None:
-    document = {"name": "ring", "graphs": {"ring": {"cycle": list(range(1, 151))}}, "run": {"dt": 0.1, "duration": 1}}
     for name, last in (("a", [149, 150]), ("b", [150, 149])):
-        document["graphs"] = {"ring": {"cycle": [*range(1, 149), *last]}}
-        document["run"] = {"dt": 0.1, "duration": 1, "start": "zero"}
-        Experiment.parse(document).simulate().save(tmp_path / name)
+        ring = {"ring": {"cycle": [*range(1, 149), *last]}}
+        line_ring(graphs=ring, switching={}, run={"duration": 1, "start": "zero"}).simulate().save(tmp_path / name)
     data = json.loads(Page(render_runs(list_runs(tmp_path), tmp_path, tmp_path)).data)
     values = [each["graphs.ring.cycle"] for each in data["documents"] if "name" in each]
     assert len(set(values)) == 2

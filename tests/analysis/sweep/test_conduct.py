@@ -13,7 +13,6 @@ import pytest
 import yaml
 
 import experiments
-from experiments import Experiment, simulate
 from msg_analysis.errors import InputError
 from msg_analysis.sweeps import workers as conducting
 from msg_analysis.sweeps.grid import load_sweep
@@ -71,16 +70,6 @@ def test_ctrl_c_while_an_outcome_is_written(tmp_path: Path, monkeypatch: pytest.
         assert len(store.outcomes) == (tmp_path / JOURNAL).read_bytes().count(b"\n") == 1
 
 
-def test_simulated_runs_are_those_of_the_twin() -> None:
-    """Mean square of the disagreement, by numpy."""
-    what = document(seed=5)
-    outcome = evaluate(Job.of("simulate", what))
-    states = simulate(Experiment.parse(what)).values[:-1]
-    deviations = states - states.mean(axis=1, keepdims=True)
-    assert outcome.result["system_error"]["measured"] == pytest.approx(float((deviations**2).sum(axis=1).mean()))
-    assert outcome.result["steps"] == 1000
-
-
 def test_what_fails_fails_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whether steps with delayed values are stable, only the prediction finds out."""
     done = in_this_process(monkeypatch)
@@ -101,7 +90,7 @@ def test_what_fails_fails_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         assert [job.id for job in done[3:]] == [jobs[1].id]
 
 
-def test_defects_fail_alone_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_defects_fail_alone_too() -> None:
     outcome = evaluate(Job("x", "predict", "{}", 0.01))
     assert outcome.status == FAILED
     outcome = evaluate(Job("x", "predict", "nonsense", 0.01))
@@ -180,6 +169,11 @@ def test_what_kills_its_workers_is_given_up_and_the_others_are_done() -> None:
     assert isinstance(lost, Lost)
     assert "killed every worker" in lost.reason
     assert found == {number: number**3 for number in range(30) if number != 13}
+
+
+def test_a_scheduler_that_does_not_answer() -> None:
+    with pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: no answer: expected the address"):
+        Workers(scheduler="tcp://127.0.0.1:9", patience=0.2).__enter__()
 
 
 def test_columns_and_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -34,10 +34,6 @@ def job(directory: Path, script: str, *, keep: bool = False) -> Job:
     return dataclasses.replace(made, network=NetworkOptions(str(program), str(directory / "runs"), keep))
 
 
-def never() -> bool:
-    return False
-
-
 SAY = 'printf \'{"verdict": "%s", "bag": "%s", "report": "%s", "experiment": %s}\' $VERDICT "$4" "$6" "$(cat $2)"'
 
 
@@ -53,7 +49,7 @@ def test_what_is_run_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verdict: str, keep: bool, report: str, kept: bool
 ) -> None:
     monkeypatch.setenv("VERDICT", verdict)
-    document = run_network(job(tmp_path, SAY, keep=keep), never)
+    document = run_network(job(tmp_path, SAY, keep=keep), lambda: False)
     assert document["experiment"] == DOCUMENT
     assert document["report"] == report
     assert (document["bag"] is not None) == kept
@@ -62,7 +58,7 @@ def test_what_is_run_and_kept(
 
 def test_a_run_that_fails(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"msg-agents run: exit code 7: no room$"):
-        run_network(job(tmp_path, "echo first >&2; echo error: no room >&2; exit 7"), never)
+        run_network(job(tmp_path, "echo first >&2; echo error: no room >&2; exit 7"), lambda: False)
     assert list((tmp_path / "runs").iterdir()) == []
 
 
@@ -90,16 +86,17 @@ def test_kept_and_read_again(tmp_path: Path) -> None:
 
 def test_cut_anywhere_it_keeps_all_whole_lines_and_goes_on(tmp_path: Path) -> None:
     with ResultStore.open(tmp_path) as store:
-        store.add([outcome("a"), outcome("b"), outcome("c")])
+        store.add([outcome("a"), outcome("b")])
     content = (tmp_path / JOURNAL).read_bytes()
     for size in range(len(content) + 1):
         (tmp_path / JOURNAL).write_bytes(content[:size])
+        whole = ["a", "b"][: content[:size].count(b"\n")]
         with ResultStore.open(tmp_path) as store:
-            assert list(store.outcomes) == ["a", "b", "c"][: content[:size].count(b"\n")]
+            assert list(store.outcomes) == whole
             assert store.damaged == 0
             store.add([outcome("d")])
         with ResultStore.open(tmp_path) as store:
-            assert list(store.outcomes) == [*["a", "b", "c"][: content[:size].count(b"\n")], "d"]
+            assert list(store.outcomes) == [*whole, "d"]
             assert store.damaged == 0
 
 

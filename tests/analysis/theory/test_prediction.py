@@ -7,19 +7,15 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from experiments import GOLDEN, Experiment, line_ring, predict
+from experiments import GOLDEN, TRACKING, Experiment, line_ring, predict
 from msg_analysis.errors import NotAvailableError
 from msg_analysis.theory.prediction import stationary_start_factor
 
 DISCRETE = {"time": "discrete", "graphs": {"a": {"path": [1, 2, 3]}}, "switching": {}, "run": {"dt": 1}}
 
 
-def experiment(**changes):
-    return line_ring(5, 0.5, **changes)
-
-
 def one_graph(graph, **changes):
-    return experiment(graphs={"only": graph}, switching={"generator": [[0.0]]}, **changes)
+    return line_ring(graphs={"only": graph}, switching={}, **changes)
 
 
 def assert_contains(document, golden, path=""):
@@ -60,36 +56,19 @@ def test_one_graph_is_resistance_and_information_centrality(graph, oracle):
         np.testing.assert_allclose(moments.node_errors, expected, rtol=1e-10)
 
 
-def test_one_grounded_leader_is_half_the_sum_of_resistances():
-    leaders = {"agents": [3], "gain": float("inf"), "reference": 1.0}
-    graph = {"edges": [[1, 2], [2, 3], [3, 1], [3, 4]]}
-    prediction = predict(one_graph(graph, problem="tracking", leaders=leaders))
-    information = nx.information_centrality(nx.Graph([(0, 1), (1, 2), (2, 0), (2, 3)]))
-    assert prediction.continuous.system_error == pytest.approx(0.5 / information[2], rel=1e-10)
-    assert prediction.continuous.node_errors[2] == 0.0
-    assert prediction.continuous.to_json()["node_certainty"][2] is None
-
-
 def test_static_is_the_weighted_mean_of_single_graphs():
-    weights = {"generator": [[-1.0, 1.0], [3.0, -3.0]]}
-    prediction = predict(experiment(switching=weights))
-    graphs = experiment().to_document()["graphs"].values()
-    single = [predict(one_graph(graph)).continuous.covariance for graph in graphs]
+    prediction = predict(line_ring(5, switching={"generator": [[-1.0, 1.0], [3.0, -3.0]]}))
+    single = [predict(one_graph({kind: [1, 2, 3, 4, 5]})).continuous.covariance for kind in ("path", "cycle")]
     np.testing.assert_allclose(prediction.static.covariance, 0.75 * single[0] + 0.25 * single[1], rtol=1e-10)
 
 
 def test_graphs_that_do_not_keep_agents_together_have_no_static_baseline() -> None:
-    graphs = {"left": {"edges": [[1, 2]]}, "right": {"edges": [[2, 3]]}}
-    prediction = predict(experiment(graphs=graphs, agents=3))
+    prediction = predict(line_ring(graphs={"left": {"edges": [[1, 2]]}, "right": {"edges": [[2, 3]]}}))
     assert prediction.static_moments is None
     assert prediction.to_json()["static"] is None
     assert prediction.continuous.system_error > 0.0
     graphs = {"deaf": {"arcs": [[1, 2]]}, "all": {"path": [1, 2, 3]}}
-    leaders = {"agents": [1], "gain": 1.0, "reference": 0.0}
-    assert predict(experiment(graphs=graphs, agents=3, problem="tracking", leaders=leaders)).static_moments is None
-    document = predict(experiment(noise={"process": 0.0})).to_json()
-    assert document["emulated"]["system_error"] == 0.0
-    assert document["emulated"]["system_certainty"] is None
+    assert predict(line_ring(graphs=graphs, **TRACKING)).static_moments is None
 
 
 def test_start_factor_is_the_symmetric_root_of_the_conditional_covariance():

@@ -9,15 +9,12 @@ import pytest
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from switching_systems import generator, laplacian, system
+from switching_systems import generator, system
 
 from msg_analysis.errors import InputError
-from msg_analysis.theory import packed_symmetric as symmetric
-from msg_analysis.theory import solvers
 from msg_analysis.theory.coupled_equations import AveragedEquations, CoupledEquations
 from msg_analysis.theory.jump_system import JumpSystem, held
 from msg_analysis.theory.krylov import plain_conjugate_gradients
-from msg_analysis.theory.lyapunov import LocalSolves
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.solvers import DenseSolver, IterativeSolver
 
@@ -79,12 +76,14 @@ def test_large_systems_in_single_precision_are_as_accurate(rate, dt, reversible)
     random = np.random.default_rng(4)
     model = system(random, 90, generator(random, 3, rate, reversible=reversible), dt=dt)
     solver = IterativeSolver(model)
-    measured, dual = solver.steady(), solver.dual(np.eye(89)[None])
+    forms = np.stack([np.eye(89), np.zeros((89, 89))])
+    measured, (dual, nothing) = solver.steady(), solver.dual(forms)
+    assert not nothing.any()
     reference = IterativeSolver(model, single_from=1000)
     expected = reference.steady()
     assert reference.report.preconditioner == "two-level"
     np.testing.assert_allclose(measured, expected, rtol=1e-11, atol=1e-11 * expected.max())
-    np.testing.assert_allclose(dual, reference.dual(np.eye(89)[None]), rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(dual, reference.dual(forms)[0], rtol=1e-10, atol=1e-10)
 
 
 def test_what_is_chosen():
@@ -94,6 +93,7 @@ def test_what_is_chosen():
     def method(model):
         solver = MomentSolver(model)
         solver.steady()
+        assert solver.report.iterations < 30
         return solver.report.method, solver.report.preconditioner
 
     assert method(system(random, 8, reversible)) == ("cg", "two-level")
@@ -118,64 +118,20 @@ def test_graphs_that_rather_alternate_do_not_use_the_average():
     np.testing.assert_allclose(np.tensordot(chain.T, moved, axes=1), second, rtol=1e-9, atol=1e-9 * second.max())
 
 
-@pytest.mark.parametrize("dt", [None, 0.01])
-@pytest.mark.parametrize("reversible", [True, False])
-def test_the_averaged_equations_are_the_equations_in_other_coordinates(dt, reversible):
-    """(I + S) U is the right-hand side that X = M^-1/2 U solves, by the equations written out."""
+def test_right_sides_that_are_equal_in_all_graphs_are_like_others():
     random = np.random.default_rng(15)
-    model = system(random, 14, generator(random, 3, 3.0, reversible=reversible), dt=dt)
-    averaged = AveragedEquations(CoupledEquations(model))
-    assert averaged.definite == reversible
-    inside = random.standard_normal((2, 3, 13, 13)).astype(np.float32)
-    inside += inside.swapaxes(-1, -2)
-    x, scale = np.zeros(inside.shape), np.array([1.0, 1e3])
-    averaged.leave(inside, scale, x)
-    law, z = model.stationary, model.matrices
-    weighted = law[:, None, None] * x
-    if dt is None:
-        right = z @ weighted + weighted @ z - np.einsum("ji,qjab->qiab", model.chain, weighted)
-    else:
-        right = weighted - np.einsum("ji,qjab->qiab", model.chain, z @ weighted @ z)
-    expected = averaged.enter(right / law[:, None, None], scale)
-    limit = 1e-5 * np.abs(expected).max()
-    np.testing.assert_allclose(averaged.apply(inside), expected, rtol=0, atol=limit)
-    assert averaged.definite == (np.abs(_matrix(averaged) - _matrix(averaged).T).max() < 1e-5)
-    rough = averaged.apply(inside, 1.0)
-    assert np.abs(rough - expected).max() < (limit if dt is None else 0.05 * np.abs(expected).max())
-    same = np.broadcast_to(np.eye(13), inside.shape)
+    averaged = AveragedEquations(CoupledEquations(system(random, 14, generator(random, 3, reversible=True))))
+    same, scale = np.broadcast_to(np.eye(13), (2, 3, 13, 13)), np.array([1.0, 1e3])
     almost = same.copy()
-    almost[:, 0, 0, 0] += 1e-9  # not recognised as equal in all graphs
+    almost[:, 0, 0, 0] += 1e-9  # not recognised as equal
     np.testing.assert_allclose(averaged.enter(same, scale), averaged.enter(almost, scale), rtol=1e-5, atol=1e-5)
 
 
-def _matrix(averaged):
-    """I + S for diagonal unknowns: enough to see whether it is symmetric."""
-    columns = []
-    for i, a in np.ndindex(3, 13):
-        unit = np.zeros((1, 3, 13, 13), np.float32)
-        unit[0, i, a, a] = 1.0
-        columns.append(np.diagonal(averaged.apply(unit)[0], axis1=1, axis2=2).ravel().copy())
-    return np.array(columns).T
-
-
-def test_plain_conjugate_gradients_solve_several_systems_at_once():
-    """Against numpy; a right-hand side that is zero gives zero."""
-    random = np.random.default_rng(16)
-    root = random.standard_normal((18, 18))
-    matrix = root @ root.T / 18 + np.eye(18)
-    right = random.standard_normal((3, 2, 3, 3))
-    right[1] = 0.0
-    asked = []
-
+def test_plain_conjugate_gradients_end_after_so_many_iterations():
     def apply(x, accuracy):
-        asked.append(accuracy)
-        return (x.reshape(3, 18) @ matrix).reshape(x.shape)
+        return np.arange(1.0, 19.0).reshape(1, 2, 3, 3) * x
 
-    found, used = plain_conjugate_gradients(apply, right.copy(), np.full(3, 1e-12), 50)
-    assert used == len(asked) <= 25
-    assert asked == sorted(asked)
-    np.testing.assert_allclose(found.reshape(3, 18), np.linalg.solve(matrix, right.reshape(3, 18).T).T, atol=1e-10)
-    assert plain_conjugate_gradients(apply, right.copy(), np.full(3, 1e-12), 4)[1] == 4
+    assert plain_conjugate_gradients(apply, np.ones((1, 2, 3, 3)), np.full(1, 1e-12), 4)[1] == 4
 
 
 PERIODIC = np.roll(np.eye(4), 1, axis=1)
@@ -211,30 +167,6 @@ def test_one_graph_is_the_h2_norm(kind):
     assert np.trace(MomentSolver(model).steady()[0]) == pytest.approx(control.system_norm(plant, 2) ** 2, rel=1e-8)
 
 
-@pytest.mark.parametrize("time", ["continuous", "discrete"])
-@pytest.mark.parametrize("kind", ["symmetric", "directed", "chain"])
-def test_single_graphs_are_scipys(time, kind):
-    """The building block, in both directions, with a rate of leaving."""
-    random = np.random.default_rng(10)
-    drift = np.stack([laplacian(random, 9, kind)[1:, 1:] * 0.1 for _ in range(2)])
-    right = np.stack([a @ a.T for a in random.standard_normal((2, 8, 8))])
-    leaving = np.array([0.5, 0.125])
-    solves = LocalSolves(time, drift, leaving)
-    assert (solves.eigenvectors is None) == (kind == "chain")
-    for local, matrices in ((solves, drift), (solves.transposed(), drift.transpose(0, 2, 1))):
-        found, moved = local(right)
-        for x, y, d, f, a in zip(found, moved, matrices, right, leaving, strict=True):
-            if time == "continuous":
-                expected = scipy.linalg.solve_continuous_lyapunov(d + 0.5 * a * np.eye(8), f)
-                after = expected
-            else:
-                w = np.eye(8) - d
-                expected = scipy.linalg.solve_discrete_lyapunov(np.sqrt(1.0 - a) * w, f)
-                after = w @ expected @ w.T
-            np.testing.assert_allclose(x, expected, rtol=1e-8, atol=1e-10)
-            np.testing.assert_allclose(y, after, rtol=1e-8, atol=1e-10)
-
-
 def test_union_that_does_not_connect_is_refused():
     pieces = np.kron(np.eye(2), [[1.0, -1.0], [-1.0, 1.0]])
     lift = scipy.linalg.helmert(4).T
@@ -265,19 +197,15 @@ def test_drift_that_pushes_away_is_refused():
         MomentSolver(model).steady()
 
 
-def test_no_convergence_is_an_error_or_a_dense_solve(monkeypatch):
-    monkeypatch.setattr(solvers, "MAX_ITERATIONS", 2)
-    monkeypatch.setattr(solvers, "MAX_RELATIVE_ERROR", 1e-14)
+def test_no_convergence_is_an_error_or_a_dense_solve():
     random = np.random.default_rng(12)
     model = system(random, 12, generator(random, 4), "directed")
-    with pytest.raises(InputError, match="iterations do not converge"):
-        IterativeSolver(model).steady()
     unknowns = 4 * 11 * 12 // 2
-    solver = MomentSolver(model, most_dense=unknowns)
+    solver = MomentSolver(model, most_dense=unknowns, most_iterations=2)
     solver.steady()
     assert solver.report.method == "dense"
     with pytest.raises(InputError, match="iterations do not converge"):
-        MomentSolver(model, most_dense=unknowns - 1).steady()
+        MomentSolver(model, most_dense=unknowns - 1, most_iterations=2).steady()
 
 
 def test_many_forms_are_solved_in_batches():
@@ -286,15 +214,3 @@ def test_many_forms_are_solved_in_batches():
     forms = np.stack([a + a.T for a in random.standard_normal((7, 8, 8))])
     together = IterativeSolver(model).dual(forms)
     np.testing.assert_allclose(IterativeSolver(model, chunk=400).dual(forms), together, rtol=1e-10, atol=1e-12)
-
-
-@pytest.mark.parametrize("d", [0, 1, 2, 5])
-def test_packed_matrices_keep_the_inner_product_and_adjoints(d):
-    w, *others = np.random.default_rng(1).standard_normal((3, d, d))
-    a, b = (other + other.T for other in others)
-    assert symmetric.pack(a).shape == (symmetric.size(d),)
-    np.testing.assert_allclose(symmetric.unpack(symmetric.pack(a), d), a, rtol=1e-15)
-    assert symmetric.pack(a) @ symmetric.pack(b) == pytest.approx(np.trace(a @ b), abs=1e-12)
-    lyapunov = symmetric.lyapunov(w)
-    np.testing.assert_allclose(lyapunov @ symmetric.pack(a), symmetric.pack(w @ a + a @ w.T), atol=1e-12)
-    np.testing.assert_allclose(lyapunov.T @ symmetric.pack(a), symmetric.pack(w.T @ a + a @ w), atol=1e-12)

@@ -1,28 +1,20 @@
-"""Autocovariance and density: one graph in closed form, brute force, integrals, and long runs by scipy.signal.welch."""
+"""Autocovariance and density: one graph in closed form, brute force, and integrals."""
 
 import itertools
-from typing import Any
 
 import numpy as np
 import pytest
 import scipy.linalg
-import scipy.signal
 
+from experiments import TRACKING, line_ring, predict
 from msg_analysis import Experiment, InputError
-from msg_analysis.theory.prediction import predict
 from msg_analysis.theory.spectrum import spectrum
-
-
-def one_graph() -> Experiment:
-    run = {"dt": 0.1, "duration": 100}
-    graph = {"ring": {"cycle": [1, 2, 3, 4]}}
-    leaders = {"agents": [1], "gain": 0.5}
-    return Experiment.parse({"name": "one", "problem": "tracking", "leaders": leaders, "graphs": graph, "run": run})
 
 
 def test_one_graph_is_a_vector_autoregression() -> None:
     """R(l) = W^l C, and the density (1 - W z)^-1 N (1 - W z)^-* at z = exp(-i w)."""
-    prediction = predict(one_graph())
+    ring = {"ring": {"cycle": [1, 2, 3, 4]}}
+    prediction = predict(line_ring(graphs=ring, switching={}, run={"dt": 0.1}, **TRACKING))
     weights, noise = prediction.step.weights[0], prediction.step.noise[0]
     steady = scipy.linalg.solve_discrete_lyapunov(weights, noise)
     frequencies = np.array([0.0, 0.3, 1.0, 4.9, 5.0])
@@ -37,25 +29,16 @@ def test_one_graph_is_a_vector_autoregression() -> None:
     assert found.times == pytest.approx([0.0, 0.1, 0.7, 4.0])
 
 
-LAWS: dict[str, dict[str, Any]] = {
-    "line_ring": {},
-    "tracking": {},
-    "discrete": {},
-    "lossy_links": {},
-    "line_ring_realtime": {},
-    "delay": {"noise": {"process": 1.0, "delay": 3}},
-    "hold": {"noise": {"process": 1.0, "loss": 0.4, "on_loss": "hold", "broadcast": 0.2}},
+NAMES = "line_ring", "tracking", "discrete", "lossy_links", "line_ring_realtime"
+LAWS = {name: Experiment.load(name) for name in NAMES} | {
+    "delay": line_ring(5, 0.5, noise={"delay": 3}),
+    "hold": line_ring(5, 0.5, noise={"loss": 0.4, "on_loss": "hold", "broadcast": 0.2}),
 }
-
-
-def of(law: str, **run: Any) -> Experiment:
-    document = Experiment.load(law if "noise" not in LAWS[law] else "line_ring").to_document() | LAWS[law]
-    return Experiment.parse(document | {"run": document["run"] | run})
 
 
 @pytest.mark.parametrize("law", LAWS)
 def test_lag_0_and_the_integral_are_the_predicted_covariance(law: str) -> None:
-    prediction = predict(of(law))
+    prediction = predict(LAWS[law])
     frequencies = np.linspace(0.0, 0.5 / prediction.step.dt, 4001)
     found = spectrum(prediction, np.array([0]), frequencies)
     assert found.covariances[0] == pytest.approx(prediction.emulated.covariance, rel=1e-12, abs=1e-14)
@@ -65,9 +48,10 @@ def test_lag_0_and_the_integral_are_the_predicted_covariance(law: str) -> None:
     assert found.system_density == pytest.approx(found.node_densities.sum(axis=1))
 
 
-def test_the_sum_over_all_paths() -> None:
-    """E[e(k + l) e(k)^T] for three graphs: every path of so many graphs, with its probability."""
-    prediction = predict(of("tracking"))
+@pytest.mark.parametrize("law", LAWS)
+def test_the_sum_over_all_paths(law: str) -> None:
+    """E[e(k + l) e(k)^T]: every path of so many graphs, with its probability."""
+    prediction = predict(LAWS[law])
     system, lag = prediction.system, 4
     expected = np.zeros((system.dimension,) * 2)
     for path in itertools.product(range(system.modes), repeat=lag):
@@ -80,36 +64,18 @@ def test_the_sum_over_all_paths() -> None:
     assert spectrum(prediction, np.array([lag])).covariances[0] == pytest.approx(system.lifted(expected), rel=1e-10)
 
 
-def test_the_density_is_the_sum_over_lags() -> None:
-    prediction = predict(of("lossy_links"))
+@pytest.mark.parametrize("law", LAWS)
+def test_the_density_is_the_sum_over_lags(law: str) -> None:
+    prediction = predict(LAWS[law])
     lags = np.arange(4000)
     frequency = 0.37
     found = spectrum(prediction, lags, np.array([frequency]))
     terms = found.system_autocovariance * np.cos(2.0 * np.pi * frequency * found.times)
-    assert found.system_density[0] == pytest.approx(2.0 * 0.05 * (2.0 * terms.sum() - terms[0]), rel=1e-9)
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_long_runs(law: str) -> None:
-    """Bands of the density by Welch's method within 6 %, lags within 6 % of lag 0: four standard errors or more."""
-    experiment = of(law, duration=20_000 if law == "discrete" else 2000, replicas=8, seed=11)
-    prediction = predict(experiment)
-    states, dt = experiment.simulate().states, prediction.step.dt
-    consensus = experiment.problem == "consensus"
-    errors = states - (states.mean(axis=1, keepdims=True) if consensus else experiment.reference)
-    frequencies, measured = scipy.signal.welch(errors, fs=1.0 / dt, nperseg=1024, detrend=False, axis=0)
-    predicted = spectrum(prediction, np.array([0]), frequencies).node_densities.sum(axis=1)
-    for band in np.array_split(np.arange(4, 512), 6):
-        ratio = measured.sum(axis=1).mean(axis=1)[band].sum() / predicted[band].sum()
-        assert ratio == pytest.approx(1.0, abs=0.06), band
-    found = spectrum(prediction, np.array([1, 5, 20]))
-    for lag, expected in zip(found.lags.tolist(), found.system_autocovariance, strict=True):
-        seen = (errors[lag:] * errors[: len(errors) - lag]).sum(axis=1).mean()
-        assert seen == pytest.approx(expected, abs=0.06 * prediction.emulated.system_error)
+    assert found.system_density[0] == pytest.approx(2.0 * prediction.step.dt * (2.0 * terms.sum() - terms[0]), rel=1e-9)
 
 
 def test_default_lags_end_where_little_is_left() -> None:
-    found = spectrum(predict(of("line_ring")))
+    found = spectrum(predict(LAWS["line_ring"]))
     assert found.lags[0] == 0
     assert len(found.lags) <= 200
     assert abs(found.system_autocovariance[-1]) == pytest.approx(0.01 * found.system_autocovariance[0], rel=0.05)
@@ -117,18 +83,17 @@ def test_default_lags_end_where_little_is_left() -> None:
 
 
 def test_in_python_and_without_noise() -> None:
-    found = of("line_ring").spectrum([0, 1], [0.0, 1.0])
+    found = LAWS["line_ring"].spectrum([0, 1], [0.0, 1.0])
     assert found.to_json()["lags"] == [0.0, 0.05]
     assert "Spectrum of 'line_ring'" in repr(found)
     assert [len(axes.get_lines()) for axes in found.plot().axes] == [7, 6]
-    quiet = {"name": "q", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "noise": {"process": 0.0}}
-    found = spectrum(predict(Experiment.parse(quiet | {"run": {"duration": 10, "start": "zero"}})))
+    found = spectrum(predict(line_ring(noise={"process": 0.0})))
     assert not found.system_autocovariance.any()
     assert not found.system_density.any()
 
 
 def test_refused() -> None:
-    prediction = predict(of("line_ring"))
+    prediction = predict(LAWS["line_ring"])
     for lags in ([], [-1, 2], [3, 3]):
         with pytest.raises(InputError, match="lags: expected ascending whole numbers"):
             spectrum(prediction, np.array(lags, dtype=np.int64))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from experiments import Experiment, predict, simulate
+from experiments import Experiment, line_ring, predict, simulate
 from msg_analysis.errors import InputError
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.time_mean_variance import mean_variance
@@ -15,12 +15,10 @@ from msg_analysis.theory.time_mean_variance import mean_variance
 PATH, RING = {"path": [1, 2, 3]}, {"cycle": [1, 2, 3]}
 
 
-def experiment(graphs: dict[str, Any], rate: float = 0.7, **changes: Any) -> Experiment:
-    names = list(graphs)
-    switching = {"rates": {a: {b: rate} for a, b in itertools.pairwise([*names, names[0]])}} if len(names) > 1 else {}
-    document: dict[str, Any] = {"name": "net", "graphs": graphs, "noise": {"process": [1.0, 0.5, 2.0]}}
-    document |= {"run": {"dt": 0.15, "duration": 30, "replicas": 2}, "switching": switching} | changes
-    return Experiment.parse({key: value for key, value in document.items() if value != {}})
+def uneven(graphs: dict[str, Any], rate: float = 0.7, **changes: Any) -> Experiment:
+    """One graph, or two that are left at this rate, of agents with different noise."""
+    fields = {"noise": {"process": [1.0, 0.5, 2.0]}, "run": {"dt": 0.15, "duration": 30}}
+    return line_ring(3, rate, graphs=graphs, **({"switching": {}} if len(graphs) == 1 else {}) | fields | changes)
 
 
 def by_brute_force(prediction: Prediction, patterns: list[list[tuple[float, np.ndarray]]]) -> tuple[float, float]:
@@ -72,10 +70,6 @@ def by_brute_force(prediction: Prediction, patterns: list[list[tuple[float, np.n
     return found[0], found[1]
 
 
-def without_loss(prediction: Prediction) -> list[list[tuple[float, np.ndarray]]]:
-    return [[(1.0, matrix)] for matrix in prediction.system.matrices]
-
-
 def with_loss(prediction: Prediction, probability: float) -> list[list[tuple[float, np.ndarray]]]:
     """Every pattern of lost messages: the weight of a lost one falls to the agent itself."""
     step, lift = prediction.step, prediction.system.lift
@@ -108,9 +102,9 @@ def with_loss(prediction: Prediction, probability: float) -> list[list[tuple[flo
     ],
 )
 def test_it_is_the_sum_of_all_autocovariances(changes: dict[str, Any]) -> None:
-    prediction = predict(experiment({"path": PATH, "ring": RING}, **changes))
+    prediction = predict(uneven({"path": PATH, "ring": RING}, **changes))
     found = mean_variance(prediction)
-    path, alone = by_brute_force(prediction, without_loss(prediction))
+    path, alone = by_brute_force(prediction, [[(1.0, matrix)] for matrix in prediction.system.matrices])
     assert found.followed
     assert found.path == pytest.approx(path, rel=1e-8)
     assert found.of(1) == pytest.approx(alone, rel=1e-8)
@@ -121,7 +115,7 @@ def test_it_is_the_sum_of_all_autocovariances(changes: dict[str, Any]) -> None:
 def test_losses_to_the_first_order(weight: float, loss: float) -> None:
     """Of a step in which a loss moves an agent by 15 %, then 45 % of the difference: within 0.2 and 2 %."""
     graphs = {"path": {"edges": [[1, 2, weight], [2, 3, weight]]}, "pair": {"edges": [[1, 2, 0.2 * weight]]}}
-    prediction = predict(experiment(graphs, noise={"process": 1.0, "loss": loss}))
+    prediction = predict(uneven(graphs, noise={"process": 1.0, "loss": loss}))
     found = mean_variance(prediction)
     path, alone = by_brute_force(prediction, with_loss(prediction, loss))
     assert found.path == pytest.approx(path, rel=0.02 if weight > 1.0 else 0.002)
@@ -130,7 +124,7 @@ def test_losses_to_the_first_order(weight: float, loss: float) -> None:
 
 def test_one_graph_in_closed_form() -> None:
     """Gaussian states: the covariance of y^T y at lag l is 2 tr(C_l C_l^T); no path, no scatter of it."""
-    prediction = predict(experiment({"path": PATH}))
+    prediction = predict(uneven({"path": PATH}))
     weights, noise = prediction.system.matrices[0], prediction.system.noise[0]
     lag = scipy.linalg.solve_discrete_lyapunov(weights, noise)
     total = 2.0 * float((lag * lag).sum())
@@ -144,7 +138,7 @@ def test_one_graph_in_closed_form() -> None:
 
 def test_of_a_large_network_the_principal_axes_are_followed() -> None:
     graphs = {"path": {"path": [1, 2, 3, 4, 5, 6]}, "ring": {"cycle": [1, 3, 5, 2, 4, 6]}}
-    prediction = predict(experiment(graphs, noise={"process": 1.0, "loss": 0.1}))
+    prediction = predict(uneven(graphs, noise={"process": 1.0, "loss": 0.1}))
     exact = mean_variance(prediction)
     near = mean_variance(prediction, most_work=2.0 * 7.0**3)  # p = 6 of three axes
     assert exact.followed
@@ -155,7 +149,7 @@ def test_of_a_large_network_the_principal_axes_are_followed() -> None:
 
 def test_runs_scatter_so_much() -> None:
     """120 runs of 2000 steps: the sum of squares over the variance, chi-square with 119 degrees: 1 % false alarms."""
-    prediction = predict(experiment({"path": PATH, "ring": RING}, noise={"process": 1.0, "loss": 0.2, "link": 0.3}))
+    prediction = predict(uneven({"path": PATH, "ring": RING}, noise={"process": 1.0, "loss": 0.2, "link": 0.3}))
     means = []
     for seed in range(120):
         run = simulate(prediction.experiment.with_run(seed=seed, duration=300.0))
@@ -171,7 +165,7 @@ def test_no_fourth_moments() -> None:
     """Losses of messages with large weights: second moments exist, fourth do not."""
     graphs = {"mixed": {"arcs": [[1, 2, 1.0], [2, 1, 1.0], [2, 3, 1.0], [3, 1, 1.0]]}}
     run = {"dt": 0.95, "duration": 28.5}
-    prediction = predict(experiment(graphs, noise={"process": 1.0, "loss": 0.3}, run=run))
+    prediction = predict(uneven(graphs, noise={"process": 1.0, "loss": 0.3}, run=run))
     assert np.isfinite(prediction.emulated.system_error)
     fourth = sum(p * np.kron(np.kron(w, w), np.kron(w, w)) for p, w in with_loss(prediction, 0.3)[0])
     assert np.abs(np.linalg.eigvals(fourth)).max() > 1.4

@@ -1,4 +1,4 @@
-"""The two-topology closed forms against Kronecker algebra as printed, the coupled solver, and many digits."""
+"""The two-topology closed forms against the coupled solver and many digits; as printed: benchmarks/errata.py."""
 
 import dataclasses
 from decimal import localcontext
@@ -17,7 +17,7 @@ from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.graph_indices import MAX_UNKNOWNS, two_topology
 from msg_analysis.theory.moments import MomentSolver
 
-MODELS = settings(max_examples=25, deadline=None, derandomize=True)
+MODELS = settings(max_examples=40, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
 
 
@@ -28,39 +28,6 @@ def with_rate(system, rate):
     return dataclasses.replace(system, chain=flow if system.time == "continuous" else np.eye(2) + flow)
 
 
-def printed_consensus(experiment):
-    """(static, E) per agent, by the formula of the paper with its pseudo-inverses and m^2 x m^2 matrices."""
-    m = experiment.agents
-    eye, projector = np.eye(m), np.eye(m) - 1 / m
-    both = np.kron(projector, projector)
-    q = (projector @ experiment.noise_gain[0] @ experiment.noise_gain[0].T @ projector).ravel()
-    inverses = []
-    for graph in experiment.graph_list:
-        z = projector @ graph.laplacian @ projector
-        inverses.append(np.linalg.pinv(np.kron(z, eye) + np.kron(eye, z), rcond=1e-11))
-    one, two = inverses
-    pi = experiment.chain.stationary
-    beta = experiment.chain.matrix[0, 1] + experiment.chain.matrix[1, 0]
-    omega = both @ (pi[1] * one + pi[0] * two)
-    inner = np.linalg.solve(np.eye(m * m) + beta * omega, both @ (two @ q - one @ q))
-    static, error = [], []
-    for agent in range(m):
-        h = np.outer(eye[agent], eye[agent]).ravel()
-        static.append(h @ (pi[0] * one @ q + pi[1] * two @ q))
-        error.append(static[-1] - beta * pi[0] * pi[1] * h @ (two - one) @ inner)
-    return np.array(static), np.array(error)
-
-
-@MODELS
-@given(seeds, st.integers(2, 5))
-def test_consensus_is_the_formula_of_the_paper(seed, m):
-    experiment = network(seed, m, 2, directed=False)
-    static, error = printed_consensus(experiment)
-    found = two_topology(systems.continuous(experiment))
-    np.testing.assert_allclose(found.static, static, rtol=1e-9)
-    np.testing.assert_allclose(found.node_errors, error, rtol=1e-9)
-
-
 @MODELS
 @given(
     seeds,
@@ -68,12 +35,21 @@ def test_consensus_is_the_formula_of_the_paper(seed, m):
     st.sampled_from(["consensus", "tracking", "grounded"]),
     st.sampled_from(["continuous", "emulated", "discrete"]),
     st.booleans(),
+    st.booleans(),
 )
-def test_closed_form_is_the_solution_of_the_coupled_equations(seed, m, problem, law, directed):
+def test_closed_form_is_the_solution_of_the_coupled_equations(seed, m, problem, law, directed, uneven):
+    """Uneven: noise, and in steps losses, depend on the graph."""
     gain, time = np.inf if problem == "grounded" else 0.7, "discrete" if law == "discrete" else "continuous"
     kind = "consensus" if problem == "consensus" else "tracking"
     experiment = network(seed, m, 2, problem=kind, gain=gain, time=time, directed=directed, dt=0.01)
     system = systems.continuous(experiment) if law == "continuous" else predict(experiment).system
+    random, d = np.random.default_rng(seed), system.dimension
+    if uneven:
+        f = random.standard_normal((2, d, d))
+        system = dataclasses.replace(system, noise=f @ f.transpose(0, 2, 1))
+    if uneven and law != "continuous":
+        most = 0.01 if law == "discrete" else 1e-4  # for steps that are still stable
+        system = dataclasses.replace(system, loss_variance=random.uniform(0.0, most, (2, m, m)))
     covariance = system.lifted(MomentSolver(system).steady().sum(axis=0))
     found = two_topology(system)
     np.testing.assert_allclose(found.node_errors, np.diag(covariance), rtol=1e-9, atol=1e-13)
@@ -81,21 +57,6 @@ def test_closed_form_is_the_solution_of_the_coupled_equations(seed, m, problem, 
     held = [MomentSolver(systems.held(system, mode)).steady()[0] for mode in range(2)]
     static = sum(share * np.diag(system.lifted(c)) for share, c in zip(system.stationary, held, strict=True))
     np.testing.assert_allclose(found.static, static, rtol=1e-9, atol=1e-13)
-
-
-@MODELS
-@given(seeds, st.integers(2, 5), st.sampled_from(["continuous", "discrete"]))
-def test_noise_and_loss_that_depend_on_the_graph(seed, m, time):
-    random = np.random.default_rng(seed)
-    experiment = network(seed, m, 2, time=time, directed=False, dt=0.01)
-    system = systems.continuous(experiment) if time == "continuous" else predict(experiment).system
-    d = system.dimension
-    f = random.standard_normal((2, d, d))
-    system = dataclasses.replace(system, noise=f @ f.transpose(0, 2, 1))
-    if time == "discrete":
-        system = dataclasses.replace(system, loss_variance=random.uniform(0.0, 0.01, (2, m, m)))
-    covariance = system.lifted(MomentSolver(system).steady().sum(axis=0))
-    np.testing.assert_allclose(two_topology(system).node_errors, np.diag(covariance), rtol=1e-9, atol=1e-12)
 
 
 def exact_error(z, pi, q, beta):
@@ -119,19 +80,6 @@ def test_any_rate_to_high_precision(rate, gain):
     pi = [system.stationary[0], 1 - system.stationary[0]]
     exact = exact_error(system.matrices, pi, system.noise[0], rate)
     assert two_topology(system).system_error == pytest.approx(exact, rel=1e-9)
-
-
-@MODELS
-@given(seeds, st.integers(2, 5), st.sampled_from(["continuous", "discrete"]), st.booleans())
-def test_equal_noise_makes_switching_help_the_more_the_faster(seed, m, time, tracking):
-    problem = "tracking" if tracking else "consensus"
-    experiment = network(seed, m, 2, time=time, noise=1.0, problem=problem, directed=False, dt=0.01)
-    system = systems.continuous(experiment) if time == "continuous" else predict(experiment).system
-    fastest = 1.0 / system.stationary.max()  # no probability above 1
-    rates = np.geomspace(1e-4, 1e4, 9) if time == "continuous" else np.linspace(0.05, 1.0, 9) * fastest
-    gains = [two_topology(with_rate(system, rate)).switching.sum() for rate in rates]
-    assert max(gains) <= 1e-12
-    assert (np.diff(gains) <= 1e-12).all()
 
 
 def test_fast_limits():
