@@ -17,7 +17,7 @@ from experiments import Experiment, line_ring, predict
 from msg_analysis.errors import InputError
 from msg_analysis.model.step_model import build_step_model
 from msg_analysis.theory.jump_system import emulated, held
-from msg_analysis.theory.moments import MomentSolver
+from msg_analysis.theory.moments import MomentSolver, transient_mean
 from msg_analysis.theory.solvers import DenseSolver
 
 MODELS = settings(max_examples=40, deadline=None, derandomize=True)
@@ -196,6 +196,27 @@ def test_steps_with_everything_are_those_of_brute_force(seed):
     dense = DenseSolver(prediction.system).steady()
     np.testing.assert_allclose(prediction.system.lifted(dense), expected, rtol=1e-7, atol=1e-8 * scale)
     json.dumps(prediction.to_json(), allow_nan=False)
+
+
+@pytest.mark.parametrize(("seed", "steps"), [*((seed, 7) for seed in range(12)), (1, 3000), (2, 3000)])
+def test_transient_with_everything_is_that_of_brute_force(seed, steps):
+    """From a known start, which a delay takes to have been the same before."""
+    given = document(seed)
+    experiment = Experiment.parse(given)
+    _, law = transition_and_law(given)
+    blocks = given["noise"]["delay"] + 1
+    x = np.random.default_rng(seed).standard_normal(given["agents"])
+    stacked = np.tile(x, blocks)
+    vector = np.concatenate([np.kron(law, np.kron(stacked, stacked)), [1.0]])
+    matrix, total = affine_step(given, law), 0.0
+    for _ in range(steps):
+        total = total + agents_moments(given, vector).sum(axis=0)
+        vector = matrix @ vector
+    system = emulated(build_step_model(experiment), experiment.problem)
+    y = system.reduced(x)
+    initial = system.stationary[:, None, None] * np.outer(y, y)
+    measured = transient_mean(system, MomentSolver(system).steady(), initial, system.stationary, steps)
+    np.testing.assert_allclose(system.lifted(measured), total / steps, rtol=1e-9, atol=1e-9)
 
 
 @MODELS

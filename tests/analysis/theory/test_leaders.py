@@ -1,4 +1,4 @@
-"""Leader sets against brute-force Kronecker algebra, networkx, and an exact algorithm for paths."""
+"""Leader sets against brute-force Kronecker algebra, networkx, and exact algorithms for paths and rings."""
 
 import math
 from functools import cache
@@ -140,6 +140,28 @@ def best_on_path(agents: int, count: int) -> float:
         return min(between(place - last) + least(place, left - 1) for place in range(last + 1, agents - left + 1))
 
     return min(first * (first + 1) / 4 + least(first, count - 1) for first in range(agents - count + 1))
+
+
+def best_on_ring(agents: int, count: int) -> float:
+    """Exact: distances between neighbouring leaders as equal as can be, since ``between`` is convex."""
+    longer = agents % count
+    return longer * between(agents // count + 1) + (count - longer) * between(agents // count)
+
+
+@pytest.mark.parametrize(("agents", "count"), [(9, 1), (10, 2), (11, 3), (9, 4)])
+@pytest.mark.parametrize("kind", ["path", "cycle"])
+def test_optimal_leaders_on_paths_and_rings(kind: str, agents: int, count: int) -> None:
+    experiment = Experiment.parse({"name": kind, "graphs": {"g": {kind: list(range(1, agents + 1))}}})
+    best = (best_on_path if kind == "path" else best_on_ring)(agents, count)
+    exhaustive = select_leaders(experiment, count, method="exhaustive")
+    assert exhaustive.sets[0][0] == pytest.approx(best, rel=1e-10)
+    assert exhaustive.evaluations == math.comb(agents, count)
+    for method in ("greedy", "swap"):
+        selection = select_leaders(experiment, count, method=method)  # type: ignore[arg-type]
+        assert selection.bound is not None
+        assert selection.bound <= best * (1 + 1e-9)
+        assert selection.sets[0][0] >= best * (1 - 1e-9)
+        assert method == "greedy" or selection.sets[0][0] == pytest.approx(best, rel=1e-9)
 
 
 def test_optimal_leaders_of_a_longer_path() -> None:

@@ -246,6 +246,17 @@ def test_settling_time_is_the_last_crossing(law, place):
     assert settling_time(system, steady, start, most_unknowns=1) == pytest.approx(found, rel=1e-9)
 
 
+def test_settling_of_one_pair_in_closed_form():
+    """Two agents, one edge: the disagreement has variance (1 - exp(-4 t)) / 4, settled at log(20) / 4."""
+    document = LINE_RING | {"graphs": {"pair": {"path": [1, 2]}}, "switching": {}}
+    system = systems.continuous(Experiment.parse(document))
+    steady = steady_of(system)
+    assert settling_time(system, steady, point_start(system, np.zeros(2))) == pytest.approx(np.log(20) / 4, rel=1e-9)
+    rates = asymptotic_rates(system)
+    assert (rates.mean, rates.second_moment) == (pytest.approx(2.0), pytest.approx(4.0))
+    assert rates.graph is None
+
+
 def test_settled_from_the_start_and_slow_graphs():
     experiment = Experiment.parse(LINE_RING)
     system = systems.continuous(experiment)

@@ -82,6 +82,19 @@ def test_any_rate_to_high_precision(rate, gain):
     assert two_topology(system).system_error == pytest.approx(exact, rel=1e-9)
 
 
+@MODELS
+@given(seeds, st.integers(2, 5), st.sampled_from(["continuous", "discrete"]), st.booleans())
+def test_equal_noise_makes_switching_help_the_more_the_faster(seed, m, time, tracking):
+    problem = "tracking" if tracking else "consensus"
+    experiment = network(seed, m, 2, time=time, noise=1.0, problem=problem, directed=False, dt=0.01)
+    system = systems.continuous(experiment) if time == "continuous" else predict(experiment).system
+    fastest = 1.0 / system.stationary.max()  # no probability above 1
+    rates = np.geomspace(1e-4, 1e4, 9) if time == "continuous" else np.linspace(0.05, 1.0, 9) * fastest
+    gains = [two_topology(with_rate(system, rate)).switching.sum() for rate in rates]
+    assert max(gains) <= 1e-12
+    assert (np.diff(gains) <= 1e-12).all()
+
+
 def test_fast_limits():
     experiment = network(8, 5, 2, directed=False)
     system = systems.continuous(experiment)
