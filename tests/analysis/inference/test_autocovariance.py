@@ -71,10 +71,8 @@ def test_many_states_of_one_path(noise: dict[str, Any]) -> None:
     [{"process": 1.0}, {"process": 1.0, "loss": 0.2, "broadcast": 0.3}, {"process": 1.0, "delay": 2, "link": 0.3}],
 )
 def test_p_values_of_correct_runs_are_uniform(noise: dict[str, Any]) -> None:
-    """60 runs; Kolmogorov and Smirnov at 0.1 %: so often it fails with another seed.
-
-    A replica costs next to nothing, a step much: 300 steps of 8 replicas are as many numbers as 1,200 of 2.
-    """
+    """60 runs; Kolmogorov and Smirnov at 0.1 %: so often it fails with another seed."""
+    # A replica costs next to nothing, a step much: 300 steps of 8 replicas are as many numbers as 1,200 of 2.
     experiment = steps(noise=noise, run={"duration": 15, "replicas": 8})
     prediction = predict(experiment)
     values = [found(observed(experiment.with_run(seed=seed), prediction), LONG_LAGS).p for seed in range(60)]

@@ -89,10 +89,8 @@ CASES = {  # what the record claims, what is otherwise, the cause (kind, agent, 
 
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_wrong_is_the_first_cause(case):
-    """Fixed seeds; every fault is six standard errors large, and is to be estimated within four of them.
-
-    Apart from the errors, which show every fault, the test that is made for it is the clearest.
-    """
+    """Fixed seeds; every fault is six standard errors large, and is to be estimated within four of them."""
+    # Apart from the errors, which show every fault, the test that is made for it is the clearest.
     claimed, change, said, truth, found_by = CASES[case]
     result = compare(misrecorded(claimed | change, claimed))
     assert (result.verdict, result.exit_code) == ("disagrees", 1)

@@ -75,10 +75,8 @@ HARD = {
 @pytest.mark.parametrize("case", HARD)
 @pytest.mark.usefixtures("predicted_once")
 def test_the_level_holds_where_a_few_holding_times_decide(case):
-    """60 correct runs of 10 units (rare: 100), 1,000 for the documentation: alarms at 1e-4 by the binomial law.
-
-    Over all paths of the graphs, the errors of such runs are far from normal: 3 to 7 % of the verdicts were wrong.
-    """
+    """60 correct runs of 10 units (rare: 100), 1,000 for the documentation: alarms at 1e-4 by the binomial law."""
+    # Over all paths of the graphs, the errors of such runs are far from normal: 3 to 7 % of the verdicts were wrong.
     results = [compare(simulate(HARD[case].with_run(seed=seed))) for seed in range(60)]
     assert_few_alarms(results)
     noisy = case in ("far", "rare")

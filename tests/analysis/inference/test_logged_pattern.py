@@ -81,10 +81,8 @@ def written_out(observation):
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("timing", TIMING)
 def test_against_all_noise_written_out(case, timing, monkeypatch):
-    """Expectation and standard errors of the system error, of all nodes, and chi-square of all moments.
-
-    In blocks of a few steps, and with all arrays in files.
-    """
+    """Expectation and standard errors of the system error, of all nodes, and chi-square of all moments."""
+    # In blocks of a few steps, and with all arrays in files.
     monkeypatch.setenv(LARGE_VARIABLE, "1")
     observation = dataclasses.replace(observed(made_late(case, timing)), block_numbers=40)
     order = order_events(observation)

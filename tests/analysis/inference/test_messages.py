@@ -105,11 +105,9 @@ def means_of(observation):
 
 @pytest.mark.parametrize("case", CASES)
 def test_expectation_and_variance_given_the_log(case, monkeypatch):
-    """The expectation exactly; the variance, which is a function of the states, in the mean over many replicas.
-
-    It is a mean over 20,000 replicas with relative spread of about 1: 3 % are four standard errors. What is in use is
-    found in blocks of one or two steps, and is in files.
-    """
+    """The expectation exactly; the variance, which is a function of the states, in the mean over many replicas."""
+    # It is a mean over 20,000 replicas with relative spread of about 1: 3 % are four standard errors. What is in use is
+    # found in blocks of one or two steps, and is in files.
     monkeypatch.setenv(LARGE_VARIABLE, "1")
     observation = dataclasses.replace(observed(made(case, replicas=20_000)), block_numbers=300)
     brute, means = Unrolled(observation), means_of(observation)

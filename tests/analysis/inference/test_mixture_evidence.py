@@ -89,10 +89,8 @@ def test_proportions_begin_at_one_and_their_mean_stays_one() -> None:
 
 
 def test_a_fair_game_seldom_wins_much() -> None:
-    """Of 2,000 fair games of 1,000 normal samples, watched all the time, at most 5 % ever pass 20 (Ville).
-
-    False-alarm rate: that of a binomial(2000, 0.05) above 129, 0.2 %; the seed is fixed.
-    """
+    """Of 2,000 fair games of 1,000 normal samples, watched all the time, at most 5 % ever pass 20 (Ville)."""
+    # False-alarm rate: that of a binomial(2000, 0.05) above 129, 0.2 %; the seed is fixed.
     samples = np.random.default_rng(3).normal(size=(2000, 1000))
     counts = np.arange(1, 1001)
     logs = variance_evidence(np.broadcast_to(counts, samples.shape), np.cumsum(samples**2, axis=1))

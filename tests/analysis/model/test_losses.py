@@ -109,11 +109,9 @@ def test_mistakes(noise: dict[str, Any], expected: str) -> None:
     [(p, b) for p in (0.1, 0.4, 0.55) for b in (None, 1.0, 1.6, 5.0, 40.0) if b is None or b > p / (1 - p)],
 )
 def test_the_law_of_bursts(loss: float, burst: float | None) -> None:
-    """Pairs of fates of successive messages against the chain, and its stationary law: chi-square with 3 degrees.
-
-    Pairs that do not overlap, far enough apart to be nearly independent. p > 1e-4 in each of the 14 cases: a right
-    program fails with probability about 1.4e-3.
-    """
+    """Pairs of fates of successive messages against the chain, and its stationary law: chi-square with 3 degrees."""
+    # Pairs that do not overlap, far enough apart to be nearly independent. p > 1e-4 in each of the 14 cases: a right
+    # program fails with probability about 1.4e-3.
     what = lossy({"loss": loss} | ({} if burst is None else {"burst": burst}), run={"seed": 3})
     chain = Losses(what)
     lost = np.concatenate([chain.block(0, 1, number) for number in range(400)])

@@ -93,10 +93,8 @@ def setup(time: str, matrix: np.ndarray, steps: int, dt: float = 0.3, **switchin
 
 @pytest.mark.parametrize("time", ["continuous", "discrete"])
 def test_path_has_the_transition_probabilities(time: str) -> None:
-    """Transition counts of 40,000 steps against expm(Gamma dt), Pearson chi-square per row, p > 1e-5 each.
-
-    dt is a third of a mean holding time, so many holding periods fall between two steps. False-alarm rate 6e-5.
-    """
+    """Transition counts of 40,000 steps against expm(Gamma dt), Pearson chi-square per row, p > 1e-5 each."""
+    # dt is a third of a mean holding time, so many holding periods fall between two steps. False-alarm rate 6e-5.
     gamma = generator_of(1, 3)
     matrix = gamma if time == "continuous" else scipy.linalg.expm(gamma * 0.3)
     case = setup(time, matrix, 40_000, 0.3 if time == "continuous" else 1.0)

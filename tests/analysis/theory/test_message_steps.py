@@ -400,10 +400,8 @@ OF_EVERY_KIND = "held", "own, by link", "own, bursts", "real time, own", "real t
 
 @pytest.mark.parametrize("case", [*OF_EVERY_KIND, "real time, own, delay"])
 def test_fourth_moments_from_a_known_start(case):
-    """E[y^4] without noise, over three steps of messages that are lost, late, held or used one after the other.
-
-    By Kronecker powers of the matrices of every outcome, in the coordinates of all states and all that was heard.
-    """
+    """E[y^4] without noise, over three steps of messages that are lost, late, held or used one after the other."""
+    # By Kronecker powers of the matrices of every outcome, in the coordinates of all states and all that was heard.
     experiment = parse(case)
     prediction = predict(experiment)
     system = prediction.system

@@ -22,12 +22,10 @@ def uneven(graphs: dict[str, Any], rate: float = 0.7, **changes: Any) -> Experim
 
 
 def by_brute_force(prediction: Prediction, patterns: list[list[tuple[float, np.ndarray]]]) -> tuple[float, float]:
-    """N times the variance of the time mean of tr M, and of y^T y of one replica, by sums of autocovariances.
-
-    ``patterns``: for every graph the probability and the matrix W of every pattern of lost messages, in reduced
-    coordinates. Moments are those of Kronecker powers of y, nothing is packed: C = E[y y], T = E[y y y y] and
-    X = E[M M] as vectors, by graph.
-    """
+    """N times the variance of the time mean of tr M, and of y^T y of one replica, by sums of autocovariances."""
+    # ``patterns``: for every graph the probability and the matrix W of every pattern of lost messages, in reduced
+    # coordinates. Moments are those of Kronecker powers of y, nothing is packed: C = E[y y], T = E[y y y y] and
+    # X = E[M M] as vectors, by graph.
     system = prediction.system
     n, d, law = system.modes, system.dimension, system.stationary
     noise = [one.ravel() for one in system.noise]

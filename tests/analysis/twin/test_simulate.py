@@ -20,11 +20,9 @@ from msg_analysis.model.step_model import build_step_model
     ],
 )
 def test_mean_square_error_is_the_predicted_one(law: str, air: str) -> None:
-    """30 independent seeds, 60 replicas, forty steps after a stationary start.
-
-    z of the mean over seeds (replicas share lost messages), p > 3e-5 by Student's t with 29 degrees of freedom, for 4
-    agents of 17 cases: a right program fails with probability about 2e-3. An error wrong by a third fails.
-    """
+    """30 independent seeds, 60 replicas, forty steps after a stationary start."""
+    # z of the mean over seeds (replicas share lost messages), p > 3e-5 by Student's t with 29 degrees of freedom, for 4
+    # agents of 17 cases: a right program fails with probability about 2e-3. An error wrong by a third fails.
     duration = 40 if LAWS[law].get("time") == "discrete" else 2
     setup = four_agents(law, air, replicas=60, duration=duration, start="stationary")
     means = []
@@ -38,10 +36,8 @@ def test_mean_square_error_is_the_predicted_one(law: str, air: str) -> None:
 
 
 def test_stationary_start_has_the_covariance_of_its_graph() -> None:
-    """Chi-square on the half-vectorised covariance of 22,000 replicas, p > 1e-4: the false-alarm rate.
-
-    So many replicas have no past: their start is normal. tests/analysis/theory/test_sequential.py has those with one.
-    """
+    """Chi-square on the half-vectorised covariance of 22,000 replicas, p > 1e-4: the false-alarm rate."""
+    # So many replicas have no past: their start is normal. tests/analysis/theory/test_sequential.py has those with one.
     setup = four_agents("tracking", "plain", replicas=22_000, start="stationary")
     prediction = predict(setup)
     record = new_record(setup)
