@@ -1,7 +1,5 @@
 """What importing a module brings with it, in an interpreter of its own. Who may import whom: tests/test_layers.py."""
 
-from __future__ import annotations
-
 import functools
 import json
 import subprocess

@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """Which processes a network has, on which hosts and cores."""
-
-from __future__ import annotations
 
 import os
 import subprocess

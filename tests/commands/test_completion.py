@@ -1,7 +1,5 @@
 """Completion by shells: by the protocol that their scripts speak, and in a real bash."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

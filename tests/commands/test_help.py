@@ -1,7 +1,5 @@
 """What all commands of both command lines have in common: help, options, examples, start-up."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import re

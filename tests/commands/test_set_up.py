@@ -1,7 +1,5 @@
 """What ``make setup`` runs, with which packages: uv gets the places in which pip looks for them."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re
@@ -23,8 +21,6 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Any:
             monkeypatch.delenv(name)
     monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)  # nor the files of this machine
     spec = importlib.util.spec_from_file_location("install", FILE)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

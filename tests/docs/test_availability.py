@@ -1,7 +1,5 @@
 """What docs/network.md says is available, in "What is available"."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any, Literal
 
@@ -79,6 +77,6 @@ def test_all_runs_and_all_but_nonlinear_protocols_is_predicted(messages: str, pa
 def test_what_it_says_runs_does(law: str, messages: str) -> None:
     """Ten steps of the twin in both paces."""
     for pace in ("lockstep", "realtime"):
-        what = experiment(messages, law, pace)  # type: ignore[arg-type]
+        what = experiment(messages, law, pace)
         assert unavailable(what) == []
         assert simulate(what.with_run(duration=0.5)).completeness.complete

@@ -1,7 +1,5 @@
 """The examples' predictions, by direct solutions of the equations that share no code with the package."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +94,6 @@ class Example:
 
     def continuous(self) -> np.ndarray:
         """Z_i C_i + C_i Z_i' - sum_j Gamma_ji C_j = pi_i Q, one unknown for every number."""
-        assert self.chain is not None
         drifts = [self.project(graph) for graph in self.graphs]
         identity = np.eye(len(self.basis))
         matrix = scipy.linalg.block_diag(*(np.kron(z, identity) + np.kron(identity, z) for z in drifts))
@@ -131,7 +128,6 @@ class Example:
 @pytest.mark.parametrize("file", SMALL, ids=lambda file: file.stem)
 def test_predictions(file: Path) -> None:
     example, prediction = Example(file), predict(Experiment.load(file))
-    assert prediction.emulated is not None
     np.testing.assert_allclose(prediction.emulated.node_errors, example.steps(), rtol=1e-9, atol=1e-15)
     assert (prediction.continuous_moments is None) == bool(example.discrete or example.loss)
     given, wanted = [], []
@@ -145,7 +141,6 @@ def test_hundred_agents() -> None:
     file = EXPERIMENTS / "hundred_agents.yaml"
     example, prediction = Example(file), predict(Experiment.load(file))
     m, chain = example.m, example.chain
-    assert chain is not None
     centre = np.eye(m) - 1.0 / m
 
     def apply(vector: np.ndarray) -> np.ndarray:

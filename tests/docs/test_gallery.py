@@ -1,7 +1,5 @@
 """The scripts of the documentation run, and draw what the pages show."""
 
-from __future__ import annotations
-
 import re
 import runpy
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the pages show is so: files are valid, commands and options exist, and print what stands there."""
 
-from __future__ import annotations
-
 import functools
 import json
 import re

@@ -1,7 +1,5 @@
 """The command line: what goes to stdout, what to stderr, and the exit codes; the same in a process of its own."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """Options of the nodes as ROS parameters: in processes of their own, as `ros2 run` starts them."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """What is predicted and said of a run over a channel."""
-
-from __future__ import annotations
 
 from typing import Any
 
@@ -34,7 +29,6 @@ def test_the_last_value_heard(channel: dict[str, Any], expected: float) -> None:
     """The prototype has the agents step in the order of their numbers, which moves the third digit after the point."""
     what = experiment(switching=SLOW, run=REALTIME)
     predicted = predicted_errors(Channel.parse(channel, what), what)
-    assert predicted is not None
     assert predicted["system_error"] == pytest.approx(expected, abs=1e-3)
     assert sum(predicted["node_errors"]) == pytest.approx(predicted["system_error"])
 

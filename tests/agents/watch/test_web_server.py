@@ -1,7 +1,5 @@
 """The page for browsers: what it serves, to whom, and that nobody holds anybody up."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json

@@ -89,7 +89,7 @@ def _values(run: Run, bag: Path, typestore: Any) -> Counter[str]:
         assert Counter(connection.topic for connection, _, _ in plain.messages()) == count
         for connection in plain.connections:
             assert connection.digest == typestore.hash_rihs01(connection.msgtype)
-            assert connection.ext.offered_qos_profiles  # type: ignore[union-attr]
+            assert connection.ext.offered_qos_profiles
     assert np.array_equal(modes, run.modes)
     assert np.array_equal(found["state"], expected["state"])
     noisy = run.published is not None
@@ -114,7 +114,6 @@ def _files(bag: Path, files: list[Path], compression: Compression, topics: Count
         with file.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
             summary = reader.get_summary()
-            assert summary.statistics is not None
             kinds = {index.compression for index in summary.chunk_indexes}
             assert kinds == {"" if compression == "none" else compression}
             # Without the head of a later file, which has the time of its beginning, and states never have.
@@ -156,6 +155,6 @@ def _files(bag: Path, files: list[Path], compression: Compression, topics: Count
 
 def test_storage_refuses_nonsense() -> None:
     with pytest.raises(InputError, match="one of none, zstd, lz4"):
-        Storage("zip")  # type: ignore[arg-type]
+        Storage("zip")
     with pytest.raises(InputError, match="more than 0"):
         Storage(split_size=0)
