@@ -81,12 +81,6 @@ def test_the_folders_without_ros() -> None:
     assert set(folders_without_ros()) == {"stepping", "discovery", "channel", "watch", "run", "doctor", "cli"}
 
 
-def test_ros_would_be_found() -> None:
-    pytest.importorskip("rclpy")
-    (loaded,) = loaded_in_turn([["msg_agents.nodes.ros"]])
-    assert {"rclpy"} <= {name for name in loaded if is_ros(name)}
-
-
 def test_the_verb_of_ros2_imports_no_other_package() -> None:
     """ros2 loads it with all its verbs, perhaps by a Python that has none of ours."""
     (loaded,) = loaded_in_turn([["msg_agents.cli.entry_points"]])
@@ -114,20 +108,13 @@ def test_what_is_done_with_few_imports(code: str, unwanted: str) -> None:
     assert process.stdout.splitlines()[-1:] == ["[]"], process.stdout + process.stderr
 
 
-PROCESSES = {
-    "agent": ["msg_agents.nodes.agent_group", "msg_agents.nodes.process"],
-    "recorder": ["msg_agents.nodes.recorder", "msg_agents.nodes.process"],
-    "switcher": ["msg_agents.nodes.switcher", "msg_agents.nodes.process"],
-}
-
-
-@pytest.mark.parametrize("process", PROCESSES)
-def test_processes_of_a_run_import_little(process: str) -> None:
+def test_processes_of_a_run_import_little() -> None:
     """With these a network would take twice as long to start: every agent is a process that imports all it needs.
 
     What they import when they run: tests/integration/test_lockstep.py.
     """
     pytest.importorskip("rclpy")
-    (loaded,) = loaded_in_turn([[*PROCESSES[process], "msg_analysis.model.step_model"]])
+    nodes = [f"msg_agents.nodes.{name}" for name in ("agent_group", "recorder", "switcher", "process")]
+    (loaded,) = loaded_in_turn([[*nodes, "msg_analysis.model.step_model"]])
     assert {"rclpy", "msg_agents.nodes.base", "msg_analysis.messages.messages"} <= loaded
     assert {name.split(".")[0] for name in loaded}.isdisjoint({"scipy", "networkx", "matplotlib", "rich", "rosbags"})

@@ -197,13 +197,3 @@ def test_wrong_usage(program: str, name: str) -> None:
     assert (result.exit_code, result.stdout) == (2, "")
     assert f"Try '{program} {name} --help' for help." in result.stderr
     assert "No such option '--no-such-option'" in result.stderr
-
-
-@pytest.mark.parametrize(
-    ("program", "name"),
-    [command for command in COMMANDS if all(each.nargs != -1 for each in command_of(*command).params)],
-)
-def test_too_many_arguments(program: str, name: str) -> None:
-    many = run(program, name, *"xxxxxxxxx")
-    assert (many.exit_code, many.stdout) == (2, "")
-    assert "Traceback" not in many.stderr

@@ -42,7 +42,7 @@ LAWS: dict[str, dict[str, Any]] = {
 PROCESS_NOISE: tuple[Any, ...] = (0.0, 1.0, [1.0, 0.5], [[1.0, 0.2], [0.0, 1.0]], {"a": 1.0, "b": 2.0})
 
 
-def experiment(messages: str, law: str, pace: Pace, process: Any = 1.0) -> Experiment:
+def with_messages(messages: str, law: str, pace: Pace, process: Any = 1.0) -> Experiment:
     """One with these messages and this law; only asked what is available, since its protocol does nothing."""
     document: dict[str, Any] = {"name": "any", "graphs": {"a": {"path": [1, 2]}, "b": {"arcs": [[1, 2], [2, 1]]}}}
     document |= {"switching": {"generator": [[-1, 1], [1, -1]]}, **LAWS[law]}
@@ -60,7 +60,7 @@ def missing_laws(messages: str, pace: Pace, purpose: Any) -> list[str]:
     return [
         law
         for law in LAWS
-        if any(unavailable(experiment(messages, law, pace, process), purpose) for process in PROCESS_NOISE)
+        if any(unavailable(with_messages(messages, law, pace, process), purpose) for process in PROCESS_NOISE)
     ]
 
 
@@ -77,6 +77,6 @@ def test_all_runs_and_all_but_nonlinear_protocols_is_predicted(messages: str, pa
 def test_what_it_says_runs_does(law: str, messages: str) -> None:
     """Ten steps of the twin in both paces."""
     for pace in ("lockstep", "realtime"):
-        what = experiment(messages, law, pace)
+        what = with_messages(messages, law, pace)
         assert unavailable(what) == []
         assert simulate(what.with_run(duration=0.5)).completeness.complete

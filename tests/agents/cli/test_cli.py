@@ -46,7 +46,7 @@ def refused(result: Result, *words: str) -> None:
 
 
 @pytest.fixture
-def experiment(tmp_path: Path) -> Path:
+def small(tmp_path: Path) -> Path:
     file = tmp_path / "small.yaml"
     file.write_text(yaml.safe_dump(document()))
     return file
@@ -105,31 +105,31 @@ def test_experiments_that_cannot_be_run(
     assert not (tmp_path / "runs").exists()  # nothing half-done
 
 
-def test_channel_files(experiment: Path, tmp_path: Path) -> None:
+def test_channel_files(small: Path, tmp_path: Path) -> None:
     channel = tmp_path / "channel.yaml"
     channel.write_text("default: {loss: 2, delay: 3}\n")
-    refused(call("run", experiment, "--channel", channel), "channel.yaml: 2 problems")
+    refused(call("run", small, "--channel", channel), "channel.yaml: 2 problems")
     channel.write_text("{}\n")
     options = ("--channel", channel, "--pace", "realtime", "--use-sim-time")
-    refused(call("run", experiment, *options), "--use-sim-time: not with --channel")
+    refused(call("run", small, *options), "--use-sim-time: not with --channel")
 
 
-def test_files_of_which_no_run_is_known(experiment: Path, tmp_path: Path) -> None:
+def test_files_of_which_no_run_is_known(small: Path, tmp_path: Path) -> None:
     for words, message in (
         (["--bag", tmp_path], "not a bag: expected metadata.yaml, .mcap or .db3 files"),
-        (["--experiment", experiment], "not a run record (JSONDecodeError"),
+        (["--experiment", small], "not a run record (JSONDecodeError"),
         (["--experiment", tmp_path / "none.json"], "cannot be read"),
-        (["--experiment", experiment, "--bag", tmp_path], "--bag and --experiment: expected at most one of them"),
+        (["--experiment", small, "--bag", tmp_path], "--bag and --experiment: expected at most one of them"),
     ):
         refused(call("live", *words), message)
 
 
 @pytest.mark.parametrize(("out", "reason"), [("small.yaml", "is a file"), ("small.yaml/x", "Not a directory")])
-def test_a_place_where_no_bag_can_be_made(experiment: Path, out: str, reason: str) -> None:
-    place = experiment.parent / out
-    refused(call("run", experiment, "--out", place), f"error: --out: {place}: ", reason, "give a directory")
-    assert list(experiment.parent.iterdir()) == [experiment]
-    assert experiment.read_text() == yaml.safe_dump(document())
+def test_a_place_where_no_bag_can_be_made(small: Path, out: str, reason: str) -> None:
+    place = small.parent / out
+    refused(call("run", small, "--out", place), f"error: --out: {place}: ", reason, "give a directory")
+    assert list(small.parent.iterdir()) == [small]
+    assert small.read_text() == yaml.safe_dump(document())
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
@@ -139,9 +139,9 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     refused(call("run", tmp_path / "binary"), "binary")
 
 
-def test_out_is_not_writable(experiment: Path) -> None:
+def test_out_is_not_writable(small: Path) -> None:
     """Even root writes nothing below /proc."""
-    refused(call("run", experiment, "--out", "/proc/runs"), "/proc/runs")
+    refused(call("run", small, "--out", "/proc/runs"), "/proc/runs")
 
 
 @pytest.mark.parametrize(
@@ -253,8 +253,8 @@ def test_check_without_a_bag(tmp_path: Path) -> None:
     refused(call("check", tmp_path / "text.mcap"), "text.mcap")
 
 
-def test_prepare(experiment: Path) -> None:
-    process = call("prepare", experiment)
+def test_prepare(small: Path) -> None:
+    process = call("prepare", small)
     assert (process.exit_code, process.stderr) == (0, "")
     record = json.loads(process.stdout)
     assert uuid.UUID(record["run"]).version == 4

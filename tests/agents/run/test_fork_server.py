@@ -157,9 +157,9 @@ def test_a_fork_server_that_cannot_import(tmp_path: Path) -> None:
     assert "broken" in log.read_text()
 
 
-RUN = """
+WORK = """
 import atexit, ctypes, os, sys, threading, time
-def run():
+def work():
     atexit.register(print, "handlers")
     threading.Thread(target=lambda: (time.sleep(0.2), print("threads"))).start()
     %s
@@ -170,7 +170,7 @@ if hasattr(ctypes.CDLL(None), "on_exit"):  # the C library of GNU
     ctypes.CDLL(None).on_exit(ctypes.CDLL(None).abort, None)  # as a library that crashes at its end
 pid = os.fork()
 if not pid:
-    run_and_end(run)
+    run_and_end(work)
 os._exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
 """
 
@@ -189,8 +189,8 @@ os._exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
 )
 def test_a_forked_process_ends_as_python_does(statement: str, code: int, said: str) -> None:
     """After its threads and handlers, but without those of C libraries."""
-    for end in ("run()", FORKED):
-        process = subprocess.run([sys.executable, "-P", "-c", RUN % statement + end], capture_output=True, text=True)
+    for end in ("work()", FORKED):
+        process = subprocess.run([sys.executable, "-P", "-c", WORK % statement + end], capture_output=True, text=True)
         assert process.returncode == code
         assert process.stderr.endswith(said)
         assert process.stdout == ("" if code == 120 else "threads\nhandlers\n")
