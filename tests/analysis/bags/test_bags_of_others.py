@@ -151,13 +151,9 @@ STORAGES = [StoragePlugin.MCAP, StoragePlugin.SQLITE3]
     [*itertools.product(STORAGES, ["NONE", "MESSAGE", "FILE"]), (StoragePlugin.MCAP, "STORAGE")],
 )
 def test_every_storage_and_compression(noisy: Run, record: Record, storage: StoragePlugin, compression: str) -> None:
-    """With metadata.yaml and without, from the directory and from the file; compared as ours is."""
+    """With metadata.yaml and without, from the directory and from the file: the same run, so compared as ours is."""
     bag = record(_shuffled, compression=CompressionMode[compression], storage=storage)
     _same(read_bag(bag), noisy)
-    theirs, ours = compare(read_bag(bag)).to_json(), compare(noisy).to_json()
-    for document in (theirs, ours):
-        del document["completeness"]
-    assert theirs == ours
     (file,) = (file for file in bag.iterdir() if file.name != "metadata.yaml")
     _same(read_bag(file), noisy)
     (bag / "metadata.yaml").unlink()
