@@ -177,7 +177,6 @@ def test_values_of_different_steps() -> None:
     node: Synchronizer[str] = Synchronizer(
         needed=lambda j, k: k - j, delay=0, agent=0, steps=300, inputs=[[1, 2]], peers=[1, 2], start=200
     )
-    assert node.waiting_for() == "the graph of step 200"
     node.learn(0, 0, 0, 299)
     assert node.waiting_for() == "step 199 of agent 2, step 198 of agent 3"
     assert [node.offer(1, 199, "one"), node.offer(2, 198, "two")] == [None, None]
