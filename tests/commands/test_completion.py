@@ -9,12 +9,10 @@ from pathlib import Path
 import pytest
 from programs import run
 
+from experiments import line_ring
 from msg_analysis.experiment.examples import names
-from msg_analysis.experiment.experiment import Experiment
 
 BIN = Path(sys.executable).parent
-APART = {"apart": {"path": [1, 2, 3]}}
-PAIR = {"name": "pair", "graphs": APART, "run": {"dt": 0.1, "duration": 5, "start": "zero"}}
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +21,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("place")
     for name in ("line.yaml", "ring.yml", "result.json", "notes.txt", ".hidden.yaml"):
         (place / name).write_text("")
-    made = Experiment.parse(PAIR).simulate()
+    made = line_ring(run={"duration": 1}).simulate()
     made.save(place / "runs" / "lab_1")
     made.save(place / "runs" / "lab_2")
     (place / "run.json").write_text(made.record.to_json())
