@@ -54,7 +54,6 @@ def _snapshot(agents: int, **changes: object) -> Snapshot:
 def _lines(snapshot: Snapshot, experiment: Experiment, width: int, height: int) -> list[str]:
     console = Console(file=io.StringIO(), width=width, height=height, force_terminal=True, color_system=None)
     console.print(panel_of(snapshot, experiment, width=width, height=height))
-    assert isinstance(console.file, io.StringIO)
     return console.file.getvalue().rstrip("\n").split("\n")
 
 
