@@ -1,7 +1,5 @@
 """What importing a module brings with it, in an interpreter of its own. Who may import whom: tests/test_layers.py."""
 
-from __future__ import annotations
-
 import functools
 import json
 import subprocess
@@ -83,12 +81,6 @@ def test_the_folders_without_ros() -> None:
     assert set(folders_without_ros()) == {"stepping", "discovery", "channel", "watch", "run", "doctor", "cli"}
 
 
-def test_ros_would_be_found() -> None:
-    pytest.importorskip("rclpy")
-    (loaded,) = loaded_in_turn([["msg_agents.nodes.ros"]])
-    assert {"rclpy"} <= {name for name in loaded if is_ros(name)}
-
-
 def test_the_verb_of_ros2_imports_no_other_package() -> None:
     """ros2 loads it with all its verbs, perhaps by a Python that has none of ours."""
     (loaded,) = loaded_in_turn([["msg_agents.cli.entry_points"]])
@@ -96,40 +88,29 @@ def test_the_verb_of_ros2_imports_no_other_package() -> None:
     assert not {name for name in loaded if name.partition(".")[0] in ("msg_analysis", "numpy", "rclpy")}
 
 
-HELP = "from msg_agents.cli.main import main; main(['--help'], standalone_mode=False)"
 PARSING = """
+import sys
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.step_model import build_model
 document = {'name': 'two', 'graphs': {'pair': {'path': [1, 2]}, 'grid': {'grid': [1, 2]}},
             'switching': {'generator': [[-1, 1], [1, -1]]}}
-build_model(Experiment.parse(document))"""
+build_model(Experiment.parse(document))
+print([name for name in ("scipy", "networkx", "matplotlib", "rich", "rosbags") if name in sys.modules])"""
 
 
-@pytest.mark.parametrize(
-    ("code", "unwanted"),
-    [(HELP, "rclpy numpy scipy matplotlib rich"), (PARSING, "scipy networkx matplotlib rich rosbags")],
-    ids=["help", "parsing an experiment"],
-)
-def test_what_is_done_with_few_imports(code: str, unwanted: str) -> None:
-    code += f"\nimport sys; print([name for name in {unwanted.split()} if name in sys.modules])"
-    process = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=60)
+def test_an_experiment_is_parsed_with_few_imports() -> None:
+    """What --help imports: tests/commands/test_help.py."""
+    process = subprocess.run([sys.executable, "-P", "-c", PARSING], capture_output=True, text=True, timeout=60)
     assert process.stdout.splitlines()[-1:] == ["[]"], process.stdout + process.stderr
 
 
-PROCESSES = {
-    "agent": ["msg_agents.nodes.agent_group", "msg_agents.nodes.process"],
-    "recorder": ["msg_agents.nodes.recorder", "msg_agents.nodes.process"],
-    "switcher": ["msg_agents.nodes.switcher", "msg_agents.nodes.process"],
-}
-
-
-@pytest.mark.parametrize("process", PROCESSES)
-def test_processes_of_a_run_import_little(process: str) -> None:
+def test_processes_of_a_run_import_little() -> None:
     """With these a network would take twice as long to start: every agent is a process that imports all it needs.
 
     What they import when they run: tests/integration/test_lockstep.py.
     """
     pytest.importorskip("rclpy")
-    (loaded,) = loaded_in_turn([[*PROCESSES[process], "msg_analysis.model.step_model"]])
+    nodes = [f"msg_agents.nodes.{name}" for name in ("agent_group", "recorder", "switcher", "process")]
+    (loaded,) = loaded_in_turn([[*nodes, "msg_analysis.model.step_model"]])
     assert {"rclpy", "msg_agents.nodes.base", "msg_analysis.messages.messages"} <= loaded
     assert {name.split(".")[0] for name in loaded}.isdisjoint({"scipy", "networkx", "matplotlib", "rich", "rosbags"})

@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """Which processes a network has, on which hosts and cores."""
-
-from __future__ import annotations
 
 import os
 import subprocess
@@ -41,14 +36,14 @@ from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 
 
-def experiment(agents: int = 5, processes: Any = "auto") -> Experiment:
+def path_and_star(agents: int = 5, processes: Any = "auto") -> Experiment:
     graphs = {"path": {"path": list(range(1, agents + 1))}, "star": {"star": {"center": 1}}}
     run = {"dt": 0.001, "duration": 0.01, "start": "zero", "processes": processes}
     return networks.experiment(agents, agents=agents, graphs=graphs, run=run)
 
 
 def layout(agents: int, processes: Any, bag: Path | None = Path("/bag")) -> list[ProcessSpec]:
-    return lay_out_network(experiment(agents, processes), Path("/run.json"), bag)
+    return lay_out_network(path_and_star(agents, processes), Path("/run.json"), bag)
 
 
 def numbers(process: ProcessSpec) -> list[int]:
@@ -76,16 +71,16 @@ def test_every_agent_exactly_once(agents: int, processes: int) -> None:
 )
 def test_auto(monkeypatch: pytest.MonkeyPatch, cores: int, agents: int, expected: int) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
-    assert count_processes(experiment(agents, "auto")) == expected
-    assert count_processes(experiment(200, "auto")) <= MOST_PROCESSES
+    assert count_processes(path_and_star(agents, "auto")) == expected
+    assert count_processes(path_and_star(200, "auto")) <= MOST_PROCESSES
 
 
 @pytest.mark.parametrize("most", [MOST_UNAIDED, MOST_PROCESSES])
 def test_too_many_processes(most: int) -> None:
     for processes in ("one_per_agent", most + 1):
         with pytest.raises(InputError, match=rf"run\.processes: {processes} .*at most {most}"):
-            lay_out_network(experiment(most + 1, processes), Path("/run.json"), None, most=most)
-    assert len(lay_out_network(experiment(most, "one_per_agent"), Path("/run.json"), None, most=most)) == most + 1
+            lay_out_network(path_and_star(most + 1, processes), Path("/run.json"), None, most=most)
+    assert len(lay_out_network(path_and_star(most, "one_per_agent"), Path("/run.json"), None, most=most)) == most + 1
 
 
 def test_large_networks_are_given_time_to_find_each_other() -> None:
@@ -195,10 +190,10 @@ def assignment(hosts: Hosts, name: str) -> HostAssignment:
 
 
 def test_the_hosts_together_run_the_whole_network() -> None:
-    hosts = Hosts.parse(document(), experiment())
+    hosts = Hosts.parse(document(), path_and_star())
     assert hosts.agents == {"base": (), "left": (0, 3), "right": (1, 2, 4)}
     found = {
-        name: lay_out_network(experiment(), Path("/run.json"), Path("/bag"), assignment=assignment(hosts, name))
+        name: lay_out_network(path_and_star(), Path("/run.json"), Path("/bag"), assignment=assignment(hosts, name))
         for name in hosts.agents
     }
     names = {host: [process.name for process in processes] for host, processes in found.items()}
@@ -212,7 +207,7 @@ def test_the_hosts_together_run_the_whole_network() -> None:
 
 
 def test_processes_count_for_each_host() -> None:
-    many = experiment(40, 2)
+    many = path_and_star(40, 2)
     hosts = {"a": {"address": "192.0.2.1", "agents": ["1-9", 40]}, "b": {"address": "192.0.2.2", "agents": ["10-39"]}}
     found = Hosts.parse({"recorder": "a", "hosts": hosts}, many)
     assert found.domain == 0
@@ -223,7 +218,7 @@ def test_processes_count_for_each_host() -> None:
 
 def test_profile() -> None:
     """Peers and lease, the rest as on one machine; and nothing that keeps other hosts out."""
-    tree = ET.fromstring(Hosts.parse(document(), experiment()).profile(experiment()).encode())
+    tree = ET.fromstring(Hosts.parse(document(), path_and_star()).profile(path_and_star()).encode())
     assert [found.text for found in tree.iter() if found.tag.endswith("}address")] == [
         "127.0.0.1", "192.0.2.1", "192.0.2.2", "192.0.2.3",
     ]  # fmt: skip
@@ -242,7 +237,7 @@ def test_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: str |
         monkeypatch.delenv(name, raising=False)
     if own:
         monkeypatch.setenv(own, "/mine.xml")
-    environment = Hosts.parse(document(), experiment()).environment(experiment(), tmp_path)
+    environment = Hosts.parse(document(), path_and_star()).environment(path_and_star(), tmp_path)
     assert environment["ROS_DOMAIN_ID"] == "42"
     assert environment[PEERS_VARIABLE].split() == ["192.0.2.1", "192.0.2.2", "192.0.2.3"]
     assert environment[own or PROFILE_VARIABLES[-1]] == ("/mine.xml" if own else str(tmp_path / "hosts.xml"))
@@ -278,15 +273,15 @@ def with_host(name: str, **host: Any) -> dict[str, Any]:
 )  # fmt: skip
 def test_mistakes(wrong: Any, said: str) -> None:
     with pytest.raises(InputError) as error:
-        Hosts.parse(wrong, experiment(), source="hosts.yaml")
+        Hosts.parse(wrong, path_and_star(), source="hosts.yaml")
     assert str(error.value).startswith("hosts.yaml: ")
     assert said in str(error.value)
 
 
 def test_a_host_that_there_is_not() -> None:
-    hosts = Hosts.parse(document(), experiment())
+    hosts = Hosts.parse(document(), path_and_star())
     with pytest.raises(InputError, match="--name: centre: no such host in the hosts file: expected one of base, left"):
         assignment(hosts, "centre")
-    idle = Hosts.parse(document(recorder="left"), experiment())
+    idle = Hosts.parse(document(recorder="left"), path_and_star())
     with pytest.raises(InputError, match="--name: base: has no agents and is not the recorder"):
         assignment(idle, "base")

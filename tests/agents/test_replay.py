@@ -1,7 +1,5 @@
 """What a player does that needs no ROS: time, topics, keys."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Signals that are kept, and let through again, in this process."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Iterator
 

@@ -1,6 +1,4 @@
-"""Completion by shells: by the protocol that their scripts speak, and in a real bash."""
-
-from __future__ import annotations
+"""Completion: by the protocol that the script of bash speaks, and in a real bash. Other shells are click's."""
 
 import os
 import shutil
@@ -8,16 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import click
 import pytest
-from programs import COMMANDS, PROGRAMS, command_of, run
+from programs import run
 
+from experiments import line_ring
 from msg_analysis.experiment.examples import names
-from msg_analysis.experiment.experiment import Experiment
 
 BIN = Path(sys.executable).parent
-APART = {"apart": {"path": [1, 2, 3]}}
-PAIR = {"name": "pair", "graphs": APART, "run": {"dt": 0.1, "duration": 5, "start": "zero"}}
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +21,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("place")
     for name in ("line.yaml", "ring.yml", "result.json", "notes.txt", ".hidden.yaml"):
         (place / name).write_text("")
-    made = Experiment.parse(PAIR).simulate()
+    made = line_ring(run={"duration": 1}).simulate()
     made.save(place / "runs" / "lab_1")
     made.save(place / "runs" / "lab_2")
     (place / "run.json").write_text(made.record.to_json())
@@ -41,20 +36,15 @@ def folder(place: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return place
 
 
-def complete(line: str, shell: str = "bash") -> list[str]:
+def complete(line: str) -> list[str]:
     """What a shell is answered at the end of a line."""
     program, *rest = line.split(" ")
     variable = f"_{program.replace('-', '_').upper()}_COMPLETE"
-    words = {"COMP_WORDS": line, "COMP_CWORD": rest[-1] if shell == "fish" else str(len(rest))}
-    result = run(program, **{variable: f"{shell}_complete", **words})
+    result = run(program, **{variable: "bash_complete", "COMP_WORDS": line, "COMP_CWORD": str(len(rest))})
     assert (result.exit_code, result.stderr) == (0, ""), result
-    if shell == "zsh":
-        kinds = iter(result.stdout.strip("\n").splitlines())
-        return [f"{kind},{value}" for kind, value, _ in zip(kinds, kinds, kinds, strict=True)]
-    return [each.partition("\t")[0] for each in result.stdout.splitlines() if each]
+    return [each for each in result.stdout.splitlines() if each]
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 @pytest.mark.parametrize(
     ("line", "values"),
     [
@@ -82,8 +72,8 @@ def complete(line: str, shell: str = "bash") -> list[str]:
         ("msg-agents play empty --topics /", []),
     ],
 )
-def test_complete(folder: Path, shell: str, line: str, values: list[str]) -> None:
-    assert complete(line, shell) == [f"plain,{value}" for value in values]
+def test_complete(folder: Path, line: str, values: list[str]) -> None:
+    assert complete(line) == [f"plain,{value}" for value in values]
 
 
 def test_names_that_must_be_quoted_are_left_to_the_shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,13 +81,6 @@ def test_names_that_must_be_quoted_are_left_to_the_shell(tmp_path: Path, monkeyp
     for name in ("two words.yaml", "line.yaml"):
         (tmp_path / name).write_text("")
     assert complete("msg-analysis predict t") == ["file,t"]
-
-
-@pytest.mark.parametrize(("program", "name"), COMMANDS)
-def test_every_option_and_choice_is_offered(program: str, name: str) -> None:
-    offered = {each.removeprefix("plain,") for each in complete(f"{program} {name} --")}
-    options = [each for each in command_of(program, name).params if isinstance(each, click.Option) and not each.hidden]
-    assert offered >= {max(each.opts, key=len) for each in options}
 
 
 def test_in_bash(folder: Path) -> None:
@@ -131,16 +114,3 @@ def test_in_bash(folder: Path) -> None:
         "check",
         "realtime",
     ]
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-@pytest.mark.parametrize("program", PROGRAMS)
-def test_what_a_shell_reads_at_its_start(program: str, shell: str, tmp_path: Path) -> None:
-    """Is a script of that shell, where it is here to be asked."""
-    variable = f"_{program.replace('-', '_').upper()}_COMPLETE"
-    result = run(program, **{variable: f"{shell}_source"})
-    assert result.exit_code == 0
-    assert f"{variable}={shell}_complete" in result.stdout
-    (tmp_path / "script").write_text(result.stdout)
-    reader = [found, "-n"] if (found := shutil.which(shell)) else ["test", "-s"]
-    assert subprocess.run([*reader, str(tmp_path / "script")], capture_output=True).returncode == 0

@@ -1,7 +1,5 @@
 """What an installation gives to the user's shell and to ``ros2``, and what Ctrl-C does before a command has begun."""
 
-from __future__ import annotations
-
 import os
 import runpy
 import shutil

@@ -1,7 +1,5 @@
 """Names in foreign files cannot give orders to the terminal: no command prints their control characters."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The ROS packages as tools of ROS read them: what they depend on, and what a release of them needs."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import sys

@@ -1,12 +1,11 @@
 """What ``make setup`` runs, with which packages: uv gets the places in which pip looks for them."""
 
-from __future__ import annotations
-
-import importlib.util
 import os
 import re
+import runpy
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -22,12 +21,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Any:
         if name.startswith("PIP_"):
             monkeypatch.delenv(name)
     monkeypatch.setenv("PIP_CONFIG_FILE", os.devnull)  # nor the files of this machine
-    spec = importlib.util.spec_from_file_location("install", FILE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return SimpleNamespace(**runpy.run_path(str(FILE)))
 
 
 def test_by_default_uv_looks_where_it_wants(install: Any) -> None:

@@ -3,8 +3,6 @@
 The commands that join a ROS network print nothing or are looked at in tests/integration.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,12 +1,11 @@
 """What the metadata of the wheels say that the sources do not: the ROS 2 that they were built against."""
 
-from __future__ import annotations
-
-import importlib.util
 import re
+import runpy
 import zipfile
 from email import message_from_string
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,12 +17,7 @@ PLAIN = "Metadata-Version: 2.4\nName: {0}\nVersion: 0.1.0\nRequires-Dist: msg_an
 
 @pytest.fixture(scope="module")
 def wheels() -> Any:
-    spec = importlib.util.spec_from_file_location("wheels", REQUIREMENTS / "wheels.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return SimpleNamespace(**runpy.run_path(str(REQUIREMENTS / "wheels.py")))
 
 
 @pytest.mark.parametrize("distribution", ["jazzy", "kilted"])

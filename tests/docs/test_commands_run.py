@@ -4,8 +4,6 @@ Whole lines of terminals, shell and indented blocks count, and commands in the t
 whose output test_pages.py compares are left to it.
 """
 
-from __future__ import annotations
-
 import functools
 import re
 import shlex

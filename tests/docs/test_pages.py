@@ -1,14 +1,14 @@
 """What the pages show is so: files are valid, commands and options exist, and print what stands there."""
 
-from __future__ import annotations
-
 import functools
 import json
 import re
+import runpy
 import shlex
 import shutil
 from pathlib import Path
 
+import matplotlib
 import pytest
 import yaml
 from pages import EXPERIMENTS, PAGES, PRINTING, ROOT, Shown, blocks, console, experiments, missing, typed
@@ -100,6 +100,7 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
     monkeypatch.setenv("NO_COLOR", "1")
+    matplotlib.use("Agg")
     return tmp_path
 
 
@@ -145,7 +146,23 @@ def test_what_is_printed(page: Path, shown: Shown, workplace: Path) -> None:
     assert missing(shown.lines, output) == []
 
 
-@pytest.mark.parametrize("name", ["quickstart", "leaders", "messages", "commands"])
+@pytest.mark.parametrize("script", sorted((ROOT / "docs/gallery").glob("*.py")), ids=name)
+def test_gallery(script: Path, workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Scripts run, and draw what the page shows."""
+    runpy.run_path(str(script), run_name="__main__")
+    assert capsys.readouterr().out
+    picture = script.with_suffix(".png")
+    assert (workplace / picture.name).exists() == picture.exists()
+    page = (ROOT / "docs/python.md").read_text(encoding="utf-8")
+    assert f'--8<-- "gallery/{script.name}"' in page
+    assert f"(gallery/{picture.name})" in page or not picture.exists()
+    matplotlib.pyplot.close("all")
+
+
+PICTURES = {"python": {"run.png", "comparison.png", "rates.png"}}
+
+
+@pytest.mark.parametrize("name", ["quickstart", "leaders", "messages", "commands", "python"])
 def test_python_runs(name: str, workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With a short bag of the name that the page gives to it, one to salvage, and tables of it."""
     printed("msg-analysis simulate line_ring.yaml --duration 10 --out line_ring_twin")
@@ -155,3 +172,4 @@ def test_python_runs(name: str, workplace: Path, capsys: pytest.CaptureFixture[s
         if "import run_network" not in block:  # tests/integration/test_python.py runs that
             exec(compile(block, name, "exec"), {})
     assert ("agrees" in capsys.readouterr().out) == (name not in {"leaders", "commands"})
+    assert {file.name for file in workplace.glob("*.png")} == PICTURES.get(name, set())

@@ -1,7 +1,5 @@
 """The site: strict, whole, and nothing of it comes from elsewhere."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """The channel file: what it says, and every mistake in one line."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -31,15 +29,13 @@ def problems(**document: Any) -> list[str]:
 
 
 def test_by_default_every_process_is_a_host_and_nothing_is_lost() -> None:
+    """One of several agents, too."""
     channel = parse()
     assert channel.hosts == {BASE: (), **{f"agent_{i + 1}": (i,) for i in range(5)}}
     assert len(channel.links) == 6 * 5
     assert {link.loss.mean for link in channel.links.values()} == {0.0}
     assert {(link.delay, link.jitter, link.rate) for link in channel.links.values()} == {(0.0, 0.0, float("inf"))}
     assert not channel.agent_loss(5).any()
-
-
-def test_processes_with_several_agents_are_hosts() -> None:
     channel = Channel.parse({}, experiment(run={"processes": 2}))
     assert channel.hosts == {BASE: (), "agents_1_to_2": (0, 1), "agents_3_to_5": (2, 3, 4)}
     assert [channel.host_of(agents) for agents in ((0, 1), (2, 3, 4), ())] == ["agents_1_to_2", "agents_3_to_5", BASE]
@@ -134,10 +130,6 @@ def test_all_mistakes_are_reported_together_with_the_file(tmp_path: Path) -> Non
     with pytest.raises(ExperimentError, match=r"channel\.yaml: 3 problems") as caught:
         Channel.load(file, experiment())
     assert len(caught.value.problems) == 3
-
-
-def test_a_file_that_is_not_a_channel(tmp_path: Path) -> None:
-    file = tmp_path / "channel.yaml"
     file.write_text("- 1\n")
     with pytest.raises(InputError, match="expected some of the keys seed, hosts, default, pairs"):
         Channel.load(file, experiment())

@@ -1,7 +1,5 @@
 """Loss, delay, rate and queue of one direction between two hosts."""
 
-from __future__ import annotations
-
 import math
 from itertools import groupby
 
@@ -55,7 +53,7 @@ def test_packets_that_are_skipped_have_numbers_of_their_own() -> None:
 
 @pytest.mark.parametrize("other", [{"seed": 2}, {"pair": (3, 2)}, {"pair": (2, 4)}])
 def test_seeds_and_pairs_differ(other: dict[str, object]) -> None:
-    first, second = losses(loss(0.5), packets=5000), losses(loss(0.5), packets=5000, **other)  # type: ignore[arg-type]
+    first, second = losses(loss(0.5), packets=5000), losses(loss(0.5), packets=5000, **other)
     assert stats.binomtest(int((first == second).sum()), 5000, 0.5).pvalue > LEVEL
 
 

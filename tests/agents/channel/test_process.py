@@ -1,7 +1,5 @@
 """Real hosts: namespaces with TUN devices, and datagrams that the channel carries between them."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -95,7 +93,7 @@ class Running:
         self.sockets[sender].sendto(data, (self.addresses.get(receiver, receiver), PORT))
 
     def end(self) -> dict[tuple[str, str], dict[str, int]]:
-        """End it as a run does; what was counted."""
+        """End it as a start does; what was counted."""
         for found in self.sockets.values():
             found.close()
         self._control.close()
@@ -106,14 +104,14 @@ class Running:
 
 
 @pytest.fixture
-def run(hosts: dict[str, Host], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Running]:
+def start(hosts: dict[str, Host], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Running]:
     monkeypatch.setattr(signal, "signal", lambda *_: None)  # the channel is in a thread here
     monkeypatch.setattr(os, "setpriority", lambda *_: None)
     return partial(Running, hosts, tmp_path)
 
 
-def test_datagrams_reach_their_host_with_their_bytes(run: Callable[..., Running]) -> None:
-    channel = run()
+def test_datagrams_reach_their_host_with_their_bytes(start: Callable[..., Running]) -> None:
+    channel = start()
     data = os.urandom(8000)
     channel.send("left", "right", data)
     assert channel.sockets["right"].recvfrom(1 << 16) == (data, (channel.addresses["left"], PORT))
@@ -123,15 +121,15 @@ def test_datagrams_reach_their_host_with_their_bytes(run: Callable[..., Running]
     assert counts["right", "left"]["sent"] == 0
 
 
-def test_multicast_reaches_all_others(run: Callable[..., Running]) -> None:
-    channel = run()
+def test_multicast_reaches_all_others(start: Callable[..., Running]) -> None:
+    channel = start()
     channel.send("left", GROUP, b"to all")
     assert [channel.sockets[name].recv(100) for name in ("base", "right")] == [b"to all"] * 2
     assert {pair for pair, found in channel.end().items() if found["sent"]} == {("left", "base"), ("left", "right")}
 
 
-def test_what_is_lost_does_not_arrive(run: Callable[..., Running]) -> None:
-    channel = run({("left", "right"): LinkSettings(EVERYTHING)})
+def test_what_is_lost_does_not_arrive(start: Callable[..., Running]) -> None:
+    channel = start({("left", "right"): LinkSettings(EVERYTHING)})
     for number in range(20):
         channel.send("left", "right", bytes([number]))
     channel.send("base", "right", b"last")
@@ -140,8 +138,8 @@ def test_what_is_lost_does_not_arrive(run: Callable[..., Running]) -> None:
     assert (counts["left", "right"]["sent"], counts["left", "right"]["lost"]) == (20, 20)
 
 
-def test_delayed_datagrams_come_in_order_and_not_before_their_time(run: Callable[..., Running]) -> None:
-    channel = run({("left", "right"): LinkSettings(delay=0.05, jitter=0.05)})
+def test_delayed_datagrams_come_in_order_and_not_before_their_time(start: Callable[..., Running]) -> None:
+    channel = start({("left", "right"): LinkSettings(delay=0.05, jitter=0.05)})
     sent = []
     for number in range(50):
         sent.append(time.monotonic())
@@ -152,8 +150,8 @@ def test_delayed_datagrams_come_in_order_and_not_before_their_time(run: Callable
     assert max(arrival - departure for (_, arrival), departure in zip(heard, sent, strict=True)) > 0.05
 
 
-def test_a_full_queue_drops(run: Callable[..., Running]) -> None:
-    channel = run({("left", "right"): LinkSettings(rate=0.008, queue=1)})  # 1000 bytes a second
+def test_a_full_queue_drops(start: Callable[..., Running]) -> None:
+    channel = start({("left", "right"): LinkSettings(rate=0.008, queue=1)})  # 1000 bytes a second
     for number in range(10):
         channel.send("left", "right", bytes([number]) * 100)
     channel.send("left", "base", b"taken")  # after the others
@@ -162,12 +160,12 @@ def test_a_full_queue_drops(run: Callable[..., Running]) -> None:
     assert (counts["sent"], counts["queued"], counts["dropped"]) == (10, 1, 8)
 
 
-def test_the_active_graph_cuts(run: Callable[..., Running], tmp_path: Path) -> None:
+def test_the_active_graph_cuts(start: Callable[..., Running], tmp_path: Path) -> None:
     """In graph 1 all are joined, in graph 2 left and right are not, unless one of them is let through."""
     graph = ActiveGraphFile.create(tmp_path / "graph", 3)
     joined = np.ones((2, 3, 3), dtype=bool)
     joined[1, 1, 2] = joined[1, 2, 1] = False
-    channel = run(joined=joined, graph=tmp_path / "graph")
+    channel = start(joined=joined, graph=tmp_path / "graph")
     for number, (mode, host) in enumerate([(-1, 0), (1, 0), (0, 0), (1, 0), (1, 1), (1, 2), (1, 0)]):
         graph.set_mode(mode)
         for place in range(3):

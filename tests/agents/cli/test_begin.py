@@ -1,7 +1,5 @@
 """``examples``, ``new`` and ``demo``: what they print, write, ask and refuse."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Iterator
@@ -40,6 +38,7 @@ def test_examples() -> None:
     assert [[each["name"], each["shows"]] for each in listed] == lines
     assert call("examples", "tracking").stdout == text_of("tracking")
     assert json.loads(call("examples", "tracking", "--json").stdout)["text"] == text_of("tracking")
+    assert json.loads(call("prepare", "tracking").stdout)["experiment"]["name"] == "tracking"
     wrong = call("examples", "trakcing")
     assert (wrong.exit_code, wrong.stdout) == (2, "")
     assert wrong.stderr.startswith("error: trakcing: no example of this name: expected one of discrete, ")
@@ -53,10 +52,6 @@ def test_an_experiment_that_is_not_there(command: str) -> None:
         "error: lin_ring: no such file, and no example of this name: expected a file, or one"
     )
     assert "Traceback" not in wrong.stderr
-
-
-def test_prepare_an_example() -> None:
-    assert json.loads(call("prepare", "discrete").stdout)["experiment"]["name"] == "discrete"
 
 
 def test_the_demo_has_the_options_of_run() -> None:

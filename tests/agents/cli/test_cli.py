@@ -1,7 +1,5 @@
 """The command line: what goes to stdout, what to stderr, and the exit codes; the same in a process of its own."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import subprocess
@@ -48,7 +46,7 @@ def refused(result: Result, *words: str) -> None:
 
 
 @pytest.fixture
-def experiment(tmp_path: Path) -> Path:
+def small(tmp_path: Path) -> Path:
     file = tmp_path / "small.yaml"
     file.write_text(yaml.safe_dump(document()))
     return file
@@ -66,21 +64,17 @@ def run_file(tmp_path: Path) -> Path:
     [
         ({"noise": {"loss": 0.5, "burst": 1}}, [], ["noise.burst: 1", "p / (1 - p)"]),
         ({"noise": {"loss": {"arcs": [[1, 4, 0.5]]}}}, [], ["noise.loss.arcs: [1, 4]", "4 hears 1"]),
-        ({"run": {"dt": 0.3, "duration": 5}}, [], ["run.duration"]),
-        ({"unknown": 1}, [], ["unknown"]),
         (
             {"agents": 201, "run": {"dt": 0.001, "start": "zero", "processes": "one_per_agent"}},
             [],
             ["run.processes", "at most 200"],
         ),
-        ({"noise": {"loss": 1.5}}, ["--pace", "realtime"], ["noise.loss: 1.5"]),
         ({}, ["--pace", "realtime", "--speed", "0"], ["run.speed: 0", "> 0"]),
         ({}, ["--pace", "fast"], ["error: --pace: run.pace", "fast"]),
         ({}, ["--processes", "many", "--seed", "1"], ["error: --processes: run.processes", "many"]),
         ({}, ["--processes", "0"], ["run.processes"]),
         ({"run": {"dt": -1}}, ["--seed", "1"], ["bad.yaml: run.dt"]),
         ({}, ["--seed", "-1"], ["run.seed", "-1"]),
-        ({}, ["--duration", "-5"], ["run.duration"]),
         ({}, ["--duration", "nan"], ["run.duration"]),
         ({}, ["--duration", "0.07"], ["run.duration"]),
         ({}, ["--domain", "500"], ["--domain", "500"]),
@@ -107,31 +101,31 @@ def test_experiments_that_cannot_be_run(
     assert not (tmp_path / "runs").exists()  # nothing half-done
 
 
-def test_channel_files(experiment: Path, tmp_path: Path) -> None:
+def test_channel_files(small: Path, tmp_path: Path) -> None:
     channel = tmp_path / "channel.yaml"
     channel.write_text("default: {loss: 2, delay: 3}\n")
-    refused(call("run", experiment, "--channel", channel), "channel.yaml: 2 problems")
+    refused(call("run", small, "--channel", channel), "channel.yaml: 2 problems")
     channel.write_text("{}\n")
     options = ("--channel", channel, "--pace", "realtime", "--use-sim-time")
-    refused(call("run", experiment, *options), "--use-sim-time: not with --channel")
+    refused(call("run", small, *options), "--use-sim-time: not with --channel")
 
 
-def test_files_of_which_no_run_is_known(experiment: Path, tmp_path: Path) -> None:
+def test_files_of_which_no_run_is_known(small: Path, tmp_path: Path) -> None:
     for words, message in (
         (["--bag", tmp_path], "not a bag: expected metadata.yaml, .mcap or .db3 files"),
-        (["--experiment", experiment], "not a run record (JSONDecodeError"),
+        (["--experiment", small], "not a run record (JSONDecodeError"),
         (["--experiment", tmp_path / "none.json"], "cannot be read"),
-        (["--experiment", experiment, "--bag", tmp_path], "--bag and --experiment: expected at most one of them"),
+        (["--experiment", small, "--bag", tmp_path], "--bag and --experiment: expected at most one of them"),
     ):
         refused(call("live", *words), message)
 
 
 @pytest.mark.parametrize(("out", "reason"), [("small.yaml", "is a file"), ("small.yaml/x", "Not a directory")])
-def test_a_place_where_no_bag_can_be_made(experiment: Path, out: str, reason: str) -> None:
-    place = experiment.parent / out
-    refused(call("run", experiment, "--out", place), f"error: --out: {place}: ", reason, "give a directory")
-    assert list(experiment.parent.iterdir()) == [experiment]
-    assert experiment.read_text() == yaml.safe_dump(document())
+def test_a_place_where_no_bag_can_be_made(small: Path, out: str, reason: str) -> None:
+    place = small.parent / out
+    refused(call("run", small, "--out", place), f"error: --out: {place}: ", reason, "give a directory")
+    assert list(small.parent.iterdir()) == [small]
+    assert small.read_text() == yaml.safe_dump(document())
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
@@ -141,9 +135,9 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     refused(call("run", tmp_path / "binary"), "binary")
 
 
-def test_out_is_not_writable(experiment: Path) -> None:
+def test_out_is_not_writable(small: Path) -> None:
     """Even root writes nothing below /proc."""
-    refused(call("run", experiment, "--out", "/proc/runs"), "/proc/runs")
+    refused(call("run", small, "--out", "/proc/runs"), "/proc/runs")
 
 
 @pytest.mark.parametrize(
@@ -255,8 +249,8 @@ def test_check_without_a_bag(tmp_path: Path) -> None:
     refused(call("check", tmp_path / "text.mcap"), "text.mcap")
 
 
-def test_prepare(experiment: Path) -> None:
-    process = call("prepare", experiment)
+def test_prepare(small: Path) -> None:
+    process = call("prepare", small)
     assert (process.exit_code, process.stderr) == (0, "")
     record = json.loads(process.stdout)
     assert uuid.UUID(record["run"]).version == 4

@@ -1,7 +1,5 @@
 """The run record of a node: read once for all that are forked, or by the node itself."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The discovery relay, between sockets that stand for participants."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess
@@ -38,7 +36,7 @@ class Participant:
     def announce(self, datagram: bytes | None = None) -> None:
         self.socket.sendto(self.announcement if datagram is None else datagram, self._to)
 
-    def hears(self, *others: Participant) -> None:
+    def hears(self, *others: "Participant") -> None:
         """It hears the announcements of these, in any order, and then nothing."""
         self.socket.settimeout(10)
         heard = [self.socket.recv(1 << 16) for _ in others]
@@ -157,7 +155,6 @@ def test_joining_participants_are_asked_to_announce_themselves(domain: int) -> N
             process.announce()
             assert joining.socket.recv(1 << 16) == asked
         asking = read_announcement(asked)
-        assert asking is not None
         assert asking.port == discovery_port(domain, 0)
         assert asking.prefix[:4] == process.prefix[:4]
         assert asking.prefix != process.prefix

@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """Discovery: messages against bytes put together by hand from DDSI-RTPS 2.3 and real ones; domains and their locks."""
-
-from __future__ import annotations
 
 import os
 import re
@@ -161,7 +156,6 @@ def test_the_announcement_of_a_real_participant() -> None:
         process = stack.enter_context(subprocess.Popen([sys.executable, "-P", "-c", ANNOUNCER], env=environment))
         stack.callback(process.kill)
         found = read_announcement(listener.recv(1 << 16))
-        assert found is not None
         assert found.prefix == found.datagram[8:20]
         own = set()
         for entry in Path(f"/proc/{process.pid}/fd").iterdir():
@@ -211,7 +205,6 @@ def test_a_real_participant_answers_one_without_endpoints(reach: str) -> None:
             subprocess.Popen([sys.executable, "-P", "-c", ANSWERER], stdout=subprocess.PIPE, text=True, env=environment)
         )
         stack.callback(participant_of_ros.kill)
-        assert participant_of_ros.stdout is not None
         prefix = bytes.fromhex(participant_of_ros.stdout.readline())
         asking = announcement_message(prefix[:4] + bytes(range(8)), listener.getsockname()[1], 20)
         for participant in range(FIRST_RELAYED):
@@ -283,7 +276,6 @@ def holder(domains: range, directory: Path) -> Iterator[tuple[subprocess.Popen[s
     with subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
     ) as process:
-        assert process.stdout is not None
         try:
             yield process, int(process.stdout.readline())
         finally:

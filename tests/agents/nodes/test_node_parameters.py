@@ -1,7 +1,5 @@
 """Options of the nodes as ROS parameters: in processes of their own, as `ros2 run` starts them."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -11,27 +9,22 @@ from typing import Any
 import many_commands
 import pytest
 import yaml
+from networks import record_of_two
 
 pytest.importorskip("rclpy")
 
-import click
 
 from msg_agents.cli.main import main
 from msg_agents.cli.ros_command import RosCommand, split_arguments
 from msg_agents.discovery.rtps import free_domain
 from msg_agents.nodes.parameters import describe, name_of, options_of
-from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.twin.simulate import new_record
 
 NODES = {name: command for name, command in main.commands.items() if isinstance(command, RosCommand)}
-RUN = {"name": "pair", "graphs": {"a": {"path": [1, 2]}}, "run": {"dt": 0.1, "duration": 5}}
 
 
 @pytest.fixture
 def run_file(tmp_path: Path) -> Path:
-    file = tmp_path / "run.json"
-    file.write_text(new_record(Experiment.parse(RUN)).to_json())
-    return file
+    return record_of_two(tmp_path)
 
 
 def start(executable: str, *arguments: Any) -> subprocess.CompletedProcess[str]:
@@ -77,7 +70,6 @@ def test_parameters_are_found_by_the_name_of_the_executable() -> None:
 def test_ranges_are_those_of_the_options() -> None:
     (split,) = [option for option in options_of(NODES["recorder"]) if option.name == "split_size"]
     (bounds,) = describe(split).floating_point_range
-    assert isinstance(split.type, click.FloatRange)
     assert (bounds.from_value, bounds.step) == (split.type.min, 0.0)
 
 

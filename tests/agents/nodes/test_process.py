@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """Processes of nodes: who is present, and how a process that hangs ends."""
-
-from __future__ import annotations
 
 import contextlib
 import os
@@ -53,7 +48,6 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
 @pytest.mark.parametrize(("namespace", "there"), [("/", True), ("/other", False)])
 def test_a_switcher_of_another_namespace_is_not_ours(start: Callable[..., Node], namespace: str, there: bool) -> None:
     agent = start("agent_1")
-    assert isinstance(agent, NetworkNode)
     start("switcher", namespace)
     wait_for(lambda: "switcher" in agent.get_node_names())
     assert ("switcher" in agent.names_in_namespace()) == there
@@ -75,7 +69,6 @@ def test_a_peer_that_says_that_it_leaves_is_not_waited_for(
     monkeypatch.setattr(type(nodes["agent_2"]), "number", property(lambda node: 2 * (node.get_name() == "agent_2")))
     presences = {name: PeerPresence([node], timeout=1000.0) for name, node in nodes.items()}
     agent = nodes["agent_1"]
-    assert isinstance(agent, NetworkNode)
     executor = rclpy.executors.SingleThreadedExecutor()
     executor.add_node(agent)
     for name in ("agent_2", "switcher"):
@@ -91,7 +84,6 @@ def test_a_peer_that_says_that_it_leaves_is_not_waited_for(
 def test_a_reader_of_the_user_may_be_in_any_namespace(start: Callable[..., Node]) -> None:
     """That of `ros2 bag record` is always in /; another run's nodes have the names of ours."""
     agent = start("agent_1")
-    assert isinstance(agent, NetworkNode)
     start("guest", "/other")
     start("recorder", "/other")
     wait_for(lambda: {"guest", "recorder"} <= set(agent.get_node_names()))
@@ -129,9 +121,6 @@ def test_nobody_reads_what_was_printed() -> None:
     pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
     buffered = os.environ | {"PYTHONUNBUFFERED": ""}
     with subprocess.Popen([sys.executable, "-c", code], env=buffered, **pipes) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        assert process.stderr is not None
         process.stdout.close()
         process.stdin.close()
         assert (process.stderr.read(), process.wait()) == (b"", 0)

@@ -1,7 +1,5 @@
 """The recorder node, given its messages by hand."""
 
-from __future__ import annotations
-
 import platform
 import subprocess
 import sys

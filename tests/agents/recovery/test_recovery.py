@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """What a process needs to take over from a killed one."""
-
-from __future__ import annotations
 
 import errno
 import mmap
@@ -87,7 +82,6 @@ def test_killed_in_the_middle_of_it(tmp_path: Path) -> None:
     files = [tmp_path / f"states_{attempt}" for attempt in range(10)]
     command = [sys.executable, "-P", "-c", WRITERS, *map(str, files)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
         for _ in files:
             os.kill(int(process.stdout.readline()), signal.SIGKILL)
             assert process.stdout.readline() == f"ended by {signal.SIGKILL:d}\n"

@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """The temporary directory of a run, real processes and all; values of ``run`` from a command line."""
-
-from __future__ import annotations
 
 import os
 import signal
@@ -71,8 +66,6 @@ def test_of_a_killed_run_is_cleared_and_of_a_living_one_kept(temporary: Path) ->
         subprocess.Popen([sys.executable, "-c", HOLD], stdout=subprocess.PIPE, text=True) as dead,
         subprocess.Popen([sys.executable, "-c", HOLD], stdout=subprocess.PIPE, text=True) as living,
     ):
-        assert dead.stdout is not None
-        assert living.stdout is not None
         abandoned, held = Path(dead.stdout.readline().strip()), Path(living.stdout.readline().strip())
         dead.send_signal(signal.SIGKILL)
         dead.wait()

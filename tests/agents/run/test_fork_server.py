@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """Processes forked from one that has imported everything: real ones, with the commands of the command line."""
-
-from __future__ import annotations
 
 import contextlib
 import json
@@ -19,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from networks import record_of_two
-from waiting import gone, participants, wait_for
+from waiting import participants, wait_for
 
 pytest.importorskip("rclpy")
 
@@ -104,16 +99,6 @@ def test_a_forked_process_is_like_any_child(
     assert "Traceback" not in (tmp_path / "log").read_text()
 
 
-def test_it_ends_when_its_lifeline_closes(server: ForkServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
-    reading, writing = os.pipe()
-    process = start(server, tmp_path / "log", *waiting, lifeline=reading)
-    os.close(reading)
-    wait_for(lambda: participants(domain))
-    assert process.poll() is None
-    os.close(writing)
-    assert process.wait() == 3
-
-
 def test_a_command_of_any_length(server: ForkServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
     """A process of many agents: its node starts, although ROS names a log file by what ``ps`` shows."""
     command, file, *rest = waiting
@@ -131,7 +116,6 @@ def test_processes_outlive_a_killed_fork_server(
     """How they end is known all the same; no more can be forked."""
     process = start(server, tmp_path / "log", *waiting)
     wait_for(lambda: participants(domain))
-    assert server.pid is not None
     os.kill(server.pid, signal.SIGKILL)
     for _ in range(2):
         assert server.fork_nodes([NodeStart(["agent", "--help"], {}, 1, None)]) == []
@@ -173,32 +157,9 @@ def test_a_fork_server_that_cannot_import(tmp_path: Path) -> None:
     assert "broken" in log.read_text()
 
 
-PARENT = """
-import sys, time
-from pathlib import Path
-from msg_agents.environment import node_environment
-from msg_agents.run.fork_server import ForkServer, NodeStart
-log = Path(sys.argv[1])
-with ForkServer(node_environment(0), log / "server.log") as server, (log / "log").open("w") as output:
-    (process,) = server.fork_nodes([NodeStart(["agent", "--help"], {}, output.fileno(), None)])
-    process.wait()
-    print(server.pid, flush=True)
-    time.sleep(600)
-"""
-
-
-def test_it_ends_when_its_user_is_killed(tmp_path: Path) -> None:
-    with subprocess.Popen([sys.executable, "-c", PARENT, str(tmp_path)], stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout is not None
-        server = Path("/proc") / parent.stdout.readline().strip()
-        assert server.exists()
-        parent.kill()
-    wait_for(lambda: gone(int(server.name)))
-
-
-RUN = """
+WORK = """
 import atexit, ctypes, os, sys, threading, time
-def run():
+def work():
     atexit.register(print, "handlers")
     threading.Thread(target=lambda: (time.sleep(0.2), print("threads"))).start()
     %s
@@ -209,7 +170,7 @@ if hasattr(ctypes.CDLL(None), "on_exit"):  # the C library of GNU
     ctypes.CDLL(None).on_exit(ctypes.CDLL(None).abort, None)  # as a library that crashes at its end
 pid = os.fork()
 if not pid:
-    run_and_end(run)
+    run_and_end(work)
 os._exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
 """
 
@@ -228,8 +189,8 @@ os._exit(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
 )
 def test_a_forked_process_ends_as_python_does(statement: str, code: int, said: str) -> None:
     """After its threads and handlers, but without those of C libraries."""
-    for end in ("run()", FORKED):
-        process = subprocess.run([sys.executable, "-P", "-c", RUN % statement + end], capture_output=True, text=True)
+    for end in ("work()", FORKED):
+        process = subprocess.run([sys.executable, "-P", "-c", WORK % statement + end], capture_output=True, text=True)
         assert process.returncode == code
         assert process.stderr.endswith(said)
         assert process.stdout == ("" if code == 120 else "threads\nhandlers\n")

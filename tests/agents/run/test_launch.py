@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """What launch files do, without ``launch``. With it: tests/integration/test_launch.py."""
-
-from __future__ import annotations
 
 import signal
 from dataclasses import replace
@@ -139,7 +134,6 @@ def test_the_processes_are_those_of_the_runner(tmp_path: Path) -> None:
         run_file = temporary_folder(network) / "run.json"
         record = RunRecord.from_json(run_file.read_text(), str(run_file))
         assert (record.experiment.run.seed, record.experiment.run.duration) == (5, 1.0)
-        assert network.bag is not None
         lock = ("--lifeline-lock", str(run_file.parent))
         processes = lay_out_network(record.experiment, run_file, network.bag)
         assert network.processes == [replace(spec, arguments=spec.arguments + lock) for spec in processes]
@@ -191,7 +185,6 @@ def test_failed(tmp_path: Path, code: int, words: str) -> None:
 def test_interrupted(tmp_path: Path) -> None:
     """What launch was told is the reason, not that its processes obeyed; data so far are kept with the run record."""
     network = launched(tmp_path, processes="1")
-    assert network.bag is not None
     (network.bag / f"{network.bag.name}_0.mcap").touch()
     network.interrupted("stopped by Ctrl-C")
     end(network, code=3)
@@ -223,7 +216,6 @@ def test_verdict(tmp_path: Path, code: int, words: str) -> None:
     assert network.analysis()
     network.ended(ANALYSIS, code)
     network.close()
-    assert network.reason is not None
     assert words in network.reason
 
 

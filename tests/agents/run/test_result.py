@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """What the processes of a run report: events, refused messages, what they wait for."""
-
-from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path

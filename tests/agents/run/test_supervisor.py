@@ -1,13 +1,7 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """Starting, watching and ending processes; which of them have hung."""
-
-from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -24,7 +18,6 @@ pytest.importorskip("rclpy")
 
 
 from msg_agents.discovery.rtps import free_domain
-from msg_agents.environment import node_environment
 from msg_agents.process_layout import ProcessSpec
 from msg_agents.run.supervisor import ESCALATION, LONGEST_LOOK, Child, HungDetector, Supervisor
 from msg_analysis.errors import ExitCode
@@ -223,6 +216,7 @@ import sys, time
 from pathlib import Path
 from msg_agents.process_layout import ProcessSpec
 from msg_agents.environment import node_environment
+from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.supervisor import Supervisor
 directory = Path(sys.argv[1])
 run_file = str(directory / "run.json")
@@ -231,23 +225,25 @@ plans = [
     ProcessSpec("agent_1", ("agent", run_file, "--agent", "1")),
     ProcessSpec("switcher", ("switcher", run_file)),
 ]
-with Supervisor(directory, node_environment(int(sys.argv[2]))) as supervisor:
-    supervisor.start(plans)
-    print(*(child.process.pid for child in supervisor.children), flush=True)
-    time.sleep(600)
+environment = node_environment(int(sys.argv[2]))
+with ForkServer(environment, directory / "server.log") as server:
+    with Supervisor(directory, environment, fork_server=server if sys.argv[3] == "forked" else None) as supervisor:
+        supervisor.start(plans)
+        print(server.pid, *(child.process.pid for child in supervisor.children), flush=True)
+        time.sleep(600)
 """
 
 
-@pytest.mark.parametrize("early", [True, False], ids=["while they start", "while they wait"])
-def test_children_do_not_outlive_a_killed_parent(tmp_path: Path, early: bool) -> None:
+@pytest.mark.parametrize("kind", ["executed", "forked"])
+def test_children_do_not_outlive_a_killed_parent(tmp_path: Path, kind: str) -> None:
+    """Nor does the process that forks them. Killed while they start, or, forked, while they wait."""
     record_of_two(tmp_path)
     with free_domain() as domain:
-        command = [sys.executable, "-P", "-c", PARENT, str(tmp_path), str(domain)]
+        command = [sys.executable, "-P", "-c", PARENT, str(tmp_path), str(domain), kind]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
-            assert parent.stdout is not None
             pids = [int(word) for word in parent.stdout.readline().split()]
-            assert len(pids) == 3
-            if not early:
+            assert len(pids) == 4
+            if kind == "forked":
                 wait_for(lambda: (tmp_path / "bag").exists() and participants(domain) == 3)
             parent.kill()
         try:
@@ -256,22 +252,6 @@ def test_children_do_not_outlive_a_killed_parent(tmp_path: Path, early: bool) ->
             for pid in pids:
                 if not gone(pid):
                     os.kill(pid, signal.SIGKILL)
-
-
-def test_real_nodes_end_in_order_when_told(tmp_path: Path) -> None:
-    run_file = str(record_of_two(tmp_path))
-    plans = [
-        ProcessSpec("recorder", ("recorder", run_file, "--out", str(tmp_path / "bag"))),
-        ProcessSpec("agent_1", ("agent", run_file, "--agent", "1")),
-    ]
-    with free_domain() as domain, Supervisor(tmp_path, node_environment(domain)) as supervisor:
-        supervisor.start(plans)
-        wait_for(lambda: (tmp_path / "bag").exists() and participants(domain) == 2)
-    # 3: their part was not done; nobody had to be killed, and the recorder has closed its bag.
-    logs = {child.spec.name: child.log.read_text() for child in supervisor.children}
-    assert [child.failure for child in supervisor.children] == ["exit code 3", "exit code 3"], logs
-    assert (tmp_path / "bag" / "metadata.yaml").exists()
-    assert not any(re.search("Traceback", log) for log in logs.values()), logs
 
 
 BLOCKED = "import threading; lock = threading.Lock(); lock.acquire(); print('ready'); lock.acquire()"

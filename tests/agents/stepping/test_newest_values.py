@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """Newest value wins, against a model that remembers all that it was offered; when steps are due, against fractions."""
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass
@@ -80,7 +75,6 @@ def test_the_newest_graph_wins(offered: list[tuple[int, int]]) -> None:
         assert node.learn(mode, first_step) == (Refusal.REPEATED if known else None)
         assert node.learn(mode, first_step) == Refusal.REPEATED
         newest_of = newest_of if known else (mode, first_step)
-        assert newest_of is not None
         assert node.inputs() == (newest_of[0], [(NOTHING, None) for _ in INPUTS[newest_of[0]]])
 
 

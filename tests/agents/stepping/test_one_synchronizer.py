@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """One agent in lockstep, step by step: what it refuses, what it waits for, what it lacks; turns of several agents."""
-
-from __future__ import annotations
 
 import copy
 from collections.abc import Callable
@@ -129,14 +124,6 @@ def test_a_peer_without_a_link_still_holds_back() -> None:
     assert node.ready()
 
 
-def test_alone() -> None:
-    node: Synchronizer[str] = Synchronizer(agent=0, steps=3, inputs=[[]], peers=[], window=0)
-    node.learn(0, 0, 0, 2)
-    assert [make_step(node) for _ in range(3)] == [(0, [])] * 3
-    assert node.finished
-    assert not node.ready()
-
-
 def test_waiting_for() -> None:
     node: Synchronizer[str] = Synchronizer(agent=1, steps=1, inputs=[[0, 2]], peers=[0, 2], window=3)
     assert node.waiting_for() == "the graph of step 0"
@@ -190,7 +177,6 @@ def test_values_of_different_steps() -> None:
     node: Synchronizer[str] = Synchronizer(
         needed=lambda j, k: k - j, delay=0, agent=0, steps=300, inputs=[[1, 2]], peers=[1, 2], start=200
     )
-    assert node.waiting_for() == "the graph of step 200"
     node.learn(0, 0, 0, 299)
     assert node.waiting_for() == "step 199 of agent 2, step 198 of agent 3"
     assert [node.offer(1, 199, "one"), node.offer(2, 198, "two")] == [None, None]
@@ -208,7 +194,7 @@ def test_what_it_refuses_of_a_peer_that_is_heard_late() -> None:
 class Player:
     """Whoever gets the ball passes it on to the next one, until it has been passed often enough."""
 
-    def __init__(self, game: Game, number: int) -> None:
+    def __init__(self, game: "Game", number: int) -> None:
         self.game, self.number = game, number
 
     def advance(self) -> None:

@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """What a recorder takes from batches, against the same messages one by one; which steps it knows."""
-
-from __future__ import annotations
 
 import random
 import tracemalloc

@@ -4,8 +4,6 @@ The values are integers that depend on everything which they were made of, in it
 agent or a wrong order anywhere changes what comes out at the end.
 """
 
-from __future__ import annotations
-
 import io
 import pickle
 import random

@@ -1,7 +1,5 @@
 """Reading the states of a running network out of its agents' checkpoints: what was written, whole, each once."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -137,7 +135,6 @@ def test_the_observer_has_the_numbers_of_the_comparison(tmp_path: Path) -> None:
     observer.look(400)
     observer.end()
     assert observer.note is None
-    assert observer.report is not None
     wanted = compare(trajectory)
     found = observer.report.system
     assert (found.measured, found.predicted, found.standard_error) == pytest.approx(
@@ -146,7 +143,6 @@ def test_the_observer_has_the_numbers_of_the_comparison(tmp_path: Path) -> None:
     for node, other in zip(observer.report.nodes, wanted.node_errors, strict=True):
         assert (node.measured, node.z) == pytest.approx((other.measured, other.z), rel=1e-6)
     recent = observer.report.recent
-    assert recent is not None
     steps = range(400 - len(recent.steps), 400)
     assert len(steps) > 100
     assert (recent.steps.tolist(), recent.modes.tolist()) == ([*steps], trajectory.modes[steps].tolist())

@@ -1,9 +1,4 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """Snapshots of a run, its panel in the terminal, and what a page gets."""
-
-from __future__ import annotations
 
 import io
 import re
@@ -53,13 +48,12 @@ def _snapshot(agents: int, **changes: object) -> Snapshot:
         "left": 61.2,
         "report": _report(agents),
     }
-    return Snapshot(**(values | changes))  # type: ignore[arg-type]
+    return Snapshot(**(values | changes))
 
 
 def _lines(snapshot: Snapshot, experiment: Experiment, width: int, height: int) -> list[str]:
     console = Console(file=io.StringIO(), width=width, height=height, force_terminal=True, color_system=None)
     console.print(panel_of(snapshot, experiment, width=width, height=height))
-    assert isinstance(console.file, io.StringIO)
     return console.file.getvalue().rstrip("\n").split("\n")
 
 
@@ -141,7 +135,6 @@ def test_the_sojourns_are_those_of_the_run() -> None:
     path = HoldingPeriods(experiment)
     for step in range(0, 8000, 37):
         holding = path.at(step)
-        assert holding is not None
         assert holding.first_step <= step <= holding.last_step
         assert (modes[holding.first_step : holding.last_step + 1] == holding.mode).all()
     assert path.at(8000) is not None

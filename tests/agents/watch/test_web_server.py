@@ -1,7 +1,5 @@
 """The page for browsers: what it serves, to whom, and that nobody holds anybody up."""
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import json
@@ -269,22 +267,18 @@ def test_the_end_reaches_who_watches() -> None:
     assert events.until("none")[-1][0] == "end"
 
 
-def test_the_port_is_taken(idle: WebServer) -> None:
-    port = int(idle.address.rstrip("/").rpartition(":")[2])
-    with pytest.raises(InputError, match=f"--web: cannot serve at 127.0.0.1, port {port} .*in use.*another port"):
-        WebServer("127.0.0.1", port)
+def test_a_taken_port_ends_the_command_before_anything_starts(idle: WebServer, tmp_path: Any) -> None:
+    """So does a host that is none."""
     with pytest.raises(InputError, match="cannot serve at nosuchhost"):
         WebServer("nosuchhost.invalid", 0)
-
-
-def test_a_taken_port_ends_the_command_before_anything_starts(idle: WebServer, tmp_path: Any) -> None:
     experiment = tmp_path / "net.yaml"
     experiment.write_text("name: net\ngraphs: {line: {path: [1, 2, 3]}}\nrun: {duration: 5}\n")
     port = idle.address.rstrip("/").rpartition(":")[2]
     for command in (["run", str(experiment), "--out", str(tmp_path / "runs")], ["live", "--timeout", "1"]):
         result = CliRunner().invoke(main, [*command, "--web", port])
         assert result.exit_code == 2, result.output
-        assert "in use" in result.stderr
+        words = f"--web: cannot serve at 127.0.0.1, port {port} .*in use.*another port"
+        assert re.search(words, result.stderr)
         assert "Traceback" not in result.output
     assert not (tmp_path / "runs").exists()
 

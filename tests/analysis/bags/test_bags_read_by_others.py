@@ -26,7 +26,7 @@ NOISE: dict[str, dict[str, float]] = {
 
 
 @pytest.fixture(scope="module", params=NOISE)
-def run(request: pytest.FixtureRequest) -> Run:
+def twin(request: pytest.FixtureRequest) -> Run:
     """A run of the twin, with a second topic of states where they are published with noise."""
     setting = {"duration": STEPS * 0.05, "replicas": REPLICAS, "seed": 5, "start": "zero"}
     return simulate(line_ring(AGENTS, 2.0, name="peers", noise=NOISE[request.param], run=setting))
@@ -35,33 +35,33 @@ def run(request: pytest.FixtureRequest) -> Run:
 @pytest.mark.parametrize("split", [None, 3])
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_every_peer_reads_every_bag(
-    run: Run, compression: Compression, split: int | None, tmp_path: Path, typestore: Any
+    twin: Run, compression: Compression, split: int | None, tmp_path: Path, typestore: Any
 ) -> None:
     """Every message, in the order of time, with the right counts and values, in one file or in several."""
     bag = tmp_path / "bag"
     if split is not None:  # so many files
-        write_trajectory(run, tmp_path / "one", Storage(compression, chunk_size=3000))
+        write_trajectory(twin, tmp_path / "one", Storage(compression, chunk_size=3000))
         split = (tmp_path / "one" / "one_0.mcap").stat().st_size // split
-    write_trajectory(run, bag, Storage(compression, split, 3000))
+    write_trajectory(twin, bag, Storage(compression, split, 3000))
     files = sorted(bag.glob("*.mcap"), key=lambda file: int(file.stem.removeprefix("bag_")))
     assert [file.name for file in files] == [f"bag_{i}.mcap" for i in range(len(files))]
     assert len(files) in ((1,) if split is None else (2, 3))
-    topics = _values(run, bag, typestore)
+    topics = _values(twin, bag, typestore)
     _files(bag, files, compression, topics, split)
     assert {"metadata.yaml", *(file.name for file in files)} == {file.name for file in bag.iterdir()}
     found = read_bag(bag)
-    assert np.array_equal(found.states, run.states)
-    assert found.completeness == run.completeness
-    np.testing.assert_array_equal(found.lost, run.lost)
-    np.testing.assert_array_equal(found.published, run.published)
+    assert np.array_equal(found.states, twin.states)
+    assert found.completeness == twin.completeness
+    np.testing.assert_array_equal(found.lost, twin.lost)
+    np.testing.assert_array_equal(found.published, twin.published)
 
 
-def _values(run: Run, bag: Path, typestore: Any) -> Counter[str]:
+def _values(twin: Run, bag: Path, typestore: Any) -> Counter[str]:
     """All messages by rosbags, with the definitions in the bag: right values; their numbers by topic."""
-    expected = {"state": run.states if run.published is None else run.published, "truth": run.states}
+    expected = {"state": twin.states if twin.published is None else twin.published, "truth": twin.states}
     found = {kind: np.full_like(states, np.nan) for kind, states in expected.items()}
     count: Counter[str] = Counter()
-    modes = np.full_like(run.modes, -1)
+    modes = np.full_like(twin.modes, -1)
     with AnyReader([bag]) as reader:
         last = 0
         for connection, time, raw in reader.messages():
@@ -70,17 +70,17 @@ def _values(run: Run, bag: Path, typestore: Any) -> Counter[str]:
             count[connection.topic] += 1
             message: Any = reader.deserialize(raw, connection.msgtype)
             if connection.topic == "/graph":
-                graph = run.record.experiment.graph_list[message.mode - 1]
+                graph = twin.record.experiment.graph_list[message.mode - 1]
                 arcs = zip(message.source, message.target, message.weight, strict=True)
                 assert (message.name, [tuple(arc) for arc in arcs]) == (graph.name, graph.arcs)
                 modes[message.first_step : message.last_step + 1] = message.mode - 1
             elif connection.topic == "/experiment":
-                assert message.data == run.record.to_json()
+                assert message.data == twin.record.to_json()
             else:
                 assert connection.topic.startswith(f"/agent_{message.agent}/")
                 found[connection.topic.rsplit("/", 1)[1]][message.step, message.agent - 1] = message.state
-                if run.lost is not None and message.step:
-                    gone = run.lost[message.step - 1, message.agent - 1].sum()
+                if twin.lost is not None and message.step:
+                    gone = twin.lost[message.step - 1, message.agent - 1].sum()
                     assert (message.heard == 2**64 - 1).sum() == gone
         assert reader.message_count == count.total()
         assert {topic: info.msgcount for topic, info in reader.topics.items()} == count
@@ -89,16 +89,16 @@ def _values(run: Run, bag: Path, typestore: Any) -> Counter[str]:
         assert Counter(connection.topic for connection, _, _ in plain.messages()) == count
         for connection in plain.connections:
             assert connection.digest == typestore.hash_rihs01(connection.msgtype)
-            assert connection.ext.offered_qos_profiles  # type: ignore[union-attr]
-    assert np.array_equal(modes, run.modes)
+            assert connection.ext.offered_qos_profiles
+    assert np.array_equal(modes, twin.modes)
     assert np.array_equal(found["state"], expected["state"])
-    noisy = run.published is not None
-    assert np.array_equal(found["truth"], run.states) if noisy else np.isnan(found["truth"]).all()
+    noisy = twin.published is not None
+    assert np.array_equal(found["truth"], twin.states) if noisy else np.isnan(found["truth"]).all()
     kinds = ("state", "truth") if noisy else ("state",)
     states = {f"/agent_{i + 1}/{kind}": STEPS + 1 for i in range(AGENTS) for kind in kinds}
     files = len(list(bag.glob("*.mcap")))  # each begins with what is in force
     assert count == states | {"/experiment": files, "/graph": count["/graph"]}
-    assert count["/graph"] - int(np.count_nonzero(np.diff(run.modes))) - 1 in range(2 * files - 1)
+    assert count["/graph"] - int(np.count_nonzero(np.diff(twin.modes))) - 1 in range(2 * files - 1)
     return count
 
 
@@ -114,7 +114,6 @@ def _files(bag: Path, files: list[Path], compression: Compression, topics: Count
         with file.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
             summary = reader.get_summary()
-            assert summary.statistics is not None
             kinds = {index.compression for index in summary.chunk_indexes}
             assert kinds == {"" if compression == "none" else compression}
             # Without the head of a later file, which has the time of its beginning, and states never have.
@@ -156,6 +155,6 @@ def _files(bag: Path, files: list[Path], compression: Compression, topics: Count
 
 def test_storage_refuses_nonsense() -> None:
     with pytest.raises(InputError, match="one of none, zstd, lz4"):
-        Storage("zip")  # type: ignore[arg-type]
+        Storage("zip")
     with pytest.raises(InputError, match="more than 0"):
         Storage(split_size=0)

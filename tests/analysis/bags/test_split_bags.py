@@ -13,7 +13,6 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from rosbags.highlevel import AnyReader
 
 from experiments import Run, read_bag, write_trajectory
 from msg_analysis.bags.playback import Playback
@@ -40,14 +39,14 @@ def files_of(bag: Path) -> list[Path]:
 
 
 @pytest.fixture(scope="module")
-def run(make_run: MakeRun) -> Run:
+def whole(make_run: MakeRun) -> Run:
     return make_run(AGENTS, STEPS, 3)
 
 
 @pytest.fixture(scope="module")
-def unsplit(run: Run, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[str, Any]]:
+def unsplit(whole: Run, tmp_path_factory: pytest.TempPathFactory) -> list[tuple[str, Any]]:
     directory = tmp_path_factory.mktemp("unsplit") / "bag"
-    write_trajectory(run, directory)
+    write_trajectory(whole, directory)
     return messages_of(directory / "bag_0.mcap")
 
 
@@ -93,12 +92,12 @@ def record(bag: BagWriter, messages: list[tuple[str, bytes, int]], portion: int 
 @pytest.fixture(scope="module", params=[1, 37])
 def bag(
     request: pytest.FixtureRequest,
-    run: Run,
+    whole: Run,
     arriving: list[tuple[str, bytes, int]],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Path:
     storage, directory = Storage("zstd", 12_000), tmp_path_factory.mktemp("split") / "split"
-    with BagWriter(directory, network_topics(AGENTS), record=run.record.to_json(), storage=storage) as writer:
+    with BagWriter(directory, network_topics(AGENTS), record=whole.record.to_json(), storage=storage) as writer:
         record(writer, arriving, request.param)
         assert writer.messages == len(arriving)
     assert len(files_of(directory)) > 4
@@ -123,7 +122,7 @@ def test_files_follow_each_other_in_time(bag: Path) -> None:
     assert information["message_count"] == sum(entry["message_count"] for entry in information["files"])
 
 
-def test_every_file_reads_alone(run: Run, bag: Path) -> None:
+def test_every_file_reads_alone(whole: Run, bag: Path) -> None:
     """With the experiment, and the graph of every step between two of its states."""
     covered = np.zeros((STEPS + 1, AGENTS), dtype=int)
     for file in files_of(bag):
@@ -131,10 +130,10 @@ def test_every_file_reads_alone(run: Run, bag: Path) -> None:
         alone = read_bag(file)
         there = ~np.isnan(alone.states[:, :, 0])
         covered += there
-        assert np.array_equal(alone.states[there], run.states[there])
+        assert np.array_equal(alone.states[there], whole.states[there])
         steps = np.flatnonzero(there.all(axis=1))
         between = slice(int(steps.min()), int(steps.max()))
-        assert np.array_equal(alone.modes[between], run.modes[between])
+        assert np.array_equal(alone.modes[between], whole.modes[between])
         assert alone.completeness.refused == {}
     assert (covered == 1).all()
 
@@ -160,12 +159,12 @@ def test_repetitions_say_what_they_repeat(bag: Path) -> None:
         assert numbers == set(range(len(numbers)))
 
 
-def test_the_whole_bag_is_that_which_is_not_split(run: Run, bag: Path) -> None:
+def test_the_whole_bag_is_that_which_is_not_split(whole: Run, bag: Path) -> None:
     found = read_bag(bag)
     assert found.completeness.complete
     assert (found.completeness.duplicates, found.completeness.refused) == (0, {})
-    assert np.array_equal(found.states, run.states)
-    assert np.array_equal(found.modes, run.modes)
+    assert np.array_equal(found.states, whole.states)
+    assert np.array_equal(found.modes, whole.modes)
 
 
 def test_it_is_played_once(bag: Path, unsplit: list[tuple[str, Any]]) -> None:
@@ -182,32 +181,22 @@ def test_it_is_played_once(bag: Path, unsplit: list[tuple[str, Any]]) -> None:
         assert played == wanted
 
 
-def test_rosbags_reads_it(bag: Path, arriving: list[tuple[str, bytes, int]]) -> None:
-    """Its order of files is that of time, and its counts are those of metadata.yaml."""
-    with AnyReader([bag]) as reader:
-        found = [(connection.topic, time, bytes(data)) for connection, time, data in reader.messages()]
-        assert reader.message_count == len(found) > len(arriving)
-    times = [time for _, time, _ in found]
-    assert times == sorted(times)
-    assert {(topic, data) for topic, _, data in found} == {(topic, data) for topic, data, _ in arriving}
-
-
-def test_an_agent_that_is_far_behind(run: Run, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> None:
+def test_an_agent_that_is_far_behind(whole: Run, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> None:
     """Its states come when all files that waited for them are closed: nothing is lost, and the graphs are there."""
     late = [message for message in arriving if message[0] == "/agent_2/state"]
     bag = tmp_path / "split"
-    with BagWriter(bag, network_topics(AGENTS), record=run.record.to_json(), storage=Storage("none", 9000)) as writer:
+    with BagWriter(bag, network_topics(AGENTS), record=whole.record.to_json(), storage=Storage("none", 9000)) as writer:
         record(writer, [message for message in arriving if message not in late] + late)
-    assert np.array_equal(read_bag(bag).states, run.states)
-    assert np.array_equal(read_bag(bag).modes, run.modes)
+    assert np.array_equal(read_bag(bag).states, whole.states)
+    assert np.array_equal(read_bag(bag).modes, whole.modes)
 
 
-def test_a_latched_message_that_is_late(run: Run, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> None:
+def test_a_latched_message_that_is_late(whole: Run, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> None:
     """It is in the file of its time, and at once in the later one that has begun already."""
     states = [message for message in arriving if message[0] not in LATCHED]
     experiment = next(message for message in arriving if message[0] == "/experiment")
     bag = tmp_path / "split"
-    with BagWriter(bag, network_topics(AGENTS), record=run.record.to_json(), storage=Storage("none", 9000)) as writer:
+    with BagWriter(bag, network_topics(AGENTS), record=whole.record.to_json(), storage=Storage("none", 9000)) as writer:
         for topic, data, time in states:
             if topic != "/agent_2/state":  # all files wait for this agent
                 writer.write(topic, data, time)
@@ -217,10 +206,10 @@ def test_a_latched_message_that_is_late(run: Run, arriving: list[tuple[str, byte
     assert [[topic for topic, _ in messages_of(file)].count("/experiment") for file in files_of(bag)] == [1, 1]
 
 
-def test_torn_in_two_files(run: Run, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> None:
+def test_torn_in_two_files(whole: Run, arriving: list[tuple[str, bytes, int]], tmp_path: Path) -> None:
     """The recorder is killed while a file waits for late states: both are salvaged, with true counts."""
     bag = tmp_path / "split"
-    writer = BagWriter(bag, network_topics(AGENTS), record=run.record.to_json(), storage=Storage("zstd", 9000))
+    writer = BagWriter(bag, network_topics(AGENTS), record=whole.record.to_json(), storage=Storage("zstd", 9000))
     late = [message for message in arriving if message[0] == "/agent_2/state"]
     record(writer, [message for message in arriving if message not in late][: 3 * STEPS // 2])
     writer.flush()
@@ -233,7 +222,7 @@ def test_torn_in_two_files(run: Run, arriving: list[tuple[str, bytes, int]], tmp
     found = read_bag(bag)
     others = np.delete(~np.isnan(found.states[:, :, 0]), 1, axis=1)
     assert others.sum() > STEPS
-    assert np.array_equal(found.states[:, [0, 2, 3]][others], run.states[:, [0, 2, 3]][others])
+    assert np.array_equal(found.states[:, [0, 2, 3]][others], whole.states[:, [0, 2, 3]][others])
     played = Playback(bag).messages(LATCHED)
     assert [message.topic for message in played].count("/experiment") == 1
 

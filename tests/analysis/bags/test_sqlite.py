@@ -51,14 +51,14 @@ WORDS = {
 
 
 @pytest.fixture(scope="module")
-def run(make_run: MakeRun) -> Run:
+def ours(make_run: MakeRun) -> Run:
     return make_run(3, 200, 2)
 
 
 @pytest.fixture(scope="module")
-def messages(run: Run, tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
+def messages(ours: Run, tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
     bag = tmp_path_factory.mktemp("ours") / "bag"
-    write_trajectory(run, bag)
+    write_trajectory(ours, bag)
     with AnyReader([bag]) as reader:
         return [(c.topic, c.msgtype, time, bytes(data)) for c, time, data in reader.messages()]
 
@@ -87,12 +87,12 @@ def database(file: Path, messages: list[Message], version: int = 4, mode: str = 
 
 
 @pytest.mark.parametrize("version", TOPICS)
-def test_every_version_is_read_and_played(version: int, run: Run, messages: list[Message], tmp_path: Path) -> None:
+def test_every_version_is_read_and_played(version: int, ours: Run, messages: list[Message], tmp_path: Path) -> None:
     file = database(tmp_path / "theirs_0.db3", messages, version)
     found = read_bag(file)
     assert found.completeness.complete
-    assert np.array_equal(found.states, run.states)
-    assert np.array_equal(found.modes, run.modes)
+    assert np.array_equal(found.states, ours.states)
+    assert np.array_equal(found.modes, ours.modes)
     playback = Playback(file)
     played = [(message.topic, message.time, message.data) for message in playback.messages(list(playback.topics))]
     assert sorted(played) == sorted((topic, time, data) for topic, _, time, data in messages)
@@ -102,7 +102,7 @@ def test_every_version_is_read_and_played(version: int, run: Run, messages: list
     assert playback.topics["/graph"].type_name == "msg_agents_interfaces/msg/ActiveGraph"
 
 
-def test_several_files_with_the_names_of_old_versions(run: Run, messages: list[Message], tmp_path: Path) -> None:
+def test_several_files_with_the_names_of_old_versions(ours: Run, messages: list[Message], tmp_path: Path) -> None:
     """Until version 3 of metadata.yaml, names of files begin with that of the bag. Without it, they go by number."""
     bag = tmp_path / "theirs"
     bag.mkdir()
@@ -114,7 +114,7 @@ def test_several_files_with_the_names_of_old_versions(run: Run, messages: list[M
         yaml.safe_dump({"rosbag2_bagfile_information": information | {"relative_file_paths": names}})
     )
     for _ in range(2):
-        assert np.array_equal(read_bag(bag).states, run.states)
+        assert np.array_equal(read_bag(bag).states, ours.states)
         document = describe_bag(bag)
         files = [file["name"] for file in document["files"] if file["name"].endswith(".db3")]
         assert files == [f"theirs_{number}.db3" for number in range(12)]
@@ -150,14 +150,14 @@ def test_the_log_of_a_killed_recorder_counts(messages: list[Message], tmp_path: 
     assert file.read_bytes() == before
 
 
-def test_nothing_is_left_beside_a_file_in_wal_mode(run: Run, messages: list[Message], tmp_path: Path) -> None:
+def test_nothing_is_left_beside_a_file_in_wal_mode(ours: Run, messages: list[Message], tmp_path: Path) -> None:
     (tmp_path / "bag").mkdir()
     file = database(tmp_path / "bag/theirs_0.db3", messages, mode="WAL")
-    assert np.array_equal(read_bag(file).states, run.states)
+    assert np.array_equal(read_bag(file).states, ours.states)
     assert [path.name for path in file.parent.iterdir()] == [file.name]
 
 
-def test_salvage_makes_mcap_of_it(run: Run, messages: list[Message], tmp_path: Path) -> None:
+def test_salvage_makes_mcap_of_it(ours: Run, messages: list[Message], tmp_path: Path) -> None:
     """Also of a file that is cut off, as far as SQLite can read it; others read the new bag."""
     file = database(tmp_path / "theirs_0.db3", messages)
     report = salvage(file, tmp_path / "whole")
@@ -166,7 +166,7 @@ def test_salvage_makes_mcap_of_it(run: Run, messages: list[Message], tmp_path: P
     with AnyReader([tmp_path / "whole"]) as reader:
         found = [(c.topic, c.msgtype, time, bytes(data)) for c, time, data in reader.messages()]
     assert sorted(found) == sorted(messages)
-    assert np.array_equal(read_bag(tmp_path / "whole").states, run.states)
+    assert np.array_equal(read_bag(tmp_path / "whole").states, ours.states)
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2] + bytes(4096))
     report = salvage(file, tmp_path / "half")
@@ -176,7 +176,7 @@ def test_salvage_makes_mcap_of_it(run: Run, messages: list[Message], tmp_path: P
 
 
 def test_messages_compressed_one_by_one_are_salvaged_unpacked(
-    run: Run, messages: list[Message], tmp_path: Path
+    ours: Run, messages: list[Message], tmp_path: Path
 ) -> None:
     packed = [(topic, kind, time, zstandard.compress(data)) for topic, kind, time, data in messages]
     file = database(tmp_path / "theirs_0.db3", packed)
@@ -243,7 +243,7 @@ def _made(file: Path, *statements: str) -> None:
     connection.close()
 
 
-def test_rows_that_are_no_messages(run: Run, messages: list[Message], tmp_path: Path) -> None:
+def test_rows_that_are_no_messages(ours: Run, messages: list[Message], tmp_path: Path) -> None:
     """They are left out and counted, like a message of a topic that is not there; also the last one."""
     file = database(tmp_path / "theirs_0.db3", messages)
     _made(
@@ -254,5 +254,5 @@ def test_rows_that_are_no_messages(run: Run, messages: list[Message], tmp_path: 
         ),
     )
     found = read_bag(file)
-    assert np.array_equal(found.states, run.states)
+    assert np.array_equal(found.states, ours.states)
     assert found.completeness.refused == {"damaged chunk": 4}
