@@ -105,10 +105,8 @@ def test_an_experiment_is_parsed_with_few_imports() -> None:
 
 
 def test_processes_of_a_run_import_little() -> None:
-    """With these a network would take twice as long to start: every agent is a process that imports all it needs.
-
-    What they import when they run: tests/integration/test_lockstep.py.
-    """
+    """With these a network would take twice as long to start: every agent is a process that imports all it needs."""
+    # What they import when they run: tests/integration/test_lockstep.py.
     pytest.importorskip("rclpy")
     nodes = [f"msg_agents.nodes.{name}" for name in ("agent_group", "recorder", "switcher", "process")]
     (loaded,) = loaded_in_turn([[*nodes, "msg_analysis.model.step_model"]])

@@ -118,10 +118,8 @@ def by_the_twin(command: str) -> str:
 
 @functools.cache
 def compared(document: str) -> str:
-    """Simulated and compared; the same network stands on several pages.
-
-    No bag is made on the way: what is read from it is what was written, as tests/analysis/bags says.
-    """
+    """Simulated and compared; the same network stands on several pages."""
+    # No bag is made on the way: what is read from it is what was written, as tests/analysis/bags says.
     twin = simulate(Experiment.parse(json.loads(document)))
     Path("twin").mkdir()
     with pytest.MonkeyPatch.context() as patch:

@@ -80,10 +80,8 @@ def test_bursts_have_a_geometric_length() -> None:
 
 
 def test_two_states() -> None:
-    """The share of losses is that of the stationary law of the two states; neighbours are correlated as it says.
-
-    With u the deviation from the mean, E[u(k) u(k + 1)] = pi_good pi_bad (bad - good)^2 (1 - to_bad - to_good).
-    """
+    """The share of losses is that of the stationary law of the two states; neighbours are correlated as it says."""
+    # With u the deviation from the mean, E[u(k) u(k + 1)] = pi_good pi_bad (bad - good)^2 (1 - to_bad - to_good).
     good, bad, to_bad, to_good = 0.05, 0.7, 0.02, 0.1
     chain = np.array([[1 - to_bad, to_bad], [to_good, 1 - to_good]])
     values, vectors = np.linalg.eig(chain.T)

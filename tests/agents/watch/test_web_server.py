@@ -166,10 +166,8 @@ def test_the_report_is_there_until_the_browsers_have_it(tmp_path: Path) -> None:
 
 
 def test_who_is_slow_or_goes_holds_nobody_up(web: WebServer) -> None:
-    """Moments larger than what a connection buffers: all are taken while one browser has stopped reading.
-
-    It misses those that came meanwhile. Another browser goes at once, and one reads.
-    """
+    """Moments larger than what a connection buffers: all are taken while one browser has stopped reading."""
+    # It misses those that came meanwhile. Another browser goes at once, and one reads.
     web.begin({"name": "net"})
     slow = _dial(web)
     slow.sendall(b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n")
