@@ -36,7 +36,6 @@ def test_any_reader_finds_everything(network: Any) -> None:
 def _the_seed_is_the_run(network: Any, result: RunResult) -> None:
     """The same seed gives the same contents, whatever the processes; another seed gives others."""
     first = result.trajectory
-    assert first is not None
     again = network.run(network.experiment(run={"processes": 1})).trajectory
     assert again.record.run != first.record.run
     assert np.array_equal(again.states, first.states)

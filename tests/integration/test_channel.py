@@ -132,8 +132,7 @@ def test_real_time_over_a_bad_channel(network: Any) -> None:
         recorder="clean",
     )
     result = network.completed(run)
-    used = read_bag(result["bag"]).used
-    assert used is not None
+    assert read_bag(result["bag"]).used is not None
     pairs = pairs_of(result)
     assert pairs["left", "right"]["lost"] > 0
     assert any(line.startswith("Of the messages between agents, ") for line in result["channel"]["findings"])

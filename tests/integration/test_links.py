@@ -88,7 +88,6 @@ def test_real_time(network: Any, law: str, messages: str, processes: Any) -> Non
     result = network.run(network.experiment(**changes(law, messages, UNDISTURBED | {"processes": processes})))
     assert_equal(result.trajectory)
     trajectory = result.trajectory
-    assert trajectory.used is not None
     assert (trajectory.used >= 0).any()
     noise = trajectory.record.experiment.noise
     silent = trajectory.used[100:, 3, 0] < 0  # agent 4 hears agent 3 in every graph
@@ -115,7 +114,6 @@ def test_killed_agents_hold_again_what_they_held(network: Any) -> None:
 
     trajectory = network.killed_and_back(network.record(file, "--restarts", "4", "--json"), victims)
     assert_equal(trajectory)
-    assert trajectory.used is not None
     ages = np.arange(len(trajectory.used))[:, None, None] - trajectory.used
     assert ages[trajectory.used >= 0].max() > 200
 

@@ -233,7 +233,6 @@ def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyP
         assert all(min(marker["scale"].values()) > 0 for marker in picture["markers"])
     (agents,), (links,), (title,) = (by_space(pictures[-1], name) for name in ("agents", "links", "title"))
     trajectory = result.trajectory
-    assert trajectory.agent_modes is not None
     modes = trajectory.agent_modes[-1].tolist()
     assert title["text"] == f"net  step {STEPS}  t = 20  {('line', 'ring')[modes[0]]}"
     places = [(point["x"], point["y"]) for point in agents["points"]]

@@ -74,7 +74,6 @@ def equals_the_twin(what: Experiment, trajectory: Run | None) -> None:
     again = simulate(what)  # from the experiment alone: nothing of the bag is used
     assert np.array_equal(again.states, trajectory.states)
     assert np.array_equal(again.modes, trajectory.modes)
-    assert trajectory.agent_modes is not None
     assert np.array_equal(trajectory.agent_modes[1:], np.repeat(again.modes[:, None], 5, axis=1))
 
 

@@ -1,16 +1,20 @@
 """Random networks with random faults: equal to their twins. One whose checkpoint is made wrong is found."""
 
+import contextlib
+import random
 import re
 import signal
+import time
 from pathlib import Path
 from typing import Any
 
 import yaml
-from random_faults import plan_faults, run_random_network
 from random_networks import random_document
 
 from msg_agents.cli.nodes import load_record
 from msg_agents.recovery import Checkpoint, entry_size
+from msg_agents.run.result import read_steps
+from msg_agents.run.supervisor import STEPS
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.twin.check import check
@@ -19,27 +23,51 @@ KILLED = 3468  # the process of an agent is killed before the first step
 UNDISTURBED = 225  # six agents in two processes, 3,474 steps, no noise on the air
 
 
-def test_equal(network: Any, repetition: int) -> None:
-    seed = KILLED + repetition
-    result, met, verdict = run_random_network(seed, network.directory / "runs")
-    assert verdict.status in ("equal", "ended"), (seed, verdict, met, result.bag)
-    experiment = Experiment.parse(random_document(seed))
-    assert set(met.faults) <= set(plan_faults(seed, experiment.agents, experiment.steps).faults)
-    assert len(result.restarts) <= sum(fault.kills for fault in met.faults)
-    first = repetition == 0  # then it is known what happens, and nothing is missing
-    states = experiment.agents * (experiment.steps + 1)
-    assert not first or verdict.status == "equal", verdict
-    assert not first or verdict.compared in (states, 2 * states)  # with what was published, if that is something else
-    assert not first or len(result.restarts) == sum(fault.kills for fault in met.faults) == 1
+def written(network: Any, seed: int) -> tuple[Path, int]:
+    """A file with the experiment of a seed; its number of steps."""
+    file = Path(network.directory / "network.yaml")
+    file.write_text(yaml.safe_dump(random_document(seed)))
+    return file, Experiment.load(file).steps
+
+
+def test_equal(network: Any, repetition: int, rng: random.Random) -> None:
+    """Up to three processes are killed or stopped, each at any moment: the run is complete and equal to its twin."""
+    file, steps = written(network, KILLED + repetition)
+    run = network.record(file, "--restarts", "3", "--json")
+    network.wait_for(network.nodes, 60, "a process")
+    reached = network.run_file().with_name(STEPS)
+    killed: list[str] = []
+    for number in range(rng.randint(1, 3)):
+        # In the first network, who is killed has made no step yet.
+        moment = rng.randrange(round(0.7 * steps)) if number or repetition else -1
+        network.wait_for(lambda moment=moment: run.poll() is not None or _slowest(reached) >= moment, 100, "a step")
+        victims = network.processes("agent", "switcher")
+        if not victims:
+            break  # it is over
+        victim = rng.choice(victims)
+        print("at step", moment, victim.command[2:])
+        if number == 0 or rng.random() < 0.5:
+            killed.append(victim.kind)
+            victim.kill()
+        else:
+            victim.kill(signal.SIGSTOP)
+            time.sleep(rng.uniform(0.05, 1.5))
+            victim.kill(signal.SIGCONT)
+    restarts = network.completed(run)["restarts"]
+    assert all(": killed by SIGKILL" in line for line in restarts)
+    assert (1 if repetition == 0 else 0) <= len(restarts) <= len(killed)
+
+
+def _slowest(steps: Path) -> int:
+    """Step of the last agent; a run that is over has no such file any more."""
+    with contextlib.suppress(OSError):
+        return min(read_steps(steps), default=-1)
+    return -1
 
 
 def test_one_bit(network: Any) -> None:
     """Of a state from which a killed agent goes on: found."""
-    experiment = Experiment.parse(random_document(UNDISTURBED))
-    assert not experiment.noise.on_air
-    file = network.directory / "network.yaml"
-    file.write_text(yaml.safe_dump(random_document(UNDISTURBED)))
-    run = network.record(file)
+    run = network.record(written(network, UNDISTURBED)[0])
     process = network.wait_for(lambda: network.processes("agent"), 60, "an agent")[0]
     size = entry_size(load_record(network.run_file()))
 

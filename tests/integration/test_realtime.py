@@ -58,8 +58,6 @@ def assert_possible(trajectory: Run) -> None:
     assert trajectory.completeness.refused == {}
     assert trajectory.completeness.expected == trajectory.states[..., 0].size
     experiment, used, made = trajectory.record.experiment, trajectory.used, trajectory.made
-    assert used is not None
-    assert made is not None
     assert (made[0] == 0).all()
     assert (np.diff(made, axis=0) > 0).all()
     due = (np.arange(experiment.steps)[:, None] + phases(experiment)) * experiment.step_length * 1e9
@@ -100,8 +98,6 @@ def test_a_busy_machine_is_no_wrong_theory(network: Any) -> None:
     assert_possible(result.trajectory)
     comparison = compare(result.trajectory, level=1e-4)
     assert comparison.verdict == "agrees"
-    assert comparison.timing is not None
-    assert comparison.laws is not None
     assert comparison.laws.pattern.supported
     assert comparison.timing.missed_share <= 0.01 or comparison.laws.sequential.supported is False
 

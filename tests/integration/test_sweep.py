@@ -168,5 +168,4 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
     assert rows[2].startswith("network,quantity,agent")
     assert len(rows) == 3 + 6
     measured = compare(simulate(Experiment.parse(json.loads(runs[0].job().document)))).system_error.measured
-    assert measured is not None
     assert float(rows[3].split(",")[6]) == 1.0 / measured

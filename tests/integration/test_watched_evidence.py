@@ -58,7 +58,6 @@ def test_watchers_have_the_evidence_of_the_comparison(
     assert (result.failures, result.until["ended_early"]) == ([], False)
     wanted = evidence_of(result.trajectory)
     report = observers[0].report
-    assert report is not None
     assert observers[0]._reader.missed == 0
     assert report.any_time.log_evidence == pytest.approx(wanted, abs=1e-7)
     live = network.start("live", "--reliable", "--json", "--timeout", "60")

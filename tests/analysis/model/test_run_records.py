@@ -103,14 +103,11 @@ def test_a_bag_of_what_is_not_installed(name: str, offer: Callable[..., None], t
     read = read_bag(bag)
     assert read.completeness == trajectory.completeness
     assert np.array_equal(read.states, trajectory.states)
-    assert read.lost is not None
-    assert trajectory.lost is not None
     assert np.array_equal(read.lost, trajectory.lost)
     word = f"protocol {name} (msg_agents_example_protocols 0.1.0) is not available here"
     assert word in describe_bag(bag)["protocol"]["absent"]
     comparison = compare(read)
     assert comparison.verdict == "unpredicted"
-    assert comparison.unpredicted is not None
     assert word in comparison.unpredicted
     with pytest.raises(InputError, match=r"is not available here .*: install msg_agents_example_protocols 0"):
         check(read)
