@@ -127,10 +127,9 @@ def test_before_anything_has_begun(network: Any, repetition: int, rng: random.Ra
     ids=["compared", "at any moment"],
 )
 def test_after_the_network(network: Any, there: str, changes: dict[str, Any], words: str) -> None:
-    """The user does not wait for the verdict. The result is printed; the bag is whole, and can be compared later.
-
-    The comparison takes longer than this test needs to see that the logs are there, or as soon as they are being kept.
-    """
+    """The user does not wait for the verdict. The result is printed; the bag is whole, and can be compared later."""
+    # The comparison takes longer than this test needs to see that the logs are there, or as soon as they are being
+    # kept.
     run = network.start("run", network.file(**changes), "--out", network.directory / "runs", "--json")
     network.wait_for(lambda: list(network.directory.glob(f"runs/*/{there}")), 60, "the end of the network")
     time.sleep(0.2 if there == "log/run.json" else 0.0)

@@ -48,11 +48,9 @@ def heard_of(file: Path) -> set[str]:
 
 @pytest.mark.timeout(150)
 def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
-    """On /diagnostics, in the log of its neighbour, and to the user; then all goes on as if nothing had been.
-
-    Meanwhile second processes of two agents, of the same run and of another one, find their names taken and leave; the
-    run says who was there.
-    """
+    """On /diagnostics, in the log of its neighbour, and to the user; then all goes on as if nothing had been."""
+    # Meanwhile second processes of two agents, of the same run and of another one, find their names taken and leave;
+    # the run says who was there.
     other = network.directory / "other.json"
     other.write_text(new_record(network.experiment(run={"duration": 100, "seed": 8})).to_json(with_key=True))
     heard, reports = network.directory / "heard", network.directory / "reports"

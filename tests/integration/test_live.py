@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from awaiting_network import BAG, failures_of, network_awaiting
 
-from msg_agents.discovery.rtps import free_domain
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.inference.pool import compare
@@ -211,20 +210,18 @@ def by_space(array: dict[str, Any], namespace: str) -> list[dict[str, Any]]:
     return [marker for marker in array["markers"] if marker["ns"] == namespace]
 
 
-def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_of_a_running_network(network: Any, domain: int) -> None:
     """The last picture is that of the last step: its links, by networkx, and its states, by the bag."""
     # In real time, a process that had to wait for the processor may step under an outdated graph, which it logs.
-    with free_domain() as domain:
-        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
-        script = PICTURES.replace("{LAST}", str(STEPS))
-        listener = subprocess.Popen([sys.executable, "-P", "-c", script], stdout=subprocess.PIPE, text=True)
-        assert listener.stdout.readline() == "ready\n"
-        markers = network.start("markers", "--replica", "2", "--frame", "lab")
-        assert "waiting for one" in markers.stderr.readline()
-        run = {"duration": STEPS * 0.05, "processes": 2, "pace": "realtime", "speed": SPEED}
-        result = network.run(network.experiment(run=run), domain=domain)
-        pictures = json.loads(listener.communicate(timeout=60)[0])
-        network.ended(markers)
+    script = PICTURES.replace("{LAST}", str(STEPS))
+    listener = subprocess.Popen([sys.executable, "-P", "-c", script], stdout=subprocess.PIPE, text=True)
+    assert listener.stdout.readline() == "ready\n"
+    markers = network.start("markers", "--replica", "2", "--frame", "lab")
+    assert "waiting for one" in markers.stderr.readline()
+    run = {"duration": STEPS * 0.05, "processes": 2, "pace": "realtime", "speed": SPEED}
+    result = network.run(network.experiment(run=run), domain=domain)
+    pictures = json.loads(listener.communicate(timeout=60)[0])
+    network.ended(markers)
     for picture in pictures:
         names = Counter((marker["ns"], marker["id"]) for marker in picture["markers"])
         assert max(names.values()) == 1
@@ -250,11 +247,9 @@ def test_pictures_of_a_running_network(network: Any, monkeypatch: pytest.MonkeyP
     assert [marker["text"] for marker in by_space(pictures[-1], "names")] == list("12345")
 
 
-def test_no_such_replica(network: Any, twin_bag: Path) -> None:
+def test_no_such_replica(network: Any, domain: int, twin_bag: Path) -> None:
     """Said once the experiment is known, which a bag that is being played keeps there."""
-    with free_domain() as domain:
-        play = network.start("play", twin_bag, "--rate", "0.1", "--domain", str(domain))
-        markers = network.start("markers", "--replica", "3", "--domain", str(domain))
-        assert "--replica: 3: expected a number from 1 to 2" in network.ended(markers, 2)[1]
-        play.terminate()
-        play.communicate(timeout=60)
+    play, markers = network.start("play", twin_bag, "--rate", "0.1"), network.start("markers", "--replica", "3")
+    assert "--replica: 3: expected a number from 1 to 2" in network.ended(markers, 2)[1]
+    play.terminate()
+    play.communicate(timeout=60)

@@ -46,11 +46,9 @@ def topics(bag: Path) -> Counter[str]:
 
 @pytest.mark.usefixtures("domain")
 def test_parameters_namespace_and_remapping(network: Any) -> None:
-    """One parameter file for all, in a namespace, one topic under another name: complete, and as the twin says.
-
-    In the bag the topic has its own name. Another network of the same domain, in a namespace of its own, is not in the
-    way, though its nodes have the same names.
-    """
+    """One parameter file for all, in a namespace, one topic under another name: complete, and as the twin says."""
+    # In the bag the topic has its own name. Another network of the same domain, in a namespace of its own, is not in
+    # the way, though its nodes have the same names.
     nodes = []
     bags = {"/lab": network.directory / "lab", "/hall": network.directory / "hall"}
     for seed, (namespace, bag) in enumerate(bags.items()):

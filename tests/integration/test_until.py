@@ -13,7 +13,7 @@ import yaml
 from networks import assert_equal_to_twin
 
 from msg_agents.recovery import StopFiles
-from msg_agents.run.result import RunResult, conclude
+from msg_agents.run.result import conclude
 from msg_agents.watch import observer as watching
 from msg_agents.watch.observer import RunObserver
 from msg_analysis.bags.reading import read_bag
@@ -40,11 +40,6 @@ def ended(result: dict[str, Any], planned: int = PLANNED) -> int:
     assert 0 < step < planned
     assert record.experiment.steps == step == record.planned_steps - (planned - step)
     return step
-
-
-def complete(result: RunResult) -> None:
-    """The run of a test in this process is complete, and equal to its twin."""
-    assert_equal_to_twin(result.trajectory)
 
 
 def says_so(network: Any, result: dict[str, Any], until: str) -> None:
@@ -124,7 +119,7 @@ def test_evidence_ends_a_run_whose_switcher_is_killed(network: Any, monkeypatch:
     monkeypatch.setattr(watching, "RunObserver", observer)
     monkeypatch.setattr(StopFiles, "decided", kill)
     result = network.run(experiment, until=Until.parse("decided"))
-    complete(result)
+    assert_equal_to_twin(result.trajectory)
     assert result.until["reason"].startswith("evidence against the prediction passed 100 at step ")
     assert result.until["ended_early"]
     assert [result.until["step"]] == announced == [result.trajectory.record.experiment.steps]
@@ -182,7 +177,7 @@ def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch, error: Ex
     four_seconds = {"pace": "realtime", "duration": 40, "speed": 10.0}  # the errors are looked at once a second
     experiment = network.experiment(run=four_seconds | {"processes": 2})
     result = network.run(experiment, until=Until(0.5), on_note=notes.append)
-    complete(result)
+    assert_equal_to_twin(result.trajectory)
     assert len(result.trajectory.modes) == 800
     assert not result.until["ended_early"]
     assert result.until["reason"].startswith(
@@ -195,6 +190,6 @@ def test_too_late(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """In 40 steps, agents can be at the end before they know of an earlier one: the run stays whole."""
     monkeypatch.setattr(online_errors, "reached", lambda *_: "precision 50 % reached at step 1")
     result = network.run(network.experiment(run={"duration": 2}), until=Until(0.5))
-    complete(result)
+    assert_equal_to_twin(result.trajectory)
     assert len(result.trajectory.modes) == 40
     assert not result.until["ended_early"]

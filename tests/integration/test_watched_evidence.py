@@ -11,7 +11,6 @@ from tests.support.watched_run import whole_sums
 from msg_agents.watch import observer as watching
 from msg_agents.watch.observer import RunObserver
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import Until
 from msg_analysis.theory.prediction import predict
 
@@ -35,11 +34,6 @@ agent_law.ProcessNoise = Noisy
 """
 
 
-def evidence_of(trajectory: Run) -> float:
-    """Of the comparison, without departures."""
-    return whole_sums(trajectory, predict(trajectory.record.experiment, trajectory.record.step_model)).evidence()
-
-
 @pytest.mark.parametrize("law", LAWS)
 def test_watchers_have_the_evidence_of_the_comparison(
     network: Any, domain: int, law: str, monkeypatch: pytest.MonkeyPatch
@@ -56,7 +50,8 @@ def test_watchers_have_the_evidence_of_the_comparison(
     experiment = network.experiment(**changes | {"run": {"duration": 10, "processes": 2} | changes.get("run", {})})
     result = network.run(experiment, until=Until(0.001))
     assert (result.failures, result.until["ended_early"]) == ([], False)
-    wanted = evidence_of(result.trajectory)
+    record = result.trajectory.record
+    wanted = whole_sums(result.trajectory, predict(record.experiment, record.step_model)).evidence()
     report = observers[0].report
     assert observers[0]._reader.missed == 0
     assert report.any_time.log_evidence == pytest.approx(wanted, abs=1e-7)

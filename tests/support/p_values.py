@@ -25,11 +25,9 @@ def kolmogorov_smirnov(name: str, p: Sequence[float]) -> float:
 
 
 def assert_calibrated(results: Sequence[Comparison]) -> None:
-    """Of correct runs: p-values are even, intervals cover, verdicts agree.
-
-    Kolmogorov-Smirnov at 2e-4 for each of at most 20 tests, coverage and verdicts at 1e-4 by the binomial law: a right
-    program fails with probability below 0.5 %.
-    """
+    """Of correct runs: p-values are even, intervals cover, verdicts agree."""
+    # Kolmogorov-Smirnov at 2e-4 for each of at most 20 tests, coverage and verdicts at 1e-4 by the binomial law: a
+    # right program fails with probability below 0.5 %.
     for name in [test.name for test in results[0].tests]:
         p = [test.p for result in results for test in result.tests if test.name == name]
         assert kolmogorov_smirnov(name, p) > 2e-4, name

@@ -154,11 +154,10 @@ def steps_by_hand(observation):
 
 
 def by_hand(observation):
-    """Mean given the path, and sum of the covariances given the states, of the time means of the node errors.
-
-    E[sum | x(k+1)] is a quadratic function of x(k+1) = W x + B v: with c + b.v + v^T A v in the noise v of a step, the
-    covariance of two of these is b.b' + 2 tr(A A'). Its matrix is the sum of P^T H P over products P of later steps.
-    """
+    """Mean given the path, and sum of the covariances given the states, of the time means of the node errors."""
+    # E[sum | x(k+1)] is a quadratic function of x(k+1) = W x + B v: with c + b.v + v^T A v in the noise v of a step,
+    # the covariance of two of these is b.b' + 2 tr(A A'). Its matrix is the sum of P^T H P over products P of later
+    # steps.
     m, steps, replicas = 3, observation.steps, observation.replicas
     law = steps_by_hand(observation)
     consensus = observation.prediction.experiment.problem == "consensus"

@@ -47,12 +47,10 @@ def made_late(case, timing="all"):
 
 
 def written_out(observation):
-    """Expectation and covariance of the time means of x x^T (consensus: less the agents' mean), entry by entry.
-
-    Returns the mean (m, m) and the covariance of its m (m + 1) / 2 entries i >= j. Where every agent has its own noise,
-    the covariance is the sum over the periods of what the noise of the period adds, given the noise before it; else its
-    expectation.
-    """
+    """Expectation and covariance of the time means of x x^T (consensus: less the agents' mean), entry by entry."""
+    # Returns the mean (m, m) and the covariance of its m (m + 1) / 2 entries i >= j. Where every agent has its own
+    # noise, the covariance is the sum over the periods of what the noise of the period adds, given the noise before it;
+    # else its expectation.
     (steps, m), replicas = observation.timers.graphs.shape, observation.replicas
     unrolled = Unrolled(observation, replicas)
     x, b = np.split(unrolled.sampled, [replicas], axis=2)

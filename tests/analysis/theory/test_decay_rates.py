@@ -79,11 +79,10 @@ def bisected(function: Callable[[mpmath.mpf], mpmath.mpf]) -> mpmath.mpf:
 @pytest.mark.parametrize("agents", [5, 10, 20])
 @pytest.mark.parametrize("heard", [1e-3, 1e-9, 1e-13])
 def test_right_or_not_given(agents: int, heard: float) -> None:
-    """A chain whose last agent is heard by the first, hardly; of 20, the second moments are iterated.
-
-    With x = 1 - rate, the determinant is x^agents + heard (x^(agents - 1) - 1). The slowest rate belongs to the largest
-    eigenvalue x, which is real and positive (Perron), and there is only one of these (Descartes): in 60 digits.
-    """
+    """A chain whose last agent is heard by the first, hardly; of 20, the second moments are iterated."""
+    # With x = 1 - rate, the determinant is x^agents + heard (x^(agents - 1) - 1). The slowest rate belongs to the
+    # largest eigenvalue x, which is real and positive (Perron), and there is only one of these (Descartes): in 60
+    # digits.
     arcs = [*chain(agents), [agents, 1, heard]]
     rates = asymptotic_rates(systems.continuous(network(arcs, "tracking")))
     with mpmath.workdps(60):
