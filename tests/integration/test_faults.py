@@ -170,9 +170,6 @@ def test_a_killed_runner_takes_everybody_along(network: Any) -> None:
     assert check(trajectory).difference is None
 
 
-PAUSE = 10.0  # s
-
-
 @pytest.mark.timeout(150)
 def test_stopped_recorder(network: Any, repetition: int, rng: random.Random) -> None:
     """At full speed everybody waits for it in the end, and nothing is lost."""
@@ -182,7 +179,7 @@ def test_stopped_recorder(network: Any, repetition: int, rng: random.Random) -> 
     time.sleep(rng.uniform(0.0, 1.0))
     (recorder,) = network.processes("recorder")
     recorder.kill(signal.SIGSTOP)
-    time.sleep(PAUSE)
+    time.sleep(10.0)
     recorder.kill(signal.SIGCONT)
     assert network.completed(run)["restarts"] == []
 
