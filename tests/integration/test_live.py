@@ -5,7 +5,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -206,10 +206,6 @@ print(json.dumps([plain(array) for array in found]))
 STEPS, SPEED = 400, 5  # 4 s: long enough to be found by who watches
 
 
-def by_space(array: dict[str, Any], namespace: str) -> list[dict[str, Any]]:
-    return [marker for marker in array["markers"] if marker["ns"] == namespace]
-
-
 def test_pictures_of_a_running_network(network: Any, domain: int) -> None:
     """The last picture is that of the last step: its links, by networkx, and its states, by the bag."""
     # In real time, a process that had to wait for the processor may step under an outdated graph, which it logs.
@@ -228,7 +224,10 @@ def test_pictures_of_a_running_network(network: Any, domain: int) -> None:
         assert {marker["header"]["frame_id"] for marker in picture["markers"]} == {"lab"}
         assert all(marker["pose"]["orientation"]["w"] == 1.0 for marker in picture["markers"])
         assert all(min(marker["scale"].values()) > 0 for marker in picture["markers"])
-    (agents,), (links,), (title,) = (by_space(pictures[-1], name) for name in ("agents", "links", "title"))
+    by_space: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for marker in pictures[-1]["markers"]:
+        by_space[marker["ns"]].append(marker)
+    (agents,), (links,), (title,) = (by_space[name] for name in ("agents", "links", "title"))
     trajectory = result.trajectory
     modes = trajectory.agent_modes[-1].tolist()
     assert title["text"] == f"net  step {STEPS}  t = 20  {('line', 'ring')[modes[0]]}"
@@ -244,7 +243,7 @@ def test_pictures_of_a_running_network(network: Any, domain: int) -> None:
     redness = np.array([colour["r"] - colour["b"] for colour in agents["colors"]])
     assert all((redness > 0.0) == (deviation > 0)) or abs(deviation).min() < 1e-3
     assert np.all(np.diff(redness[np.argsort(deviation)]) >= 0)
-    assert [marker["text"] for marker in by_space(pictures[-1], "names")] == list("12345")
+    assert [marker["text"] for marker in by_space["names"]] == list("12345")
 
 
 def test_no_such_replica(network: Any, domain: int, twin_bag: Path) -> None:
@@ -252,4 +251,4 @@ def test_no_such_replica(network: Any, domain: int, twin_bag: Path) -> None:
     play, markers = network.start("play", twin_bag, "--rate", "0.1"), network.start("markers", "--replica", "3")
     assert "--replica: 3: expected a number from 1 to 2" in network.ended(markers, 2)[1]
     play.terminate()
-    play.communicate(timeout=60)
+    play.wait(60)

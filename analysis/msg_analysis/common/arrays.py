@@ -15,6 +15,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from msg_analysis.errors import InputError
+
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
@@ -29,7 +31,12 @@ SMALL_BLOCK = 200_000  # the same where there are several such arrays: they stay
 
 
 def _large() -> int:
-    return int(os.environ.get(LARGE_VARIABLE, LARGE))
+    value = os.environ.get(LARGE_VARIABLE, str(LARGE))
+    try:
+        return int(value)
+    except ValueError:
+        wanted = f"expected a number of bytes: unset it, or give {LARGE} for example"
+        raise InputError(f"{LARGE_VARIABLE}: {value}: {wanted}") from None
 
 
 def large_zeros(shape: tuple[int, ...], dtype: Any, *, total: int) -> AnyArray:

@@ -36,6 +36,9 @@ def test_large_ones_keep_their_numbers(tmp_path: Path, monkeypatch: pytest.Monke
     release(view)
     assert np.array_equal(array, np.arange(40_000).reshape(1000, 40))
     assert not in_file(large_zeros((0, 40), np.float64, total=LARGE))
+    monkeypatch.setenv("MSG_ANALYSIS_LARGE", "much")
+    with pytest.raises(ValueError, match="MSG_ANALYSIS_LARGE: much: expected a number of bytes"):
+        large_zeros((1000, 40), np.float64, total=LARGE)
 
 
 def test_released_memory_is_free() -> None:
@@ -66,7 +69,7 @@ def test_a_run_that_is_read_into_files(
     run.states[1500, 1] = np.nan
     write_trajectory(run, tmp_path / "bag")
     one = read_bag(tmp_path / "bag")
-    monkeypatch.setattr(arrays, "LARGE", 1)
+    monkeypatch.setenv("MSG_ANALYSIS_LARGE", "1")
     monkeypatch.setattr(states, "RELEASED_AT_ONCE", 100)
     monkeypatch.setattr(states, "_CELLS", 7)
     other = read_bag(tmp_path / "bag")
