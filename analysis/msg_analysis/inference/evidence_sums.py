@@ -18,7 +18,7 @@ from msg_analysis.inference.e_values import Analyses, log_mean, log_means, log_s
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.question import Block, Diagnostic, Finding, Law, RunningSums
 from msg_analysis.inference.questions import QUESTIONS, evidence_weights
-from msg_analysis.inference.received_values import NO_NOISE, ReceivedValues, process_noise
+from msg_analysis.inference.received_values import NO_NOISE, ReceivedValues, RepeatedNoise, process_noise
 from msg_analysis.inference.residuals import QUIET_ROUNDING, residuals
 from msg_analysis.inference.statistics import simultaneous_half_width
 from msg_analysis.inference.system_error import ErrorMartingale
@@ -44,6 +44,9 @@ class EvidenceSums:
         self._independent = independent = not (noise.link and (step.holds or real_time))
         self._process = np.array([process_noise(step, np.full(m, g)) for g in range(step.modes)])  # (n, m, m)
         variances = np.diagonal(self._process, axis1=1, axis2=2)
+        # With a delay, the message with x(0) is used in several steps.
+        again = noise.link and step.delay and independent
+        self.repeated = RepeatedNoise(step, replicas, realtime=False) if again else None
         self._floor = NO_NOISE * float(variances.max(initial=0.0))
         noisy = np.asarray((variances > self._floor).all(axis=0) & independent)
         correlated = bool((self._process * ~np.eye(m, dtype=bool)).any())
@@ -101,7 +104,8 @@ class EvidenceSums:
             block = self._block(parts, analyses, observation, first, last, received)
             if not quadratic:
                 lost = None if observation.lost is None else observation.lost[first:last]
-                self._add_received(parts, analyses, block.reception, block.white, block.scale, lost)
+                decided = np.arange(first, last) >= self._step.sure_messages
+                self._add_received(parts, analyses, block.reception, block.white, block.scale, lost, decided)
             found = {each.name: each.add(block) for each in self.diagnostics}
         graphs = observation.modes[first : last + 1]
         now, following = graphs[:-1], graphs[1:]
@@ -141,12 +145,17 @@ class EvidenceSums:
             parts.broadcast_samples += analyses.lengths * added.shape[2]
             parts.broadcast_squares += analyses.sums((added**2).sum(axis=2)) / self._noise.broadcast**2
 
-    def add_received(self, reception: ReceivedValues, e: FloatArray, lost: BoolArray | None, largest: float) -> None:
-        """Add steps, in any order: residuals (b, m, R), lost messages (b, m, D), and size of the ``largest`` state."""
+    def add_received(
+        self, reception: ReceivedValues, e: FloatArray, lost: BoolArray | None, decided: BoolArray, largest: float
+    ) -> None:
+        """Add steps, in any order: residuals (b, m, R), and lost messages (b, m, D), of the ``decided`` (b,) steps.
+
+        ``largest``: size of the largest state.
+        """
         # Of a step with an infinite ``link_variance``, the agent is left out.
         analyses = Analyses(np.array([len(e)]))
         scale = self._scales(self.total, analyses, reception, e, largest)
-        self._add_received(self.total, analyses, reception, e / scale[:, :, None], scale, lost)
+        self._add_received(self.total, analyses, reception, e / scale[:, :, None], scale, lost, decided)
 
     def _near(self, states: FloatArray) -> bool:
         """Whether states are so near to each other, or to the reference, that squares lose nothing that counts."""
@@ -215,6 +224,8 @@ class EvidenceSums:
         """The steps, with their residuals over the standard deviations, by what was received."""
         reception = received[0] if received else ReceivedValues.of(observation, first, last)
         e = received[1] if received else residuals(observation, first, last, reception)
+        if self.repeated:
+            e, reception = self.repeated.free(first, e, reception)
         scale = self._scales(parts, analyses, reception, e, observation.largest)
         graphs, after = observation.modes[first : last + 1], observation.states[first + 1 : last + 1]
         return Block(first, graphs, e / scale[:, :, None], scale, after, reception, analyses)
@@ -239,6 +250,7 @@ class EvidenceSums:
         white: FloatArray,
         scale: FloatArray,
         lost: BoolArray | None,
+        decided: BoolArray,
     ) -> None:
         """Noise, pairs, and of gains and losses the regressors, over the standard deviation of the noise."""
         parts.samples += analyses.counts(np.where(np.isinf(scale), 0, white.shape[2]))
@@ -268,8 +280,9 @@ class EvidenceSums:
             np.add.at(parts.link_score.reshape(-1), place, (part * white).sum(axis=2)[there])
             np.add.at(parts.link_information.reshape(-1), place, (part**2).sum(axis=2)[there])
             if lost is not None and len(self._law.lossy):
-                np.add.at(parts.messages.reshape(-1), place, 1)
-                np.add.at(parts.lost.reshape(-1), place, lost[:, :, d][there])
+                counted = decided[np.nonzero(there)[0]]
+                np.add.at(parts.messages.reshape(-1), place[counted], 1)
+                np.add.at(parts.lost.reshape(-1), place[counted], lost[:, :, d][there][counted])
         if self._law.apart:
             parts.common_score += analyses.sums((common * white).sum(axis=(1, 2)))
             parts.common_information += analyses.sums((common**2).sum(axis=(1, 2)))

@@ -33,7 +33,7 @@ class Measurement:
     covariance: FloatArray  # (m, m): mean over steps and replicas of the products of the agents' deviations
     modes: IntArray  # (N,) g(0..N-1)
     lost: BoolArray | None  # (N, m, D) see ``Run.lost``
-    sure_messages: int  # see ``Observation.sure_messages``
+    sure_messages: int  # see ``StepModel.sure_messages``
     block_numbers: int = BLOCK_NUMBERS  # see ``Observation.block_numbers``
 
     @classmethod
@@ -176,8 +176,8 @@ class Observation:
 
     @property
     def sure_messages(self) -> int:
-        """Steps at the beginning whose messages say nothing about losses."""
-        return self.step.delay + (1 if self.step.holds else 0)
+        """See ``StepModel.sure_messages``."""
+        return self.step.sure_messages
 
     @cached_property
     def largest(self) -> float:

@@ -195,6 +195,10 @@ class ReceivedEvidence(EvidenceWatch):
         self._largest = 0.0
         self._length = max(1, BLOCK_NUMBERS // self.sums.numbers_per_step)
         self._path = NetworkPath()
+        self._repeated = self.sums.repeated
+        # Steps before this one use a message again; the next of them, None if one is missing or there are none.
+        self._again = self._repeated.end or 0 if self._repeated else 0
+        self._turn = 0 if self._again else None
 
     def add(self, logged: LoggedStates) -> None:
         """Add whole steps."""
@@ -233,8 +237,14 @@ class ReceivedEvidence(EvidenceWatch):
             after = (part + 1) % self._kept
             used = self._used[after]
             known = (used < 0) | (label[used % self._kept] == used)
-            ready: BoolArray = known.all(axis=(1, 2)) | (part < newest - self._timeout)
-            self._add_steps(part[ready], known[ready].all(axis=2))
+            late = part < newest - self._timeout
+            ready: BoolArray = known.all(axis=(1, 2)) | late
+            early = part < self._again
+            if self._turn is not None:  # one after the other
+                in_turn = np.logical_and.accumulate(ready & (part == self._turn + np.arange(len(part))))
+                ready &= ~early | in_turn | late
+            for chosen in (ready & early, ready & ~early):
+                self._add_steps(part[chosen], known[chosen].all(axis=2))
         if self._realtime:
             graphs, following, count = self._path.passed(min(self._newest, self._end) - 1)
             self.sums.add_transitions(np.repeat(graphs, count), np.repeat(following, count))
@@ -257,12 +267,30 @@ class ReceivedEvidence(EvidenceWatch):
             agents = np.tile(np.arange(step.agents), len(steps))
             flat = np.repeat(steps + 1, step.agents), graphs.reshape(-1) + 1, agents
             lost = self._inputs.lost(*flat, used.reshape(len(agents), -1)).reshape(used.shape)
-        self.sums.add_received(reception, received_residuals(step, reception, self._states[after]), lost, self._largest)
+        e = received_residuals(step, reception, self._states[after])
+        if steps[0] < self._again:
+            e, reception = self._freed(steps, known, e, reception)
+        self.sums.add_received(reception, e, lost, steps >= step.sure_messages, self._largest)
         self.sums.add_broadcast(self._published[place] - now)
         self._done[place] = True
         self.count += len(steps)
         if not self._realtime:
             self._add_graphs(steps, graphs[:, 0])
+
+    def _freed(
+        self, steps: IntArray, known: BoolArray, e: FloatArray, reception: ReceivedValues
+    ) -> tuple[FloatArray, ReceivedValues]:
+        """Residuals of the first steps, less what earlier ones say of the noise in them; left out if one is missing."""
+        if (
+            not self._repeated
+            or self._turn is None
+            or not known.all()
+            or (steps != self._turn + np.arange(len(steps))).any()
+        ):
+            self._turn = None
+            return e, replace(reception, link_variance=np.full_like(reception.link_variance, np.inf))
+        self._turn += len(steps)
+        return self._repeated.free(int(steps[0]), e, reception)
 
     def _add_graphs(self, steps: IntArray, graphs: IntArray) -> None:
         """In lockstep: count the transitions between these steps, which are done now, and those next to them."""

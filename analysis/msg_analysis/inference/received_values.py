@@ -204,14 +204,16 @@ NEVER = -2
 class RepeatedNoise:
     """Frees the residuals, block after block, of what earlier ones say about the noise in them.
 
-    The noise of a link belongs to the message: used again, because a newer one was lost or late, it is the same. The
-    noises of an agent's newest messages are a Gaussian vector, of which every step observes one combination, w^T noise
-    + process noise: a Kalman filter. Exact where the process noise of the agents is independent.
+    The noise of a link belongs to the message: used again, because a newer one was lost or late, it is the same; with a
+    delay d, that of x(0) is used in the steps 0..d. The noises of an agent's newest messages are a Gaussian vector, of
+    which every step observes one combination, w^T noise + process noise: a Kalman filter. Exact for each agent; for all
+    together where their process noise is independent.
     """
 
-    def __init__(self, observation: Observation) -> None:
-        self._step = step = observation.step
-        m, replicas = step.agents, observation.replicas
+    def __init__(self, step: StepModel, replicas: int, *, realtime: bool) -> None:
+        m = step.agents
+        # From this step on, every message is used once.
+        self.end = None if realtime or step.holds else step.delay + 1
         listens = step.listens()
         most = int(listens.sum(axis=1).max(initial=1)) or 1
         places = np.cumsum(listens, axis=1) - 1  # (m, m) place of a sender among all that an agent ever receives
@@ -224,16 +226,22 @@ class RepeatedNoise:
     @classmethod
     def of(cls, observation: Observation) -> RepeatedNoise | None:
         """None where there is no link noise, or no message is used again."""
-        kept = observation.timers is not None or observation.used is not None
-        return cls(observation) if observation.step.link and kept else None
+        step, realtime = observation.step, observation.timers is not None
+        if not step.link or not (realtime or step.holds or step.delay):
+            return None
+        return cls(step, observation.replicas, realtime=realtime)
 
-    def free(self, residuals: FloatArray, reception: ReceivedValues) -> tuple[FloatArray, FloatArray]:
-        """Residuals (b, m, R) less what is known of them, and the variance (b, m) of the link noise that is not."""
-        found, variances = np.empty_like(residuals), np.empty(reception.link_variance.shape)
+    def free(self, first: int, residuals: FloatArray, reception: ReceivedValues) -> tuple[FloatArray, ReceivedValues]:
+        """Residuals (b, m, R) of the next steps, from ``first`` on, less what is known of them.
+
+        With them, the reception with the variance (b, m) of the link noise that is not known.
+        """
+        count = len(residuals) if self.end is None else min(max(self.end - first, 0), len(residuals))
+        found, variances = residuals.copy(), reception.link_variance.copy()
         agents = np.arange(residuals.shape[1])[:, None]
         places = self._place[reception.graphs, agents.T]  # (b, m, D)
         process = self._process[reception.graphs, agents.T]
-        for k, e in enumerate(residuals):
+        for k, e in enumerate(residuals[:count]):
             there = reception.weights[k] != 0.0
             self._renew(reception.used[k], places[k], there)
             weights = np.zeros(self._message.shape)
@@ -247,7 +255,7 @@ class RepeatedNoise:
             gain = np.divide(across, total[:, None], out=np.zeros_like(across), where=total[:, None] > 0.0)
             self._mean += gain[:, :, None] * found[k][:, None]
             self._covariance -= gain[:, :, None] * across[:, None]
-        return found, variances
+        return found, replace(reception, link_variance=variances)
 
     def _renew(self, used: IntArray, places: IntArray, there: BoolArray) -> None:
         """Forget the noise of messages that newer ones have replaced."""

@@ -10,7 +10,7 @@ values that the agents received (``received_values``), for any timing. See docs/
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING
 
@@ -169,8 +169,7 @@ class ResidualSums:
                 if follower:
                     follower.add(observation, first, last, (reception, e))
                 if self._repeated:
-                    e, link_variance = self._repeated.free(e, reception)
-                    reception = replace(reception, link_variance=link_variance)
+                    e, reception = self._repeated.free(first, e, reception)
                 regression.add(reception, e, first)
                 if self._equalizer:
                     e = self._equalizer.equalize(e, reception)
