@@ -145,7 +145,8 @@ def test_innovations_are_freed_of_noise_that_is_known(case):
     parts, repeated = [], RepeatedNoise.of(observation)
     for first in range(0, steps, 7):  # in blocks
         piece = ReceivedValues.of(observation, first, min(first + 7, steps))
-        parts.append(repeated.free(e[first : first + 7], piece))
+        some, piece = repeated.free(first, e[first : first + 7], piece)
+        parts.append((some, piece.link_variance))
     freed, variances = (np.concatenate(part) for part in zip(*parts, strict=True))
     for i in range(step.agents):
         covariance = step.dt * np.eye(steps)
