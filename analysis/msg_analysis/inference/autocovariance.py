@@ -39,7 +39,7 @@ MOST_WINDOW = 4096  # steps, of Welch's method
 class LoggedAutocovariance:
     """Measured autocovariances of the system error, R(l) = E[e(k + l) . e(k)], and their test."""
 
-    steps: int  # that were used, from the beginning of the run
+    steps: int  # that were used, from the beginning of the run; with a delay and noisy messages, from step d + 1 on
     times: FloatArray  # (L,) lags [units of simulated time]
     predicted: FloatArray  # (L,)
     measured: FloatArray  # (L,)
@@ -106,9 +106,15 @@ def why_not_tested(observation: Observation) -> str | None:
         return "agents keep values from step to step"
     if observation.step.delay and observation.step.loss:
         return "messages are lost and come later"
-    if observation.steps < LEAST_STEPS:
-        return f"{observation.steps} steps are too few: at least {LEAST_STEPS} are needed"
+    if (steps := observation.steps - _first_step(observation)) < LEAST_STEPS:
+        return f"{steps} steps are too few: at least {LEAST_STEPS} are needed"
     return None
+
+
+def _first_step(observation: Observation) -> int:
+    """The first step whose noise is new: until step d, the message with x(0) is used again, with the same noise."""
+    noise = observation.prediction.experiment.noise
+    return noise.delay + 1 if noise.delay and noise.on_air else 0
 
 
 def logged_autocovariance(
@@ -126,11 +132,12 @@ def logged_autocovariance(
     system, replicas = observation.prediction.system, observation.replicas
     chosen = _chosen_lags(observation) if lags is None else np.asarray(lags)
     d = system.dimension
-    steps = min(observation.steps, int(most_numbers / max(1, len(chosen) * d * max(d, replicas))))
+    first = _first_step(observation)
+    steps = min(observation.steps - first, int(most_numbers / max(1, len(chosen) * d * max(d, replicas))))
     chosen = chosen[chosen < steps]
-    kinds = kinds[0][:steps], kinds[1], kinds[2]
+    kinds = kinds[0][first : first + steps], kinds[1], kinds[2]
     which, matrices, noise = kinds
-    y, product = _coordinates(observation, steps)
+    y, product = _coordinates(observation, first, steps)
     seen = y if product is None else y @ product
     along = matrices[which]  # (N, d, d) W_k
     forms = np.zeros((steps + 1, d, len(chosen), d))
@@ -166,11 +173,11 @@ def logged_autocovariance(
     )
 
 
-def _coordinates(observation: Observation, steps: int) -> tuple[FloatArray, FloatArray | None]:
-    """(N + 1, R, d) y, and (d, d) C^T C of the errors e = C y; None where that is the identity."""
+def _coordinates(observation: Observation, first: int, steps: int) -> tuple[FloatArray, FloatArray | None]:
+    """(N + 1, R, d) y from a step on, and (d, d) C^T C of the errors e = C y; None where that is the identity."""
     system, delay = observation.prediction.system, observation.step.delay
-    deviations = observation.states[: steps + 1] - observation.step.reference
-    times = np.arange(steps + 1)[:, None] - np.arange(delay + 1)
+    deviations = observation.states[: first + steps + 1] - observation.step.reference
+    times = np.arange(first, first + steps + 1)[:, None] - np.arange(delay + 1)
     stacked = deviations[np.maximum(times, 0)]  # (N + 1, delay + 1, m, R): what was before the start is as the start
     y = np.einsum("ksr,sd->krd", stacked.reshape(steps + 1, -1, observation.replicas), system.lift)
     product = None if system.readout is None else system.readout.T @ system.readout
