@@ -70,7 +70,7 @@ def test_many_states_of_one_path(noise: dict[str, Any]) -> None:
     [
         {"process": 1.0},
         {"process": 1.0, "loss": 0.2, "broadcast": 0.3},
-        {"process": 0.3, "delay": 20, "link": 1.0, "broadcast": 0.3},
+        {"process": 0.3, "delay": 6, "link": 2.0, "broadcast": 0.3},
     ],
 )
 def test_p_values_of_correct_runs_are_uniform(noise: dict[str, Any]) -> None:
