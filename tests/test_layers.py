@@ -4,8 +4,6 @@ A chapter is a folder of a package, or a module beside them. Imports that run wh
 those in functions and those for type checkers alone are free.
 """
 
-from __future__ import annotations
-
 import ast
 import functools
 import graphlib

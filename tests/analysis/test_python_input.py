@@ -1,7 +1,5 @@
 """What Python may give as an experiment: arrays, graphs of other libraries, names of agents, other values."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

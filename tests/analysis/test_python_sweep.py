@@ -1,7 +1,5 @@
 """Sweeps from Python, and assert_agrees for tests of other packages."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

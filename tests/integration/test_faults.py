@@ -22,6 +22,7 @@ from msg_analysis.twin.check import check
 
 # 20,000 steps: no test waits for them; of states that are soon seen in the bag
 LONG = {"duration": 1000, "replicas": 16, "processes": 2}
+NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 THIRTY = [*range(1, 31)]
 LARGE = {
     "graphs": {"line": {"path": THIRTY}, "ring": {"cycle": THIRTY}},
@@ -71,9 +72,6 @@ def kill_and_see(network: Any, run: subprocess.Popen[str], victim: Any, *, early
     assert not trajectory.completeness.complete
     assert early or trajectory.completeness.received > 0
     assert check(trajectory).difference is None
-
-
-NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 
 
 def test_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:

@@ -59,8 +59,8 @@ def test_interrupted_again_and_again(network: Any, domain: int) -> None:
 
 def test_alone(network: Any, domain: int, record: Path) -> None:
     """Nobody comes: exit code 2 (something is wrong with what was started), naming everyone who is missing."""
-    command = ("agent", record, "--agent", "1", "--await", "recorder", "--discovery-timeout", "3")
-    stdout, stderr = network.ended(network.start(*command), 2)
+    options = ("--agent", "1", "--await", "recorder", "--discovery-timeout", "3")
+    stdout, stderr = network.ended(network.start("agent", record, *options), 2)
     assert stdout == ""
     error = re.search(r"^error: after 3 s (.*) did not discover: (.*?)\. Are they running", stderr, re.MULTILINE)
     assert error, stderr

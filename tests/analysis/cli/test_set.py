@@ -1,7 +1,5 @@
 """``--set KEY=VALUE`` of the commands that take an experiment."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

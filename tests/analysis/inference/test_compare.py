@@ -1,6 +1,3 @@
-# SPDX-FileCopyrightText: 2026 msg_agents contributors
-# SPDX-License-Identifier: Apache-2.0
-
 """The verdict: calibrated on twins that follow their law, powerful against others; which errors it trusts."""
 
 import dataclasses
