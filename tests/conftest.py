@@ -38,7 +38,6 @@ WAITING = 0.6
 """Part of the time of all tests that those which wait take: of so many workers, they are the first tests."""
 
 TESTS = Path(__file__).parent
-
 MACHINE = "this machine: "
 """How the reason of a skipped test begins if nothing that can be installed would help."""
 

@@ -64,7 +64,7 @@ def test_theory() -> None:
     prediction = LINE_RING.predict()
     assert prediction.emulated.covariance.shape == (5, 5)
     for law in ("emulated", "continuous"):
-        moments, course = getattr(prediction, law), LINE_RING.transient([0, 1, 2.5], law=law)  # type: ignore[arg-type]
+        moments, course = getattr(prediction, law), LINE_RING.transient([0, 1, 2.5], law=law)
         for key in ("system_error", "system_certainty", "node_errors", "node_certainty"):
             np.testing.assert_allclose(getattr(moments, key), NUMBERS[law][key], rtol=1e-8)
         np.testing.assert_allclose(course.times, [0, 1, 2.5])

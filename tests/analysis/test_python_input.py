@@ -150,7 +150,7 @@ def test_other_values() -> None:
     assert base.with_noise(process=np.ones(3), loss=0.1).noise.process == [1.0, 1.0, 1.0]
     led = base.with_leaders("west", 1, gain=2.0)
     assert (led.problem, led.spec.leaders and led.spec.leaders.agents) == ("tracking", [3, 1])
-    assert led.with_leaders(reference=3.0).spec.leaders == led.spec.leaders.model_copy(update={"reference": 3.0})  # type: ignore[union-attr]
+    assert led.with_leaders(reference=3.0).spec.leaders == led.spec.leaders.model_copy(update={"reference": 3.0})
     assert led.with_leaders() == base
     two = base.with_graphs({"a": WEIGHTED, "b": {"cycle": NAMES}}, switching={"rates": {"a": {"b": 1}, "b": {"a": 1}}})
     assert [graph.name for graph in two.graph_list] == ["a", "b"]
@@ -187,7 +187,7 @@ def test_agents_count_from_1() -> None:
     np.testing.assert_array_equal([line.get_ydata() for line in drawn], run.states[:, [2, 0], 0].T)
     for wrong in ("east", 0, 4, -1, 1.5, "1"):
         with pytest.raises(InputError, match=r"agents: .*expected numbers from 1 to 3, or one of the names"):
-            experiment.indices([wrong])  # type: ignore[list-item]
+            experiment.indices([wrong])
 
 
 def test_errors_speak_of_arguments() -> None:

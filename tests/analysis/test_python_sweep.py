@@ -26,7 +26,7 @@ def test_predictions_are_those_of_the_experiments() -> None:
     assert repr(found) == "<Sweep of 'line_ring' over switching.scale, noise.process: 4 points, predict>"
     axes = found.plot("emulated.system_error").axes[0]
     assert [line.get_xdata().tolist() for line in axes.lines[::2]] == [scales.tolist()] * 2
-    assert found.plot()._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
+    assert found.plot()._repr_png_().startswith(b"\x89PNG")
 
 
 def test_runs_are_those_of_the_command(tmp_path: Path) -> None:

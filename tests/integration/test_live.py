@@ -5,7 +5,7 @@ import re
 import signal
 import subprocess
 import sys
-from collections import Counter, defaultdict
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -224,10 +224,8 @@ def test_pictures_of_a_running_network(network: Any, domain: int) -> None:
         assert {marker["header"]["frame_id"] for marker in picture["markers"]} == {"lab"}
         assert all(marker["pose"]["orientation"]["w"] == 1.0 for marker in picture["markers"])
         assert all(min(marker["scale"].values()) > 0 for marker in picture["markers"])
-    by_space: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for marker in pictures[-1]["markers"]:
-        by_space[marker["ns"]].append(marker)
-    (agents,), (links,), (title,) = (by_space[name] for name in ("agents", "links", "title"))
+    spaces = ("agents", "links", "title", "names")
+    (agents,), (links,), (title,), names = ([m for m in pictures[-1]["markers"] if m["ns"] == name] for name in spaces)
     trajectory = result.trajectory
     modes = trajectory.agent_modes[-1].tolist()
     assert title["text"] == f"net  step {STEPS}  t = 20  {('line', 'ring')[modes[0]]}"
@@ -243,7 +241,7 @@ def test_pictures_of_a_running_network(network: Any, domain: int) -> None:
     redness = np.array([colour["r"] - colour["b"] for colour in agents["colors"]])
     assert all((redness > 0.0) == (deviation > 0)) or abs(deviation).min() < 1e-3
     assert np.all(np.diff(redness[np.argsort(deviation)]) >= 0)
-    assert [marker["text"] for marker in by_space["names"]] == list("12345")
+    assert [marker["text"] for marker in names] == list("12345")
 
 
 def test_no_such_replica(network: Any, domain: int, twin_bag: Path) -> None:

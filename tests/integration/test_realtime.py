@@ -13,8 +13,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -67,16 +65,6 @@ def assert_possible(trajectory: Run) -> None:
     assert not np.isnan(trajectory.states).any()
 
 
-@contextmanager
-def clock(domain: int) -> Iterator[None]:
-    process = subprocess.Popen([sys.executable, "-P", "-c", CLOCK], env=node_environment(domain))
-    try:
-        yield
-    finally:
-        process.kill()
-        process.wait()
-
-
 def test_one_process_per_agent(network: Any) -> None:
     """The verdict is one that a right run misses once in 10,000 times."""
     result = network.run(network.experiment(run={**UNDISTURBED, "processes": "one_per_agent"}))
@@ -119,7 +107,8 @@ def test_under_a_clock_of_somebody_else(network: Any) -> None:
     """All stamps are ticks of that clock, but for the nanoseconds by which what comes out of something is later."""
     speed = 2.5
     what = network.experiment(run={**REALTIME, "speed": speed, "duration": 12, "processes": 2})
-    with free_domain() as domain, clock(domain):
+    with free_domain() as domain, started_processes() as started:
+        started.append(subprocess.Popen([sys.executable, "-P", "-c", CLOCK], env=node_environment(domain)))
         result = network.run(what, domain=domain, use_sim_time=True)
     assert_possible(result.trajectory)
     assert (result.trajectory.made % round(TICK * speed) < 10_000).all()

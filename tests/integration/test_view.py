@@ -19,7 +19,7 @@ HIDE_CURSOR, SHOW_CURSOR = "\x1b[?25l", "\x1b[?25h"
 
 def _long(network: Any, **run: Any) -> Path:
     """Paced, so that it takes long enough to be looked at on any machine: 40 s."""
-    return network.file(run={"pace": "realtime", "speed": 2, "duration": 80} | run)  # type: ignore[no-any-return]
+    return network.file(run={"pace": "realtime", "speed": 2, "duration": 80} | run)
 
 
 def _bottom(screen: Terminal) -> int:

@@ -328,6 +328,14 @@ class NoiseSpec(Section):
         return self.loss.any and self.on_loss == "hold"
 
     @property
+    def sure_messages(self) -> int:
+        """Steps at the beginning that say nothing about losses: those that use the message with x(0) but the last.
+
+        Where values are held it is never lost, so the last does not either.
+        """
+        return self.delay + (1 if self.holds else 0)
+
+    @property
     def steps_only(self) -> bool:
         """Whether there is noise on the air, loss or delay, which only steps can have."""
         return self.on_air or self.delay > 0

@@ -104,7 +104,7 @@ class EvidenceSums:
             block = self._block(parts, analyses, observation, first, last, received)
             if not quadratic:
                 lost = None if observation.lost is None else observation.lost[first:last]
-                decided = np.arange(first, last) >= self._step.sure_messages
+                decided = np.arange(first, last) >= self._noise.sure_messages
                 self._add_received(parts, analyses, block.reception, block.white, block.scale, lost, decided)
             found = {each.name: each.add(block) for each in self.diagnostics}
         graphs = observation.modes[first : last + 1]

@@ -33,7 +33,7 @@ class Measurement:
     covariance: FloatArray  # (m, m): mean over steps and replicas of the products of the agents' deviations
     modes: IntArray  # (N,) g(0..N-1)
     lost: BoolArray | None  # (N, m, D) see ``Run.lost``
-    sure_messages: int  # see ``StepModel.sure_messages``
+    sure_messages: int  # see ``NoiseSpec.sure_messages``
     block_numbers: int = BLOCK_NUMBERS  # see ``Observation.block_numbers``
 
     @classmethod
@@ -59,7 +59,7 @@ class Measurement:
             covariance=products / max(1, (steps - first) * experiment.run.replicas),
             modes=trajectory.modes[:steps],
             lost=None if lost is None else lost[:steps],
-            sure_messages=experiment.noise.delay + (1 if experiment.noise.holds else 0),
+            sure_messages=experiment.noise.sure_messages,
             block_numbers=block_numbers,
         )
 
@@ -176,8 +176,8 @@ class Observation:
 
     @property
     def sure_messages(self) -> int:
-        """See ``StepModel.sure_messages``."""
-        return self.step.sure_messages
+        """See ``NoiseSpec.sure_messages``."""
+        return self.prediction.experiment.noise.sure_messages
 
     @cached_property
     def largest(self) -> float:

@@ -178,6 +178,7 @@ class ReceivedEvidence(EvidenceWatch):
         step, m = self._step, self._step.agents
         self._inputs = LoggedInputs(step, experiment)
         self._realtime = experiment.run.pace == "realtime"
+        self._sure_messages = experiment.noise.sure_messages
         self._lossy = experiment.noise.loss.any and not self._realtime
         truth = experiment.truth
         each = 8 * m * (replicas * (2 if truth else 1) + step.most_neighbours + 1)
@@ -270,7 +271,7 @@ class ReceivedEvidence(EvidenceWatch):
         e = received_residuals(step, reception, self._states[after])
         if steps[0] < self._again:
             e, reception = self._freed(steps, known, e, reception)
-        self.sums.add_received(reception, e, lost, steps >= step.sure_messages, self._largest)
+        self.sums.add_received(reception, e, lost, steps >= self._sure_messages, self._largest)
         self.sums.add_broadcast(self._published[place] - now)
         self._done[place] = True
         self.count += len(steps)

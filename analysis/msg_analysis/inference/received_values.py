@@ -237,6 +237,8 @@ class RepeatedNoise:
         With them, the reception with the variance (b, m) of the link noise that is not known.
         """
         count = len(residuals) if self.end is None else min(max(self.end - first, 0), len(residuals))
+        if not count:
+            return residuals, reception
         found, variances = residuals.copy(), reception.link_variance.copy()
         agents = np.arange(residuals.shape[1])[:, None]
         places = self._place[reception.graphs, agents.T]  # (b, m, D)

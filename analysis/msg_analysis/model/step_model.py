@@ -122,14 +122,6 @@ class StepModel(Wiring):
         bursts = self.burst is not None and self.loss > 0.0
         return self.holds or bursts or self.turns is not None
 
-    @property
-    def sure_messages(self) -> int:
-        """Steps at the beginning that say nothing about losses: the message with x(0) is used up to its last time.
-
-        Where values are held it is never lost.
-        """
-        return self.delay + (1 if self.holds else 0)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepMatrices:

@@ -93,7 +93,7 @@ class Running:
         self.sockets[sender].sendto(data, (self.addresses.get(receiver, receiver), PORT))
 
     def end(self) -> dict[tuple[str, str], dict[str, int]]:
-        """End it as a start does; what was counted."""
+        """End it as a run does; what was counted."""
         for found in self.sockets.values():
             found.close()
         self._control.close()

@@ -99,6 +99,16 @@ def test_a_forked_process_is_like_any_child(
     assert "Traceback" not in (tmp_path / "log").read_text()
 
 
+def test_it_ends_when_its_lifeline_closes(server: ForkServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
+    reading, writing = os.pipe()
+    process = start(server, tmp_path / "log", *waiting, lifeline=reading)
+    os.close(reading)
+    wait_for(lambda: participants(domain))
+    assert process.poll() is None
+    os.close(writing)
+    assert process.wait() == 3
+
+
 def test_a_command_of_any_length(server: ForkServer, tmp_path: Path, waiting: list[str], domain: int) -> None:
     """A process of many agents: its node starts, although ROS names a log file by what ``ps`` shows."""
     command, file, *rest = waiting

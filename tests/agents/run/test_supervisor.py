@@ -234,16 +234,16 @@ with ForkServer(environment, directory / "server.log") as server:
 """
 
 
-@pytest.mark.parametrize("kind", ["executed", "forked"])
-def test_children_do_not_outlive_a_killed_parent(tmp_path: Path, kind: str) -> None:
-    """Nor does the process that forks them. Killed while they start, or, forked, while they wait."""
+@pytest.mark.parametrize(("kind", "wait"), [("executed", False), ("executed", True), ("forked", True)])
+def test_children_do_not_outlive_a_killed_parent(tmp_path: Path, kind: str, wait: bool) -> None:
+    """Nor does the process that forks them. Killed while they start, or while they wait."""
     record_of_two(tmp_path)
     with free_domain() as domain:
         command = [sys.executable, "-P", "-c", PARENT, str(tmp_path), str(domain), kind]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
             pids = [int(word) for word in parent.stdout.readline().split()]
             assert len(pids) == 4
-            if kind == "forked":
+            if wait:
                 wait_for(lambda: (tmp_path / "bag").exists() and participants(domain) == 3)
             parent.kill()
         try:

@@ -100,7 +100,7 @@ def test_tabulate_in_narrow_windows(results: list[Path], width: int) -> None:
         place.write_text(result.read_text())
     console = Console(file=io.StringIO(), width=width, force_terminal=True, color_system=None)
     print_results([read_result(place) for place in places], 0.01, console)
-    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    lines = console.file.getvalue().splitlines()
     rows = [line.split() for line in lines if re.match(r"  \S*kind_[12] ", line)]
     assert [row[0] for row in rows] == [place.parent.name for place in places], lines
     for row, place in zip(rows, places, strict=True):

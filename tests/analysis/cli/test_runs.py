@@ -74,7 +74,7 @@ def test_runs_on_a_narrow_terminal() -> None:
     console = Console(file=io.StringIO(), width=40, force_terminal=True, color_system=None)
     found = list_runs(Path("runs"))
     print_runs(found, Path("runs"), len(found), console)
-    lines = console.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    lines = console.file.getvalue().splitlines()
     assert not {"predicted", "z"} & set(lines[2].split())
     assert sum(" pair_20261128_120000 " in line for line in lines) == 1
 

@@ -207,7 +207,7 @@ def test_standing_still() -> None:
     expected = np.log(0.5 * (1.0 + np.sum(1.0 / np.array(q)) / (5 * 400)))
     assert sums.logarithms()[0, 0] == pytest.approx(expected)
     assert finding.log_p == pytest.approx(-expected)
-    assert summed(seen(), ConstantState).finding().log_p == 0.0  # type: ignore[union-attr]
+    assert summed(seen(), ConstantState).finding().log_p == 0.0
 
 
 def test_the_largest_innovation() -> None:
@@ -311,7 +311,7 @@ def test_runs_are_merged() -> None:
     for one, other in pairs:
         windows = 6 if isinstance(one, NoiseOverTime) else None  # the others are lags
         expected = (one.logarithms() + other.logarithms())[:windows]
-        one.merge(other)  # type: ignore[arg-type]
+        one.merge(other)
         assert one.logarithms()[:windows] == pytest.approx(expected)
     largest = pairs[2][0].finding()
     assert (largest.place.run, largest.place.first) == (2, 121)

@@ -75,7 +75,7 @@ def test_whom_nothing_connects_against_networkx(seed: int, agents: int, density:
     for problem in found:
         lost, sources = re.fullmatch(
             r".*: agents? (.*) cannot be reached from agents? ([\d, ]*) in.*", problem
-        ).groups()  # type: ignore[union-attr]
+        ).groups()
         unreached, roots = ({int(label) - 1 for label in text.split(", ")} for text in (lost, sources))
         for root in roots:
             assert set(digraph) - nx.descendants(digraph, root) - {root} == unreached

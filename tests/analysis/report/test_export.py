@@ -179,7 +179,7 @@ def test_mistakes(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert not (tmp_path / "data").exists()
     run = read_bag(bag)
     with pytest.raises(InputError, match="to_dataframe: 'nodes': expected one of states, graphs, errors"):
-        run.to_dataframe("nodes")  # type: ignore[arg-type]
+        run.to_dataframe("nodes")
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(NotAvailableError, match=r"pandas is not installed: .*: pip install pandas"):
         run.to_dataframe()

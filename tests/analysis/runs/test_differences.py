@@ -157,7 +157,7 @@ def test_one_with_leaders_and_one_without() -> None:
     """The best set of the other is as large, and has the same gain."""
     led = four(problem="tracking", leaders={"agents": [1, 4], "gain": 2.0})
     found = experiment_difference(four(), led)["leaders"]
-    assert (found["b"]["agents"], found["b"]["system_error"]) == ([1, 4], led.leaders().present[0])  # type: ignore[index]
+    assert (found["b"]["agents"], found["b"]["system_error"]) == ([1, 4], led.leaders().present[0])
     bests = [found[side]["best"] for side in "ab"]
     assert [(len(best["agents"]), best["gain"]) for best in bests] == [(2, 2.0), (2, 2.0)]
 

@@ -101,7 +101,7 @@ def test_system_error_against_kronecker_algebra(seed: int, directed: bool, gain:
     for law, model in (("continuous", experiment), ("emulated", experiment), ("discrete", twin)):
         expected = kronecker_error(model, leaders, law, gain)
         numbers = [agent + 1 for agent in leaders]
-        assert system_error(model, numbers, law=law, gain=gain) == pytest.approx(expected, rel=1e-9)  # type: ignore[arg-type]
+        assert system_error(model, numbers, law=law, gain=gain) == pytest.approx(expected, rel=1e-9)
 
 
 def test_leaders_of_the_experiment_do_not_count() -> None:
@@ -157,7 +157,7 @@ def test_optimal_leaders_on_paths_and_rings(kind: str, agents: int, count: int) 
     assert exhaustive.sets[0][0] == pytest.approx(best, rel=1e-10)
     assert exhaustive.evaluations == math.comb(agents, count)
     for method in ("greedy", "swap"):
-        selection = select_leaders(experiment, count, method=method)  # type: ignore[arg-type]
+        selection = select_leaders(experiment, count, method=method)
         assert selection.bound <= best * (1 + 1e-9)
         assert selection.sets[0][0] >= best * (1 - 1e-9)
         assert method == "greedy" or selection.sets[0][0] == pytest.approx(best, rel=1e-9)
@@ -193,7 +193,7 @@ def test_monotone_and_supermodular(seed: int, directed: bool, law: str, finite: 
     """Directed and weighted graphs, uneven noise, every law, any gain."""
     document = discrete_document if law == "discrete" else random_document
     experiment = Experiment.parse(document(seed, directed=directed))
-    assert_supermodular(LeaderProblem(experiment, law, 0.7 if finite else math.inf))  # type: ignore[arg-type]
+    assert_supermodular(LeaderProblem(experiment, law, 0.7 if finite else math.inf))
 
 
 @settings(max_examples=8, deadline=None)
@@ -231,11 +231,11 @@ def test_agents_that_hear_nobody_must_lead() -> None:
     assert system_error(experiment, [2, 3]) == math.inf
     assert joint_robustness_centrality(experiment, [2, 3]) == 0.0
     for method in ("exhaustive", "greedy", "swap"):
-        selection = select_leaders(experiment, 2, method=method)  # type: ignore[arg-type]
+        selection = select_leaders(experiment, 2, method=method)
         assert [agents for _, agents in selection.sets] == [(1, 6)]
-        assert {1, 6} < set(select_leaders(experiment, 3, method=method).sets[0][1])  # type: ignore[arg-type]
+        assert {1, 6} < set(select_leaders(experiment, 3, method=method).sets[0][1])
         with pytest.raises(InputError, match="no set of 1 reaches all agents"):
-            select_leaders(experiment, 1, method=method)  # type: ignore[arg-type]
+            select_leaders(experiment, 1, method=method)
 
 
 def test_noise_on_the_air_is_looked_at_in_the_steps_law() -> None:
