@@ -21,7 +21,7 @@ from msg_analysis.inference.observation import bounded
 from msg_analysis.inference.online_evidence import AnyTime, ReceivedEvidence, RunningEvidence, needs_log, supports
 from msg_analysis.inference.online_steps import Lateness, LoggedStates, Recent, RecentSteps, StateLog, StepCollector
 from msg_analysis.inference.statistics import RunningBatches, simultaneous_half_width, steps_to_half_width
-from msg_analysis.inference.time_means import Value, forms_of, known_start, packed_moments, values_of
+from msg_analysis.inference.time_means import Value, forms_of, packed_moments, start_of_run, values_of
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.theory import packed_symmetric
@@ -345,9 +345,10 @@ class _Expected:
         system, last = self._prediction.system, int(steps.max())
         if self._away is None:
             steady = self._prediction.steady
-            initial, law = known_start(self._prediction, record.start, first_mode)
-            self._away, self._law = initial - steady, law - system.stationary
-            self._scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))
+            *before, now = start_of_run(self._prediction, record.start, first_mode)
+            self._series = [np.diag(system.lifted((each.moments - steady).sum(axis=0))) for each in before]
+            self._away, self._law = now.moments - steady, now.law - system.stationary
+            self._scale = max(np.abs(steady).max(initial=0.0), np.abs(now.moments).max(initial=0.0))
         while len(self._series) <= last and (
             np.abs(self._away).max(initial=0.0) > 1e-17 * self._scale or np.abs(self._law).max() > 1e-17
         ):

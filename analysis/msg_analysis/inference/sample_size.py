@@ -96,7 +96,7 @@ def precision_of(prediction: Prediction, sought: float) -> Precision:
     error = prediction.emulated.system_error
     warm_up = 0.0
     if not stationary and error > 0.0:
-        start = start_of(experiment, prediction.system, prediction.steady)
+        start = start_of(experiment, prediction.system, prediction.system.lifted(prediction.steady))
         warm_up = settling_time(prediction.system, prediction.steady, start, sought)
     noise = experiment.noise
     plain = not (noise.on_air or noise.delay or experiment.run.pace == "realtime")

@@ -22,6 +22,7 @@ import numpy as np
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.inference.observation import Observation
 from msg_analysis.theory import packed_symmetric
+from msg_analysis.theory.first_steps import Start, known_start, steady_start
 from msg_analysis.theory.jump_system import JumpSystem, held
 from msg_analysis.theory.moments import mode_potential, transient_mean
 from msg_analysis.theory.prediction import Prediction
@@ -173,21 +174,21 @@ class SharedValue(_Jumps):
         return np.asarray(b @ self.reached.T - a @ self.expected.T)
 
 
-def known_start(prediction: Prediction, start: FloatArray, first: int | None) -> tuple[FloatArray, FloatArray]:
-    """Second moments at the start of a run, given x(0) (m, R) and g(0) if it is not stationary; law of the graphs."""
+def start_of_run(prediction: Prediction, start: FloatArray, first: int | None) -> Start:
+    """The start of a run, given x(0) (m, R) and g(0) if it is not stationary."""
     system, law = prediction.system, prediction.system.of_modes(prediction.step.initial)
     if prediction.experiment.run.start == "stationary":
-        return system.started_steady(prediction.steady, law), law
+        return steady_start(system, system.lifted(prediction.steady), law)
     if first is not None:  # the effect of one draw of g(0) on a transient is not an error
         law = system.of_modes(np.eye(prediction.step.modes)[first])
-    return system.started((start - prediction.step.reference).T, law), law
+    return known_start(system, (start - prediction.step.reference).T, law)
 
 
 def expected_mean(observation: Observation) -> FloatArray:
     """(f, f): exact mean of E[y y^T] over the steps of a run: steady, or transient from the known start."""
     prediction = observation.prediction
-    initial, law = known_start(prediction, observation.start, int(observation.modes[0]))
-    mean = transient_mean(prediction.system, prediction.steady, initial, law, observation.steps)
+    start = start_of_run(prediction, observation.start, int(observation.modes[0]))
+    mean = transient_mean(prediction.system, prediction.steady, start, observation.steps)
     return prediction.system.framed(mean)
 
 

@@ -140,7 +140,7 @@ def _settling(
     """Keys ``steady_system_error``, ``settling`` [units of simulated time] and ``rates`` [1 / unit]."""
     error = float(np.trace(system.lifted(steady.sum(axis=0))))
     starts = {
-        "from_start": start_of(experiment, system, steady),
+        "from_start": start_of(experiment, system, system.lifted(steady)),
         "from_zero": point_start(system, np.zeros(experiment.agents)),
     }
     rates = asymptotic_rates(system)

@@ -30,8 +30,7 @@ class Messages:
     """What a system of the agents and what they heard has beside the agents; see ``message_steps``."""
 
     graphs: IntArray  # (n,) graph of every mode: with losses in bursts, modes are graphs and states of the channels
-    copies: IntArray  # (k,) the agent whose state every number s is, at some time
-    start_noise: FloatArray  # (d, d) second moment of the noise in what was heard of x(0)
+    origins: IntArray  # (k, 3) of every number s, see ``MessageSteps``
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +56,7 @@ class JumpSystem:
     losses: LossEvents | None = None  # with messages one by one, in place of ``loss_variance``
     unreduced_losses: LossEvents | None = None  # in consensus: the same for the numbers s
     messages: Messages | None = None  # with messages one by one
+    step: StepModel | None = None  # of a run, from which its first steps follow
 
     @property
     def modes(self) -> int:
@@ -95,7 +95,7 @@ class JumpSystem:
         """(..., d) reduced coordinates of the deviations of the agents (..., m); in consensus, of their states."""
         # With a delay, the earlier states are taken to be the same; so is what was heard, without its noise.
         if self.messages is not None:
-            return np.asarray(deviations[..., self.messages.copies] @ self.lift)
+            return np.asarray(deviations[..., self.messages.origins[:, 2]] @ self.lift)
         lift = self.lift.reshape(-1, deviations.shape[-1], self.dimension).sum(axis=0)
         return np.asarray(deviations @ lift)
 
@@ -142,24 +142,6 @@ class JumpSystem:
             return stack
         first = np.flatnonzero(np.diff(self.messages.graphs, prepend=-1))
         return np.add.reduceat(stack, first, axis=-3)
-
-    def started(self, deviations: FloatArray, law: FloatArray) -> FloatArray:
-        """(n, d, d) second moments at the start, from the agents' deviations (R, m) and the law (n,) of the modes."""
-        y = self.reduced(deviations)
-        moment = y.T @ y / len(y)
-        if self.messages is not None:
-            moment = moment + self.messages.start_noise
-        return np.asarray(law[:, None, None] * moment)
-
-    def started_steady(self, steady: FloatArray, law: FloatArray) -> FloatArray:
-        """(n, d, d) second moments at the start, of agents that are as in the steady state (n, d, d) given the mode."""
-        # What they have heard is x(0), while in the steady state it may be older.
-        shares = (law / self.stationary)[:, None, None]
-        if self.messages is None:
-            return np.asarray(shares * steady)
-        place = self.reduced(np.eye(len(self.output)))  # (m, d)
-        moments = place.T @ self.lifted(steady) @ place
-        return np.asarray(shares * moments + law[:, None, None] * self.messages.start_noise)
 
     def propagate(self, moments: FloatArray) -> FloatArray:
         """(n, d, d): K_j[C_j] = E[W C_j W^T | mode j] for every mode. Discrete time."""
@@ -216,7 +198,8 @@ def emulated(step: StepModel, problem: str) -> JumpSystem:
         unreduced=weights if consensus else None,
         losses=losses and losses.projected(lift),
         unreduced_losses=losses if consensus else None,
-        messages=Messages(whole.graphs, whole.copies, lift.T @ whole.start_noise @ lift) if whole else None,
+        messages=Messages(whole.graphs, whole.origins) if whole else None,
+        step=step,
     )
 
 

@@ -97,8 +97,9 @@ class MessageSteps:
     chain: FloatArray  # (n, n)
     stationary: FloatArray  # (n,)
     graphs: IntArray  # (n,) graph of every mode
-    copies: IntArray  # (k,) the agent whose state every entry is, at some time; the first m are the agents
-    start_noise: FloatArray  # (k, k) covariance of the noise in what was heard of x(0)
+    # (k, 3) age in messages, receiver and sender of every entry; the receiver is -1 in what was published, and in the
+    # first m, which are the agents
+    origins: IntArray
     moves: list[list[Move]]  # the micro-steps of every mode, of all K entries
     kept: IntArray  # (k,) those of the K entries that are read from one step to the next
     entries: int  # K
@@ -107,18 +108,19 @@ class MessageSteps:
 def message_steps(step: StepModel) -> MessageSteps:
     """The period of a run with this synchronous step, message by message. InputError: too many links or channels."""
     stack = _Stack(step)
-    channels = np.argwhere(stack.lossy) if step.burst is not None else np.empty((0, 2), np.int64)
+    channels = burst_channels(step)
     states = _channel_states(step, len(channels))
+    receivers, senders = np.array(channels, dtype=np.int64).reshape(-1, 2).T
     modes = step.modes * len(states)
     periods = []
     for mode in range(modes):
         graph, state = divmod(mode, len(states))
         probability = step.losses.copy()
-        probability[channels[:, 0], channels[:, 1]] = states[state]
+        probability[receivers, senders] = states[state]
         periods.append(_period(step, stack, graph, probability))
     chain, stationary = step.transition, step.stationary
-    for i, j in channels.tolist():
-        channel, shares = _gilbert(float(step.losses[i, j]), step.burst or 1.0)
+    for link in channels:
+        channel, shares = gilbert(float(step.losses[link]), step.burst or 1.0)
         chain, stationary = np.asarray(np.kron(chain, channel)), np.asarray(np.kron(stationary, shares))
     matrices = np.stack([period.matrix for period in periods])
     losses = _stacked(periods)
@@ -131,8 +133,7 @@ def message_steps(step: StepModel) -> MessageSteps:
         chain=chain,
         stationary=stationary,
         graphs=np.repeat(np.arange(step.modes), len(states)),
-        copies=stack.copies[kept],
-        start_noise=stack.start_noise()[np.ix_(kept, kept)],
+        origins=stack.origins[kept],
         moves=[period.moves for period in periods],
         kept=kept,
         entries=stack.size,
@@ -146,52 +147,38 @@ class _Stack:
         m, lines = step.agents, range(step.delay + 1)
         self._step = step
         listens = step.listens()
-        self.lossy: BoolArray = listens & (step.losses > 0.0)
-        held = np.argwhere(self.lossy if step.holds else np.zeros_like(listens))
-        agents: list[int] = list(range(m))
+        held = np.argwhere(listens & (step.losses > 0.0) & step.holds)
+        origins = [(0, -1, j) for j in range(m)]
         # Entries of what each agent published last, and 1, ..., d messages before; of what each receiver has heard.
         self.published = [list(range(m)) for _ in lines]
         self.heard: list[dict[tuple[int, int], int]] = [{} for _ in lines]
         for line in lines:
             if line or step.broadcast:
-                self.published[line] = list(range(len(agents), len(agents) + m))
-                agents += range(m)
+                self.published[line] = list(range(len(origins), len(origins) + m))
+                origins += [(line, -1, j) for j in range(m)]
             for i, j in held.tolist():
-                self.heard[line][i, j] = len(agents)
-                agents.append(j)
+                self.heard[line][i, j] = len(origins)
+                origins.append((line, i, j))
         # Process noise that several agents feel must be the same for all of them, whenever they step.
         sources = (step.noise_gain != 0.0).any(axis=0)
-        self.sources = list(range(len(agents), len(agents) + m)) if step.turns is not None else []
+        self.sources = list(range(len(origins), len(origins) + m)) if step.turns is not None else []
         if not self.sources or not (sources.sum(axis=0) > 1).any():
             self.sources = []
-        self.copies = np.array(agents + [-1] * len(self.sources), dtype=np.int64)
-        if len(agents) > MOST_VALUES:
+        self.origins = np.array(origins + [(-1, -1, -1)] * len(self.sources), dtype=np.int64)
+        if len(origins) > MOST_VALUES:
             raise InputError(
-                f"noise.on_loss: {len(held)} links of {m} agents make {len(agents)} values that are kept from step to "
+                f"noise.on_loss: {len(held)} links of {m} agents make {len(origins)} values that are kept from step to "
                 f"step; at most {MOST_VALUES} are predicted: use fewer agents or links, or own values"
             )
 
     @property
     def size(self) -> int:
         """K."""
-        return len(self.copies)
+        return len(self.origins)
 
     def source(self, receiver: int, sender: int) -> int:
         """The entry that a receiver uses of a sender."""
         return self.heard[-1].get((receiver, sender), self.published[-1][sender])
-
-    def start_noise(self) -> FloatArray:
-        """(k, k), see ``MessageSteps``: all that was published or heard of x(0) was one message."""
-        m, noise = self._step.agents, np.zeros((self.size, self.size))
-        links = {link: [line[link] for line in self.heard] for link in self.heard[0]}
-        heard = [entry for entries in links.values() for entry in entries]
-        for j in range(m):
-            same = [entry for entry in heard if self.copies[entry] == j]
-            same += [line[j] for line in self.published if line[j] >= m]
-            noise[np.ix_(same, same)] += self._step.broadcast**2
-        for same in links.values():
-            noise[np.ix_(same, same)] += self._step.link**2
-        return noise
 
 
 class _Period:
@@ -338,7 +325,13 @@ def _read(matrices: FloatArray, losses: LossEvents | None, agents: int) -> IntAr
         kept = more
 
 
-def _gilbert(probability: float, burst: float) -> tuple[FloatArray, FloatArray]:
+def burst_channels(step: StepModel) -> list[tuple[int, int]]:
+    """The links, receiver and sender, that lose messages in bursts."""
+    lossy = step.listens() & (step.losses > 0.0)
+    return [(i, j) for i, j in np.argwhere(lossy).tolist()] if step.burst is not None else []
+
+
+def gilbert(probability: float, burst: float) -> tuple[FloatArray, FloatArray]:
     """(2, 2) transition matrix and (2,) stationary law of a channel: state 0 delivers, state 1 loses."""
     mends = 1.0 / burst
     fails = mends * probability / (1.0 - probability)

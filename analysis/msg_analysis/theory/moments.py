@@ -18,6 +18,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.coupled_equations import MAX_RELATIVE_ERROR, SolverReport
+from msg_analysis.theory.first_steps import Start
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.solvers import MAX_ITERATIONS, DenseSolver, IterativeSolver
 
@@ -125,18 +126,18 @@ def mode_potential(system: JumpSystem, dual: FloatArray) -> tuple[FloatArray, Fl
     return means, np.linalg.solve(chain, (gained - means[:, None]).T).T
 
 
-def transient_mean(
-    system: JumpSystem, steady: FloatArray, initial: FloatArray, law: FloatArray, steps: int
-) -> FloatArray:
+def transient_mean(system: JumpSystem, steady: FloatArray, start: Start, steps: int) -> FloatArray:
     """(d, d) exact mean over the steps 0..steps-1 of E[y(k) y(k)^T] from a known start. Discrete time.
 
-    ``steady``, ``initial``: (n, d, d) steady moments, and E[y(0) y(0)^T; mode i]; ``law``: (n,) of g(0). The distance
-    to the steady state is stepped (equations of Proposition 6), until nothing is left of it.
+    ``steady``: (n, d, d). The distance to the steady state is stepped (equations of Proposition 6), until nothing is
+    left of it.
     """
-    away, law_away = initial - steady, law - system.stationary
-    scale = max(np.abs(steady).max(initial=0.0), np.abs(initial).max(initial=0.0))
     total = np.zeros_like(steady)
-    for step in range(0, steps, 8):  # not looked at every time: a look takes as long as a step
+    for now in start[: min(steps, len(start) - 1)]:
+        total += now.moments - steady
+    away, law_away = start[-1].moments - steady, start[-1].law - system.stationary
+    scale = max(np.abs(steady).max(initial=0.0), np.abs(start[-1].moments).max(initial=0.0))
+    for step in range(len(start) - 1, steps, 8):  # not looked at every time: a look takes as long as a step
         if np.abs(away).max(initial=0.0) <= 1e-17 * scale and np.abs(law_away).max() <= 1e-17:
             break
         for _ in range(min(8, steps - step)):

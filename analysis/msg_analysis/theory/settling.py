@@ -19,12 +19,13 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.markov_chain import Time
 from msg_analysis.theory import packed_symmetric
+from msg_analysis.theory.first_steps import MomentsAt, Start
 from msg_analysis.theory.jump_system import Component, JumpSystem, components
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.propagator import Flow, Power
 from msg_analysis.theory.rational_krylov import RationalFlow, slowest_rate
 from msg_analysis.theory.solvers import IterativeSolver, homogeneous_propagator, mean_propagator
-from msg_analysis.theory.transient import MAX_UNKNOWNS, MomentsAt, advance, distance, joint_flow, joint_stack, unknowns
+from msg_analysis.theory.transient import MAX_UNKNOWNS, advance, distance, joint_flow, joint_stack, unknowns
 
 CERTAIN = 1e-6  # largest relative change of a rate by changes of the matrices of relative size ``components.CHANGE``
 MAX_ARNOLDI = 10_000  # unknowns in continuous time: each of some 50 iterations solves the coupled equations
@@ -141,7 +142,7 @@ MAX_STEPS = 1_000_000
 def settling_time(
     system: JumpSystem,
     steady: FloatArray,
-    start: MomentsAt,
+    start: Start,
     fraction: float = FRACTION,
     *,
     most_unknowns: int = MAX_UNKNOWNS,
@@ -163,13 +164,17 @@ def settling_time(
     error = float(np.einsum("nab,ab->", steady, weights))
     if not error > 0.0:
         raise InputError("settling time: the steady error is 0, expected noise: set noise.process")
-    away = distance(system, start, steady)
+    course = [distance(system, now, steady) for now in start]
     judge = _Judge(system, steady, weights, fraction * error, fraction)
+    stack = joint_stack(course[-1])
     if unknowns(system) > most_unknowns and system.time == "discrete":
-        return _stepped(system, judge, away)
-    stack = joint_stack(away)
-    flow = joint_flow(system, stack, lambda: slowest_rate(system, steady), decays=True, most_unknowns=most_unknowns)
-    return _searched(flow, judge, stack, system.time)
+        found = _stepped(system, judge, course[-1])
+    else:
+        flow = joint_flow(system, stack, lambda: slowest_rate(system, steady), decays=True, most_unknowns=most_unknowns)
+        found = _searched(flow, judge, stack, system.time)
+    if found:
+        return len(start) - 1 + found
+    return float(max((k + 1 for k, now in enumerate(course) if judge.outside(joint_stack(now))), default=0))
 
 
 class _Judge:

@@ -9,7 +9,7 @@ Propositions 1 and 6 of the paper; docs/theory.md, "Transients", says how they a
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -21,6 +21,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.model.step_model import build_run_model, first_graph
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory import packed_symmetric
+from msg_analysis.theory.first_steps import MomentsAt, Start, known_start, steady_start
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.propagator import Flow
@@ -37,15 +38,6 @@ MAX_UNKNOWNS = 300  # largest n p + n, with p = d (d + 1) / 2, whose matrix is p
 MAX_BYTES = 2e9  # largest result
 SHOWN_TIMES = 11  # in a notebook's table; the arrays have all of them
 MAX_STEPS = 10_000_000  # most single steps (discrete time, beyond MAX_UNKNOWNS)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MomentsAt:
-    """The paper's pi, nu and c at one time, in reduced coordinates."""
-
-    law: FloatArray  # (n,) pi_i = P(g = i)
-    means: FloatArray  # (n, d) E[y; mode i]
-    moments: FloatArray  # (n, d, d) C_i = E[y y^T; mode i]
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -110,20 +102,19 @@ class Transient:
         return self.system.lifted(self.moments)
 
 
-def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | None = None) -> MomentsAt:
+def point_start(system: JumpSystem, deviation: FloatArray, law: FloatArray | None = None) -> Start:
     """Agents at a known place (m,), x(0) or its deviation from the reference; ``law``: (n,) of g(0), or stationary."""
-    law = system.stationary if law is None else law
-    return MomentsAt(law, np.multiply.outer(law, system.reduced(deviation)), system.started(deviation[None], law))
+    return known_start(system, deviation[None], system.stationary if law is None else law)
 
 
-def start_of(experiment: Experiment, system: JumpSystem, stationary: FloatArray) -> MomentsAt:
-    """The start that the experiment defines, for one of its laws; ``stationary``: (n, d, d) steady second moments."""
+def start_of(experiment: Experiment, system: JumpSystem, agents: FloatArray) -> Start:
+    """The start that the experiment defines, for one of its laws; ``agents``: (n, m, m) their steady second moments."""
     law = system.stationary
     if experiment.switching.initial != "stationary":
         law = system.of_modes(first_graph(experiment))
     start = experiment.run.start
     if start == "stationary":
-        return MomentsAt(law, np.zeros((system.modes, system.dimension)), system.started_steady(stationary, law))
+        return steady_start(system, agents, law)
     place = np.zeros(experiment.agents) if start == "zero" else np.array(start, dtype=float)
     return point_start(system, place - experiment.reference, law)
 
@@ -153,7 +144,7 @@ def solve_transient(
     system, unit = _system(experiment, law)
     steady = MomentSolver(system).steady()
     if not unreduced:
-        found = transient(system, start_of(experiment, system, steady), _steps(times, unit), steady)
+        found = transient(system, start_of(experiment, system, system.lifted(steady)), _steps(times, unit), steady)
         return SolvedTransient(found, system, steady, unit)
     if experiment.problem != "consensus":
         raise InputError("unreduced: expected problem: consensus (tracking has no reduction): leave it out")
@@ -161,11 +152,7 @@ def solve_transient(
         whole = unreduced_consensus(experiment)
     else:
         whole = systems.emulated(build_run_model(experiment), "tracking")
-    stationary = system.lift @ steady @ system.lift.T
-    if system.messages is not None:  # the agents' mean is 0 at the start, not that of all numbers
-        place = whole.reduced(np.eye(experiment.agents)).T
-        stationary = place @ system.lifted(steady) @ place.T
-    start = start_of(experiment, whole, stationary)
+    start = start_of(experiment, whole, system.lifted(steady))
     return SolvedTransient(transient(whole, start, _steps(times, unit)), system, steady, unit)
 
 
@@ -185,7 +172,7 @@ def unreduced_consensus(experiment: Experiment) -> JumpSystem:
 
 def transient(
     system: JumpSystem,
-    start: MomentsAt,
+    start: Start,
     times: FloatArray,
     steady: FloatArray | None = None,
     *,
@@ -203,9 +190,16 @@ def transient(
     """
     times = np.asarray(times, dtype=float)
     _check_times(system, times)
+    begin = len(start) - 1  # the step from which the equations hold
+    rest = np.maximum(times - begin, 0.0)
     if unknowns(system) > most_unknowns and system.time == "discrete":
-        return _stepped(system, start, times, steady)
-    return _powered(system, start, times, steady, most_unknowns)
+        found = _stepped(system, start[-1], rest, steady)
+    else:
+        found = _powered(system, start[-1], rest, steady, most_unknowns)
+    for row in np.flatnonzero(times < begin).tolist():
+        now = start[round(times[row])]
+        found.laws[row], found.means[row], found.moments[row] = now.law, now.means, now.moments
+    return replace(found, times=times)
 
 
 def unknowns(system: JumpSystem) -> int:

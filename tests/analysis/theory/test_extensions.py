@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from experiments import Experiment, line_ring, predict
 from msg_analysis.errors import InputError
 from msg_analysis.model.step_model import build_step_model
+from msg_analysis.theory.first_steps import MomentsAt
 from msg_analysis.theory.jump_system import emulated, held
 from msg_analysis.theory.moments import MomentSolver, transient_mean
 from msg_analysis.theory.solvers import DenseSolver
@@ -200,7 +201,7 @@ def test_steps_with_everything_are_those_of_brute_force(seed):
 
 @pytest.mark.parametrize(("seed", "steps"), [*((seed, 7) for seed in range(12)), (1, 3000), (2, 3000)])
 def test_transient_with_everything_is_that_of_brute_force(seed, steps):
-    """From a known start, which a delay takes to have been the same before."""
+    """From a known start, which a delay takes to have been the same before (its messages: test_first_steps.py)."""
     given = document(seed)
     experiment = Experiment.parse(given)
     _, law = transition_and_law(given)
@@ -214,8 +215,9 @@ def test_transient_with_everything_is_that_of_brute_force(seed, steps):
         vector = matrix @ vector
     system = emulated(build_step_model(experiment), experiment.problem)
     y = system.reduced(x)
-    initial = system.stationary[:, None, None] * np.outer(y, y)
-    measured = transient_mean(system, MomentSolver(system).steady(), initial, system.stationary, steps)
+    law = system.stationary
+    start = [MomentsAt(law, np.outer(law, y), law[:, None, None] * np.outer(y, y))]
+    measured = transient_mean(system, MomentSolver(system).steady(), start, steps)
     np.testing.assert_allclose(system.lifted(measured), total / steps, rtol=1e-9, atol=1e-9)
 
 

@@ -225,9 +225,10 @@ def test_steady_errors_and_transients(case):
     brute = Brute(case, experiment)
     x = np.array(place) - experiment.reference
     expected = brute.course(x, 400)
-    times = np.arange(7) * experiment.step_length
-    course = solve_transient(experiment, times).course
-    np.testing.assert_allclose(course.node_errors, expected[:7], rtol=1e-9, atol=1e-12)
+    # What one loss does in several steps with a delay is not in ``Brute``, but in test_first_steps.py.
+    steps = 1 if case == "real time, own, delay" else 7
+    course = solve_transient(experiment, np.arange(steps) * experiment.step_length).course
+    np.testing.assert_allclose(course.node_errors, expected[:steps], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(predict(experiment).emulated.node_errors, expected[-1], rtol=1e-9, atol=1e-12)
 
 

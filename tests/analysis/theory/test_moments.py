@@ -10,6 +10,7 @@ from switching_systems import generator, steady_of
 from switching_systems import system as switching
 
 from msg_analysis.errors import InputError
+from msg_analysis.theory.first_steps import MomentsAt
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver, mode_potential, transient_mean
 from msg_analysis.theory.solvers import DenseSolver
@@ -78,7 +79,8 @@ def test_the_mean_over_the_steps_from_a_known_start(steps, size):
         after = system.matrices @ moments @ system.matrices.transpose(0, 2, 1) + law[:, None, None] * system.noise
         moments, law = np.tensordot(system.chain, after, axes=(0, 0)), law @ system.chain
     total += max(steps - 3000, 0) * steady.sum(axis=0)
-    found = transient_mean(system, steady, first[:, None, None] * np.outer(y, y), first, steps)
+    start = [MomentsAt(first, np.outer(first, y), first[:, None, None] * np.outer(y, y))]
+    found = transient_mean(system, steady, start, steps)
     np.testing.assert_allclose(found, total / steps, rtol=1e-11, atol=1e-13 * size)
 
 
@@ -86,7 +88,7 @@ def test_a_start_with_steady_moments_under_another_graph_leaves_them():
     random = np.random.default_rng(3)
     system = switching(random, 4, generator(random, 2, 1.0), dt=0.05)
     steady, first = steady_of(system), np.array([1.0, 0.0])
-    found = transient_mean(system, steady, steady, first, 2)
+    found = transient_mean(system, steady, [MomentsAt(first, np.zeros((2, 3)), steady)], 2)
     after, _ = system.advance(steady, first)
     np.testing.assert_allclose(found, (steady + after).sum(axis=0) / 2, rtol=1e-12)
 

@@ -120,7 +120,7 @@ def test_stationary_start_stays_and_long_times_are_the_steady_state():
     experiment = Experiment.parse(LINE_RING)
     system = systems.continuous(experiment)
     steady = steady_of(system)
-    start = start_of(experiment, system, steady)
+    start = start_of(experiment, system, system.lifted(steady))
     found = transient.transient(system, start, np.array([0.0, 1.0, 1e9]), steady)
     np.testing.assert_allclose(found.moments, np.stack([steady] * 3), rtol=1e-12, atol=1e-15)
     zero = transient.transient(system, point_start(system, np.zeros(5)), np.array([1e3, 1e9]), steady)
@@ -214,7 +214,7 @@ def test_what_is_refused():
         with pytest.raises(InputError, match="ascending"):
             transient.transient(system, start, np.array(times))
     with pytest.raises(InputError, match=r"2 graphs of 5 agents need 0.0 GB in continuous time"):
-        RationalFlow(system, transient.joint_stack(start), 1.0, decays=False, most_bytes=1.0)
+        RationalFlow(system, transient.joint_stack(start[0]), 1.0, decays=False, most_bytes=1.0)
     with pytest.raises(InputError, match="whole numbers of steps"):
         transient.transient(system, start, np.array([0.5]), prediction.steady)
     with pytest.raises(InputError, match="settling fraction"):
@@ -261,7 +261,7 @@ def test_settled_from_the_start_and_slow_graphs():
     experiment = Experiment.parse(LINE_RING)
     system = systems.continuous(experiment)
     steady = steady_of(system)
-    assert settling_time(system, steady, start_of(experiment, system, steady)) == 0.0
+    assert settling_time(system, steady, start_of(experiment, system, system.lifted(steady))) == 0.0
     slow = dataclasses.replace(system, chain=1e-8 * system.chain)
     steady = steady_of(slow)
     # From the line for certain, the error is 2 and comes down to 1.5 as the law of the graph mixes.
