@@ -28,6 +28,7 @@ class ExitCode(IntEnum):
     DISAGREES = 1
     BAD_INPUT = 2
     INCOMPLETE = 3  # data are missing, or the end was not reached
+    LATE = 4  # in real time: nothing disagrees, but too many steps were late
 
 
 def killed_by(number: int) -> int:

@@ -162,6 +162,7 @@ class RunEntry:
     seed: int | None = None
     run: str | None = None  # id
     verdict: str | None = None
+    prediction: str | None = None  # for real time, made before the run: supported, not supported, not decided
     simulated_time: float | None = None  # that was compared
     measured: float | None = None
     standard_error: float | None = None
@@ -248,6 +249,7 @@ def _compared(folder: Path, date: datetime, report: str | None) -> RunEntry:
         seed=_whole(document.get("seed")),
         run=_text(document.get("run")),
         verdict=row.verdict,
+        prediction=_of_prediction(document),
         simulated_time=row.simulated_time,
         measured=measured,
         standard_error=error,
@@ -258,6 +260,15 @@ def _compared(folder: Path, date: datetime, report: str | None) -> RunEntry:
         given_path=error is not None and row.standard_error is None,
         report=report,
     )
+
+
+def _of_prediction(document: dict[str, Any]) -> str | None:
+    """Whether a run in real time supports what was predicted before it, in words."""
+    real_time = document.get("real_time")
+    if not isinstance(real_time, dict):
+        return None
+    found = real_time.get("prediction")
+    return "not decided" if found is None else "supported" if found is True else "not supported"
 
 
 def _recorded(folder: Path, names: set[str]) -> tuple[Status, dict[str, Any]]:

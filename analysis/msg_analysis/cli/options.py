@@ -190,6 +190,15 @@ def out_option(metavar: str, text: str, **more: Any) -> Callable[..., Any]:
     return click.option("--out", type=PATH, metavar=metavar, help=text, **more)
 
 
+max_missed_option = click.option(
+    "--max-missed",
+    type=click.FloatRange(0.0, 1.0),
+    metavar="SHARE",
+    default=0.05,
+    help="In real time: share of missed deadlines above which the verdict is 'late' (exit code 4).",
+)
+
+
 def level_option(what: str) -> Callable[..., Any]:
     """The option ``--level``, a probability; ``what`` is its help text."""
     return click.option("--level", type=PositiveFloat(0.5), metavar="P", default=0.01, help=what)

@@ -21,6 +21,7 @@ from msg_analysis.cli.options import (
     is_bag,
     json_option,
     level_option,
+    max_missed_option,
     seed_option,
     verbose_option,
 )
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 @click.option(
     "--verdict",
     "verdicts",
-    type=click.Choice(["agrees", "disagrees", "incomplete", "unpredicted", "none"]),
+    type=click.Choice(["agrees", "disagrees", "late", "incomplete", "unpredicted", "none"]),
     multiple=True,
     help="Only runs with this verdict; none: without one. Repeatable.",
 )
@@ -170,18 +171,26 @@ def diff(a: Path, b: Path, *, as_json: bool) -> None:
 )
 @click.argument("bags", metavar="BAG...", nargs=-1, required=True, type=BAG)
 @level_option("Probability of a false 'disagrees', over all tests.")
+@max_missed_option
 @click.option("--report", type=FILE, metavar="FILE", help="Also write an HTML report.")
 @verbose_option
 @json_option
 @click.pass_context
 def compare(
-    context: click.Context, bags: tuple[Path, ...], *, level: float, report: Path | None, verbose: bool, as_json: bool
+    context: click.Context,
+    bags: tuple[Path, ...],
+    *,
+    level: float,
+    max_missed: float,
+    report: Path | None,
+    verbose: bool,
+    as_json: bool,
 ) -> None:
     """Compare the run in BAG with its prediction.
 
     Several bags, runs of one experiment with different seeds, get one joint verdict.
 
-    Exit code 0: agrees, 1: disagrees, 3: data incomplete, no verdict.
+    Exit code 0: agrees, 1: disagrees, 3: data incomplete, no verdict, 4: late (real time).
     """
     from msg_analysis.cli.console import WorkProgress
     from msg_analysis.common.files import require_place
@@ -189,7 +198,7 @@ def compare(
 
     require_place(report)
     with WorkProgress() as progress, watched(progress):
-        comparison = compare_runs(*bags, level=level)
+        comparison = compare_runs(*bags, level=level, max_missed=max_missed)
         if report:
             from msg_analysis.report.page import write_report
 

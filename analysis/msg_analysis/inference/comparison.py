@@ -140,11 +140,14 @@ def _infinite(fourth: FourthMoment) -> str:
     return f"are infinite (they grow {least}{number_text(radius, 3)} times per step)"
 
 
-Verdict = Literal["agrees", "disagrees", "incomplete", "unpredicted"]
+Verdict = Literal["agrees", "disagrees", "late", "incomplete", "unpredicted"]
+
+MAX_MISSED = 0.05  # share of the deadlines of a run in real time, above which its verdict is "late"
 
 EXIT_CODES: dict[Verdict, ExitCode] = {
     "agrees": ExitCode.FINE,
     "disagrees": ExitCode.DISAGREES,
+    "late": ExitCode.LATE,
     "incomplete": ExitCode.INCOMPLETE,
     "unpredicted": ExitCode.FINE,
 }
@@ -237,6 +240,8 @@ class Comparison:
     trust
         in lockstep: which errors have valid intervals, and why; None where too few steps arrived, or without a
         prediction
+    max_missed
+        in real time: share of missed deadlines above which the verdict is "late"
     """
 
     trajectory: Run
@@ -263,6 +268,7 @@ class Comparison:
     pool: Pool | None = None
     any_time: AnyTimeEvidence | None = None
     trust: Trust | None = None
+    max_missed: float = MAX_MISSED
 
     def __repr__(self) -> str:
         total, runs = self.system_error, f"{len(self.pool.members)} runs" if self.pool else "run"
@@ -294,6 +300,8 @@ class Comparison:
     def verdict(self) -> Verdict:
         """Verdict: "incomplete" if data are missing, else "disagrees" if a test of the family is rejected.
 
+        Else a run in real time is "late" if it missed more deadlines than ``max_missed``: its agents follow the model
+        given what they received, but what was predicted before the run was never put to the test.
         A run that was to end as soon as its evidence disagrees (``--until decided``) disagrees when that has happened.
         Without a prediction the remaining tests cannot show that a run agrees: "unpredicted".
         """
@@ -303,11 +311,15 @@ class Comparison:
         decided = until is not None and until.decided and self.any_time is not None and self.any_time.exceeded
         if decided or any(test.rejected for test in self.tests):
             return "disagrees"
+        if self.timing and self.timing.missed_share > self.max_missed:
+            return "late"
+        if self.pool and any(member.verdict == "late" for member in self.pool.members):
+            return "late"
         return "unpredicted" if self.unpredicted else "agrees"
 
     @property
     def exit_code(self) -> int:
-        """0 agrees or unpredicted, 1 disagrees, 3 incomplete."""
+        """0 agrees or unpredicted, 1 disagrees, 3 incomplete, 4 late."""
         return EXIT_CODES[self.verdict]
 
     def plot(self) -> Figure:
@@ -321,6 +333,17 @@ class Comparison:
         from msg_analysis.report.figures import comparison_figure
 
         return comparison_figure(self)
+
+    def _real_time(self) -> dict[str, Any] | None:
+        """In real time: what is said of the agents given the log, and of the prediction made before the run."""
+        if self.laws is None or self.timing is None:
+            return None
+        return {
+            "follows_model": not any(test.rejected for test in self.tests),
+            "prediction": self.laws.sequential.supported,
+            "missed": self.timing.missed_share,
+            "max_missed": self.max_missed,
+        }
 
     @property
     def _law(self) -> str:
@@ -367,6 +390,7 @@ class Comparison:
             "broadcast": {"p": self.p_broadcast},
             "timing": self.timing,
             "laws": self.laws,
+            "real_time": self._real_time(),
             "given_path": self.given,
             "order": self.order,
             "causes": self.causes,

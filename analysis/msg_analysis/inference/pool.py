@@ -16,7 +16,7 @@ import numpy as np
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.validation import unpredictable
-from msg_analysis.inference.comparison import Comparison, Pool, PooledRun, first_difference
+from msg_analysis.inference.comparison import MAX_MISSED, Comparison, Pool, PooledRun, first_difference
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.statistics import chi2_tail
@@ -26,7 +26,7 @@ from msg_analysis.model.run_record import RunRecord
 from msg_analysis.theory.prediction import Prediction, predict
 
 
-def compare(*runs: Run | str | Path, level: float = 0.01) -> Comparison:
+def compare(*runs: Run | str | Path, level: float = 0.01, max_missed: float = MAX_MISSED) -> Comparison:
     """Compare a run, or several of one experiment, with what theory predicts.
 
     Parameters
@@ -36,6 +36,8 @@ def compare(*runs: Run | str | Path, level: float = 0.01) -> Comparison:
         verdict together
     level
         probability of a false "disagrees", all tests together; above 0, at most 0.5
+    max_missed
+        in real time: share of missed deadlines above which the verdict is "late"; 0 to 1
 
     Returns
     -------
@@ -54,8 +56,11 @@ def compare(*runs: Run | str | Path, level: float = 0.01) -> Comparison:
         raise InputError("no run: give at least one, or the path of its bag")
     if not 0.0 < level <= 0.5:
         raise InputError(f"level: {level:g}: expected a probability above 0, at most 0.5")
+    if not 0.0 <= max_missed <= 1.0:
+        raise InputError(f"max_missed: {max_missed:g}: expected a share of the deadlines, from 0 to 1")
     if len(runs) == 1:
-        return compare_run(runs[0] if isinstance(runs[0], Run) else read_bag(runs[0]), level=level)
+        run = runs[0] if isinstance(runs[0], Run) else read_bag(runs[0])
+        return compare_run(run, level=level, max_missed=max_missed)
     absent = [str(path) for path in runs if not isinstance(path, Run) and not Path(path).exists()]
     if absent:
         raise InputError(f"{', '.join(absent)}: not found: expected bags, {len(runs)} were given")
@@ -63,10 +68,12 @@ def compare(*runs: Run | str | Path, level: float = 0.01) -> Comparison:
         (f"run {place}", run) if isinstance(run, Run) else (str(run), read_bag(run))
         for place, run in enumerate(runs, start=1)
     )
-    return compare_pooled(named, level=level)
+    return compare_pooled(named, level=level, max_missed=max_missed)
 
 
-def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> Comparison:
+def compare_pooled(
+    runs: Iterable[tuple[str, Run]], *, level: float = 0.01, max_missed: float = MAX_MISSED
+) -> Comparison:
     """Compare several runs of one experiment, by name and read one after the other, with its prediction."""
     total: Evidence | None = None
     prediction: Prediction | None = None
@@ -81,7 +88,7 @@ def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> C
                 raise InputError(f"{name}: {reason}, so there is nothing to pool: compare one bag at a time")
             prediction, trajectory = predict(experiment, run.record.step_model), _without_data(run)
         prediction = prediction.for_run(experiment)
-        member, evidence = _examine(name, run, prediction, level)
+        member, evidence = _examine(name, run, prediction, level, max_missed)
         members.append(member)
         if evidence:
             total = total.merged(evidence) if total else evidence
@@ -93,17 +100,19 @@ def compare_pooled(runs: Iterable[tuple[str, Run]], *, level: float = 0.01) -> C
         comparison = without_numbers(trajectory, level, prediction, 0)
     else:
         comparison = evaluate(trajectory, prediction, total, level, pool.p)
-    return dataclasses.replace(comparison, pool=pool)
+    return dataclasses.replace(comparison, pool=pool, max_missed=max_missed)
 
 
-def _examine(name: str, run: Run, prediction: Prediction, level: float) -> tuple[PooledRun, Evidence | None]:
+def _examine(
+    name: str, run: Run, prediction: Prediction, level: float, max_missed: float
+) -> tuple[PooledRun, Evidence | None]:
     """One run by itself, with its prediction; no evidence where too little of it arrived."""
     observation = Observation.of(run, prediction)
     if observation.steps < MIN_STEPS and not run.completeness.complete:
         missing = Estimate(predicted=prediction.emulated.system_error)
         return PooledRun(name, run.record, 0, run.completeness, missing, missing, "incomplete"), None
     evidence = Evidence.of(observation, level)
-    alone = evaluate(run, prediction, evidence, level)
+    alone = dataclasses.replace(evaluate(run, prediction, evidence, level), max_missed=max_missed)
     tested = alone.given.system_error if alone.given else alone.system_error
     member = PooledRun(name, run.record, evidence.steps, run.completeness, alone.system_error, tested, alone.verdict)
     return member, evidence

@@ -237,12 +237,19 @@ def measure_laws(observation: Observation, order: EventOrder, timing: Timing, le
 def _pattern(observation: Observation, means: TimeMeans, level: float) -> CheckedLaw:
     error, p = _least(observation, means)
     if p is None:
-        return CheckedLaw(error, None, "without noise the errors cannot be tested")
+        return CheckedLaw(error, None, _untestable(observation))
     logged = "the prediction for the values and graphs that the agents logged"
     if p >= level:
         return CheckedLaw(error, True, f"the errors agree with {logged}")
     why = "this law holds for any timing, so an agent did not follow its law, or its log is wrong"
     return CheckedLaw(error, False, f"the errors differ from {logged} ({_tested(error, p)}); {why}")
+
+
+def _untestable(observation: Observation) -> str:
+    """Why the errors of a run have no standard error."""
+    if not observation.prediction.system.noise.any():
+        return "without noise the errors cannot be tested"
+    return "the agents were so late that only x(0), which is not random, could be compared"
 
 
 def _deviations(timing: Timing) -> list[str]:
@@ -288,7 +295,7 @@ def _continuous(observation: Observation, sequential: Estimate, level: float, la
     if sequential.standard_error is None:
         return CheckedLaw(untested, None, "its errors have no standard error here")
     if not sequential.standard_error or sequential.measured is None or not predicted:
-        return CheckedLaw(untested, None, "without noise the errors cannot be tested")
+        return CheckedLaw(untested, None, _untestable(observation))
     if experiment.run.start != "stationary":
         return CheckedLaw(untested, None, "only its steady state is predicted, and the run did not start there")
     z = (sequential.measured - predicted) / sequential.standard_error

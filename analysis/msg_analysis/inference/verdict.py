@@ -13,7 +13,7 @@ from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray
 from msg_analysis.common.resources import blas_threads
 from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.inference.candidates import Cause
-from msg_analysis.inference.comparison import Comparison, trusted
+from msg_analysis.inference.comparison import MAX_MISSED, Comparison, trusted
 from msg_analysis.inference.counts import LossTally, Transitions, loss_test
 from msg_analysis.inference.e_values import log_mean
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates, rank_agents
@@ -151,7 +151,9 @@ def _coarser(means: TimeMeans, other: TimeMeans) -> TimeMeans:
 MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
 
 
-def compare_run(trajectory: Run, *, level: float = 0.01, block_numbers: int = BLOCK_NUMBERS) -> Comparison:
+def compare_run(
+    trajectory: Run, *, level: float = 0.01, max_missed: float = MAX_MISSED, block_numbers: int = BLOCK_NUMBERS
+) -> Comparison:
     """Compare a run, or its complete beginning, with what theory predicts for it, see ``pool.compare``."""
     unpredicted = unpredictable(trajectory.record.experiment)
     if unpredicted:
@@ -164,7 +166,8 @@ def compare_run(trajectory: Run, *, level: float = 0.01, block_numbers: int = BL
         return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
     until = trajectory.record.until
     decided = until is not None and until.decided
-    return evaluate(trajectory, prediction, Evidence.of(observation, level, decided=decided), level)
+    evidence = Evidence.of(observation, level, decided=decided)
+    return replace(evaluate(trajectory, prediction, evidence, level), max_missed=max_missed)
 
 
 def evaluate(

@@ -148,13 +148,15 @@ class Run:
         """(N + 1,) simulated time of the states x(0), ..., x(N) [units of simulated time]."""
         return np.asarray(np.arange(len(self.states)) * self.record.experiment.step_length, dtype=float)
 
-    def compare(self, *, level: float = 0.01) -> Comparison:
+    def compare(self, *, level: float = 0.01, max_missed: float = 0.05) -> Comparison:
         """Compare the run with its prediction; see :func:`compare`.
 
         Parameters
         ----------
         level
             probability of a false "disagrees", all tests together; above 0, at most 0.5
+        max_missed
+            in real time: share of missed deadlines above which the verdict is "late"; 0 to 1
 
         Raises
         ------
@@ -163,7 +165,7 @@ class Run:
         """
         from msg_analysis.inference.pool import compare
 
-        return compare(self, level=level)
+        return compare(self, level=level, max_missed=max_missed)
 
     def to_dataframe(self, table: Table = "states") -> pd.DataFrame:
         """The run as a data frame of pandas, with the columns of ``msg-analysis export``.

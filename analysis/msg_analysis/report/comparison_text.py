@@ -16,6 +16,7 @@ from rich.text import Text
 from msg_analysis.common.text import agent_text, measured_text, number_text, p_text, percent, with_names, z_text
 from msg_analysis.inference.realtime_laws import SUPPORT
 from msg_analysis.model.run_record import RunRecord
+from msg_analysis.model.step_model import step_law
 from msg_analysis.report.tables import fact_table, first_rows, gaps, interval_text, print_rows, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 VERDICTS = {
     "agrees": "The run agrees with the prediction.",
     "disagrees": "The run disagrees with the prediction.",
+    "late": "The run was late, so it is no test of the prediction",
     "incomplete": "No verdict: the data are incomplete.",
     "unpredicted": "No verdict, because there is no prediction. All available tests are ok.",
 }
@@ -41,7 +43,13 @@ REAL_TIME_LAWS = {key: LAW_NAMES[key] for key in ("pattern", "sequential", "cont
 CORRECTED = "corrected for this run's graph sequence"
 SMALLER = "has a smaller error than"
 
-_STYLES = {"agrees": "bold green", "disagrees": "bold red", "incomplete": "bold yellow", "unpredicted": "bold"}
+_STYLES = {
+    "agrees": "bold green",
+    "disagrees": "bold red",
+    "late": "bold yellow",
+    "incomplete": "bold yellow",
+    "unpredicted": "bold",
+}
 _FEW_AGENTS, _WORST = 8, 5  # most agents of whom each has a row; rows of larger networks
 
 
@@ -146,7 +154,8 @@ def _print_errors(document: dict[str, Any], console: Console, verbose: bool) -> 
     """Of the system and of the agents; of large networks, those agents that are furthest from the prediction."""
     table = Table(box=None, pad_edge=False, padding=(0, 1))
     table.add_column("mean-square error")
-    for head in ("measured", "95 % interval", "predicted", "z"):
+    predicted = f"predicted, {LAW_NAMES[document['law']]}" if document.get("laws") else "predicted"
+    for head in ("measured", "95 % interval", predicted, "z"):
         table.add_column(head, justify="right")
 
     def row(label: str, entry: dict[str, Any] | None) -> None:
@@ -205,14 +214,27 @@ def _print_rejected(messages: Sequence[dict[str, Any]], console: Console) -> Non
 
 
 def verdict_line(document: dict[str, Any]) -> str:
-    """The verdict on one run or several; in real time with missed deadlines, which are not a disagreement."""
+    """The verdict on one run or several; in real time also on the prediction made before the run."""
     verdict = VERDICTS[document["verdict"]]
+    if real_time := document.get("real_time"):
+        return _realtime_line(document["verdict"], real_time)
     if document.get("bags"):
         verdict = verdict.replace("The run agrees", "The runs agree").replace("The run disagrees", "The runs disagree")
-    deadlines = (document.get("timing") or {}).get("deadlines")
-    if not deadlines or not deadlines["missed"]:
-        return verdict
-    return f"{verdict.removesuffix('.')}; {percent(deadlines['share'])} of the deadlines were missed."
+    return verdict
+
+
+def _realtime_line(verdict: str, real_time: dict[str, Any]) -> str:
+    """Two statements: on the agents given what they received, and on the prediction made before the run."""
+    obeys = "follow" if real_time["follows_model"] else "do not follow"
+    line = f"The agents {obeys} the model, given what they received; the prediction for real time is "
+    line += {True: "supported", False: "not supported", None: "not decided"}[real_time["prediction"]]
+    missed, limit = real_time["missed"], real_time["max_missed"]
+    if missed:
+        line += f"; {percent(missed)} of the deadlines were missed"
+    start = VERDICTS[verdict].removesuffix(".")
+    if verdict == "late":
+        return f"{start} (at most {percent(limit)} may be missed). {line}."
+    return f"{line}." if verdict in ("agrees", "disagrees") else f"{start}. {line}."
 
 
 def timing_facts(timing: dict[str, Any]) -> list[tuple[str, str]]:
@@ -323,6 +345,7 @@ def live_document(report: LiveReport, record: RunRecord) -> dict[str, Any]:
         "run": str(record.run),
         "experiment": record.experiment.name,
         "names": record.experiment.names,
+        "law": step_law(record.experiment),
         "first_step": report.first,
         "last_step": report.last,
         "steps": report.steps,

@@ -102,7 +102,7 @@ def _packed(content: bytes) -> str:
     return base64.b64encode(gzip.compress(content, mtime=0)).decode()
 
 
-SYMBOLS = {"agrees": "✓", "disagrees": "✗", "incomplete": "?", "unpredicted": "–"}
+SYMBOLS = {"agrees": "✓", "disagrees": "✗", "late": "!", "incomplete": "?", "unpredicted": "–"}
 _SHOWN_SEEDS = 8
 
 

@@ -336,7 +336,7 @@ def print_salvage(document: dict[str, Any], console: Console) -> None:
     console.print(facts)
 
 
-_STYLES = {"agrees": "green", "disagrees": "bold red", "incomplete": "yellow"}
+_STYLES = {"agrees": "green", "disagrees": "bold red", "late": "yellow", "incomplete": "yellow"}
 _OPTIONAL = ("predicted", "z", "± (95 %)", "date", "experiment")  # of runs, as in ``that_fit``
 
 
@@ -352,7 +352,7 @@ def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Cons
             run.name or "-",
             f"{run.date:%Y-%m-%d %H:%M}",
             "-" if run.seed is None else str(run.seed),
-            run.verdict or run.status,
+            (run.verdict or run.status) + ("" if run.prediction is None else f"; prediction {run.prediction}"),
             number_text(run.measured),
             half_width_text((run.low, run.high)),
             number_text(run.predicted),

@@ -37,6 +37,8 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
     for key, title in LAW_NAMES.items():
         if key in document and document[key] is None:
             console.print(f"{title.capitalize()}: infinite, or not defined with this noise", style="dim")
+    if LAW_NAMES["sequential"] in laws:
+        console.print("Sequential steps: in real time, if no step is late and every message arrives at once.")
     for line in tails_words(document):
         console.print(Text(line, style="yellow"))
 

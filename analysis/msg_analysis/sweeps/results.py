@@ -149,15 +149,15 @@ class SweepVerdict:
     """What the runs of a sweep say together; the tuples are in the order of the outcomes."""
 
     p_adjusted: tuple[float | None, ...]  # p-values, adjusted over all of them (Holm); None where there is none
-    verdicts: tuple[str | None, ...]  # "agrees", "disagrees", "unpredicted"; None for predictions and failures
-    # "disagrees" if any run does; else "incomplete" if anything failed; else "agrees", or None for predictions. Runs
-    # that are all "unpredicted" count as "agrees".
+    verdicts: tuple[str | None, ...]  # "agrees", "disagrees", "late", "unpredicted"; None for predictions and failures
+    # "disagrees" if any run does; else "incomplete" if anything failed; else "late" if any run is; else "agrees", or
+    # None for predictions. Runs that are all "unpredicted" count as "agrees".
     verdict: str | None
 
     @property
     def exit_code(self) -> int:
-        """0 agrees or only predictions, 1 disagrees, 3 something failed."""
-        codes = {"disagrees": ExitCode.DISAGREES, "incomplete": ExitCode.INCOMPLETE}
+        """0 agrees or only predictions, 1 disagrees, 3 something failed, 4 late."""
+        codes = {"disagrees": ExitCode.DISAGREES, "incomplete": ExitCode.INCOMPLETE, "late": ExitCode.LATE}
         return codes.get(self.verdict or "", ExitCode.FINE)
 
 
@@ -171,10 +171,11 @@ def evaluate_sweep(outcomes: Sequence[Outcome], level: float) -> SweepVerdict:
             adjusted[place] = float(p)
     verdicts: list[str | None] = []
     for outcome, p in zip(outcomes, adjusted, strict=True):
-        verdict = "unpredicted" if outcome.result.get("unpredicted") else "agrees"
+        late = outcome.result.get("verdict") == "late"
+        verdict = "unpredicted" if outcome.result.get("unpredicted") else "late" if late else "agrees"
         verdict = "disagrees" if p is not None and p < level else verdict
         verdicts.append(None if outcome.status == FAILED or "verdict" not in outcome.result else verdict)
-    whole = "agrees" if any(verdicts) else None
+    whole = "late" if "late" in verdicts else "agrees" if any(verdicts) else None
     if any(outcome.status == FAILED for outcome in outcomes):
         whole = "incomplete"
     return SweepVerdict(tuple(adjusted), tuple(verdicts), "disagrees" if "disagrees" in verdicts else whole)

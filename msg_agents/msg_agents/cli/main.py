@@ -30,6 +30,7 @@ from msg_analysis.cli.options import (
     duration_option,
     experiment_argument,
     json_option,
+    max_missed_option,
     out_option,
     positive_option,
     seed_option,
@@ -109,6 +110,7 @@ def _interruption() -> Interruption:
 @click.option("--no-record", is_flag=True, help="Do not record: no bag, no verdict.")
 @_no_analyse
 @_write_report
+@max_missed_option
 @seed_option
 @duration_option
 @set_option
@@ -158,6 +160,7 @@ def run(
     no_record: bool,
     no_analyse: bool,
     write_report: ReportWhen,
+    max_missed: float,
     changes: tuple[str, ...],
     until_text: str | None,
     readers: tuple[str, ...],
@@ -216,8 +219,8 @@ def run(
                 until=until,
                 **given,
             )
-        how: dict[str, Any] = {"analyse": not no_analyse, "report": write_report, "verbose": verbose}
-        finish(result, as_json, view.display.end, interruption=interruption, **how)
+        how: dict[str, Any] = {"analyse": not no_analyse, "report": write_report, "max_missed": max_missed}
+        finish(result, as_json, view.display.end, interruption=interruption, verbose=verbose, **how)
 
 
 @click.command(
@@ -240,6 +243,7 @@ def run(
 @_restarts("processes of this host")
 @_no_analyse
 @_write_report
+@max_missed_option
 @_no_fork
 @click.option(
     "--profile", "only_profile", is_flag=True, help="Only print the discovery profile, for other ROS 2 tools."
@@ -258,6 +262,7 @@ def host(
     restarts: int,
     no_analyse: bool,
     write_report: ReportWhen,
+    max_missed: float,
     no_fork: bool,
     only_profile: bool,
     storage: Storage,
@@ -302,7 +307,8 @@ def host(
             assignment=assignment,
             interruption=interruption,
         )
-    finish(result, as_json, interruption=interruption, analyse=not no_analyse, report=write_report, verbose=verbose)
+    how: dict[str, Any] = {"analyse": not no_analyse, "report": write_report, "max_missed": max_missed}
+    finish(result, as_json, interruption=interruption, verbose=verbose, **how)
     if not assignment.has_recorder and not as_json:
         click.echo(f"the run has ended: its verdict is on {places.recorder}")
 

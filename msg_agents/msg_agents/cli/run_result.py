@@ -30,6 +30,7 @@ def finish(
     interruption: Interruption,
     analyse: bool = True,
     report: ReportWhen = "always",
+    max_missed: float = 0.05,
     verbose: bool = False,
 ) -> None:
     """Print the failures, compare what was recorded (until a signal), show the result, and exit with its code."""
@@ -43,7 +44,7 @@ def finish(
         progress = WorkProgress()
         try:
             with interruption.let_through(), progress, watched(progress):
-                conclude(result, report)
+                conclude(result, report, max_missed=max_missed)
         except KeyboardInterrupt:
             result.interrupt(signal.SIGINT, "while the run was compared with the prediction")
             complain(result.failures[0], "failed:")
@@ -62,7 +63,7 @@ def _ending(result: RunResult) -> dict[str, Any]:
     if result.comparison is None:
         return {"text": "The run has ended.", "verdict": None}
     verdict = result.comparison.verdict
-    words = {"incomplete": "the data are incomplete", "unpredicted": "there is no prediction"}
+    words = {"incomplete": "the data are incomplete", "unpredicted": "there is no prediction", "late": "it was late"}
     outcome = words.get(verdict, f"it {verdict} with the prediction")
     return {"text": f"The run has ended; {outcome}.", "verdict": verdict}
 

@@ -239,13 +239,13 @@ def _without_comparison(experiment: Experiment) -> dict[str, Any]:
     }
 
 
-def conclude(result: RunResult, report: ReportWhen = "always") -> None:
-    """Set the ``comparison`` of a run whose bag was read, and write report.html and result.json into the bag."""
+def conclude(result: RunResult, report: ReportWhen = "always", **limits: float) -> None:
+    """Set the ``comparison`` (``limits``: arguments of it) of a run whose bag was read, and write report and result."""
     if result.trajectory is None or result.bag is None:
         return
     from msg_analysis.inference.pool import compare
 
-    comparison = compare(result.trajectory)
+    comparison = compare(result.trajectory, **limits)
     if result.channel is not None and comparison.timing is not None:
         from msg_agents.run.run_channel import channel_findings
 

@@ -75,7 +75,8 @@ _LEGEND = "  ● measured ◆ predicted"
 def panel_of(snapshot: Snapshot, experiment: Experiment, *, width: int, height: int) -> RenderableType:
     """The panel, for a terminal of ``width`` by ``height`` characters."""
     agents = "1 agent" if experiment.agents == 1 else f"{experiment.agents} agents"
-    title = Text(f"{experiment.name}: {agents}, {experiment.run.pace}", style="bold")
+    pace = "real time, predicted for sequential steps" if experiment.run.pace == "realtime" else "lockstep"
+    title = Text(f"{experiment.name}: {agents}, {pace}", style="bold")
     if snapshot.reached < 0:
         waiting = "starting" if not snapshot.steps else "waiting for the first states"
         return Panel(Text(waiting), title=title, title_align="left")

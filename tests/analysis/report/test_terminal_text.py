@@ -254,8 +254,13 @@ def test_real_time() -> None:
     }
     laws = {"pattern": law | {"supported": True}, "sequential": law, "continuous": law | {"supported": False}}
     document = comparison("agrees", 3, 2.0) | {"timing": timing, "laws": laws | {"why": "the reasons"}}
+    document["law"] = "pattern"
+    document["real_time"] = {"follows_model": True, "prediction": False, "missed": 0.073, "max_missed": 0.1}
     short = compared(document)
-    assert short.startswith("The run agrees with the prediction; 7.3 % of the deadlines were missed.")
+    assert short.startswith(
+        "The agents follow the model, given what they received; the prediction for real time is not"
+    )
+    assert "is not supported; 7.3 % of the deadlines were missed." in " ".join(short.split())
     assert "the reasons" in short
     assert "lateness [ms]" not in short
     output = compared(document, verbose=True)
@@ -263,7 +268,7 @@ def test_real_time() -> None:
         assert part in output
     assert re.search(r"neighbour values as recent as with ideal timers +75 %", output)
     assert "neighbours before their first message" in output
-    assert output.count("supported") == 2
+    assert output.count("supported") == 3
     assert "not decided" in output
     assert "the reasons" in output
     lockstep = compared(comparison("agrees", 3, 2.0), verbose=True)

@@ -53,7 +53,7 @@ def test_a_run_with_a_result(tmp_path: Path, bag: Path) -> None:
     assert entry.date == datetime(2026, 11, 25, 13, 5, 1).astimezone()
     kept = {key: RESULT[key] for key in ("verdict", "run", "seed", "simulated_time")}
     kept |= {key: RESULT["system_error"][key] for key in ("measured", "predicted", "standard_error", "z")}
-    kept |= {"status": "compared", "date": entry.date.isoformat(), "problem": None, "name": "pair"}
+    kept |= {"status": "compared", "date": entry.date.isoformat(), "problem": None, "name": "pair", "prediction": None}
     kept |= {"folder": str(folder), "report": str(folder / "report.html"), "given_path": False}
     assert entry.to_json() == kept | {"low": pytest.approx(1.01, abs=1e-4), "high": pytest.approx(1.99, abs=1e-4)}
 
