@@ -32,7 +32,7 @@ from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.result import EventLog, RunResult
 from msg_agents.run.run_channel import RunChannel
 from msg_agents.run.supervisor import CLOCKS, CRASHED, HUNG, LATE, STATUS_FOLDER, STEPS, Supervisor
-from msg_agents.stepping.monitoring import ClockDetector, LagDetector, StallDetector
+from msg_agents.stepping.monitoring import ClockDetector, LagDetector, StallDetector, silence_text
 from msg_agents.terminal import Interruption
 from msg_agents.watch.observer import EarlyEnd
 from msg_agents.watch.panel import View
@@ -266,10 +266,13 @@ def _watch(
             view.note(f"no step for {stall.stalled:.0f} s: {_stall_causes(supervisor, result.experiment.names)}")
         if reached < 0:
             continue
-        if lag and reached < steps and (behind := lag.update(reached)):
+        if lag and reached < steps and (late := lag.update(supervisor.steps)):
+            others = len(supervisor.steps) - len(late.silent)
             view.note(
-                f"the network cannot keep up: it is {behind:.1f} s behind the {due:g} steps/s of real time: lower "
-                f"`run: speed: {run.speed:g}`, or give several agents to one process (`run: processes`)"
+                silence_text(late.silent, late.quiet, others, supervisor.pids, result.experiment.names)
+                if late.silent
+                else f"the network cannot keep up: it is {late.behind:.1f} s behind the {due:g} steps/s of real time: "
+                f"lower `run: speed: {run.speed:g}`, or give several agents to one process (`run: processes`)"
             )
         now = time.monotonic()
         began = began or now

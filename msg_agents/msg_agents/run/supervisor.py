@@ -290,6 +290,11 @@ class Supervisor:
         return {node: child.process for child in self.children for node in child.spec.nodes}
 
     @property
+    def pids(self) -> dict[int, int]:
+        """PID of the process of every agent (from 0) of this host."""
+        return {agent: child.process.pid for child in self.running for agent in child.spec.agents}
+
+    @property
     def running(self) -> list[Child]:
         """Children that have not ended."""
         return [child for child in self.children if child.running]

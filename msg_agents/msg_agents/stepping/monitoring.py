@@ -6,10 +6,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Any
+
+from msg_analysis.common.text import agent_name
 
 STALL_TIME = 5.0  # s without a step, after which an agent counts as stalled
 LAG_TIME = 2.0  # s behind its clock after which a run in real time counts as too slow; agents report every 0.2 s
@@ -41,6 +43,24 @@ class StallDetector:
         return True
 
 
+def silence_text(
+    agents: Sequence[int], seconds: float, others: int, pids: Mapping[int, int], names: Sequence[str] | None
+) -> str:
+    """That these agents (from 0) have made no step for so long, while ``others`` have; ``pids`` of those known."""
+    shown = [agent_name(i + 1, names) + (f" (PID {pids[i]})" if i in pids else "") for i in agents]
+    who = f"agent {shown[0]} has" if len(shown) == 1 else f"agents {', '.join(shown)} have"
+    return f"{who} made no step for {seconds:.1f} s; the other {others} {'is' if others == 1 else 'are'} on time"
+
+
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """A run in real time is behind its clock."""
+
+    behind: float  # s
+    silent: tuple[int, ...]  # agents (from 0) without a step for a while, where all others are on time; else empty
+    quiet: float = 0.0  # s without a step of these
+
+
 class LagDetector:
     """Notices that a run in real time falls behind its clock; ``rate``: steps that are due per second."""
 
@@ -49,18 +69,27 @@ class LagDetector:
         self._began: float | None = None
         self._first = 0
         self._next_warning = LAG_TIME
+        self._moved: list[tuple[int, float]] = []  # newest step of every agent, and since when
 
-    def update(self, step: int) -> float | None:
-        """After each look at the newest step of all agents: s behind, if to warn now, and again when it has doubled."""
-        now = self._clock()
+    def update(self, steps: Sequence[int]) -> Lag | None:
+        """After each look at the newest step of every agent: what to warn of now, and again when it has doubled."""
+        now, step = self._clock(), min(steps)
+        before = self._moved if len(self._moved) == len(steps) else [(-1, now)] * len(steps)
+        self._moved = [old if new <= old[0] else (new, now) for old, new in zip(before, steps, strict=True)]
         if self._began is None or step == self._first:  # waiting for the epoch
             self._began, self._first = now, step
             return None
-        behind = now - self._began - (step - self._first) / self._rate
+        due = self._first + (now - self._began) * self._rate
+        behind = (due - step) / self._rate
         if behind < self._next_warning:
             return None
         self._next_warning = 2.0 * behind
-        return behind
+        ages = {agent: now - since for agent, (_, since) in enumerate(self._moved)}
+        silent = tuple(agent for agent, age in ages.items() if age > LAG_TIME / 2.0)
+        others = [steps[agent] for agent in ages if agent not in silent]
+        if not silent or not others or due - min(others) >= LAG_TIME * self._rate:
+            return Lag(behind, ())
+        return Lag(behind, silent, min(ages[agent] for agent in silent))
 
 
 class ClockDetector:

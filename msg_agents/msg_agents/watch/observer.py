@@ -10,8 +10,9 @@ import mmap
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -30,7 +31,7 @@ from msg_analysis.model.step_model import first_graph
 
 if TYPE_CHECKING:
     from msg_analysis.inference.online_errors import LiveEstimate, LiveReport
-    from msg_analysis.inference.online_steps import LoggedStates, StateLog
+    from msg_analysis.inference.online_steps import LoggedStates, Recent, StateLog
 
 
 BLOCK = 2000  # steps that are taken at once: limits the memory that a large network needs
@@ -104,6 +105,18 @@ class CheckpointReader:
         self.missed += int((~good).sum())
         return steps[:-1][good], modes[1:][good] - 1, states[:-1][good], states[1:][good]
 
+    def newest(self, steps: Sequence[int], count: int) -> Recent:
+        """The last ``count`` steps that some agent has made, from the newest step of each; NaN where one has not."""
+        from msg_analysis.inference.online_steps import Recent
+
+        last = max(steps)
+        chosen = np.arange(max(0, last - min(count, self._capacity // 2) + 1), last + 1)
+        states, modes = np.full((len(chosen), self._agents), np.nan), np.zeros(len(chosen), np.int64)
+        for agent, ring in enumerate(self._rings):
+            data, length, whole = self._read(ring, chosen)
+            states[whole, agent] = self._numbers(data, length - self._beside, self._width)[whole, 0]
+        return Recent(chosen, modes, states)
+
     def stamps(self, steps: IntArray) -> IntArray:
         """Stamps [ns] of these states of every agent, (b, m); -1 where a slot does not hold its step."""
         slots, found = steps % self._capacity, []
@@ -165,6 +178,13 @@ class RunObserver:
     def look(self, reached: int) -> None:
         """Set the newest step that all agents have published (-1: none)."""
         self._newest = reached
+
+    def beside(self, steps: Sequence[int]) -> LiveReport | None:
+        """The newest numbers, with the newest states of each agent, from its newest step, though another has none."""
+        from msg_analysis.inference.online_steps import WINDOW
+
+        report = self.report
+        return report and replace(report, recent=self._reader.newest(steps, WINDOW))
 
     def ends_at(self, step: int) -> None:
         """The run ends at this step, before its planned end."""

@@ -82,6 +82,8 @@ def panel_of(snapshot: Snapshot, experiment: Experiment, *, width: int, height: 
         return Panel(Text(waiting), title=title, title_align="left")
     inside = max(width - 4, 20)
     lines = [_progress(snapshot, experiment, inside), _graph(snapshot, experiment), _coverage(snapshot, experiment)]
+    if snapshot.warning:
+        lines.append(Text(snapshot.warning, style="bold yellow", no_wrap=True, overflow="ellipsis"))
     lines += _system(snapshot, inside)
     room = height - FIXED_LINES
     if room >= 3:
@@ -373,7 +375,10 @@ class RunView(View):
             return
         self._shown = now
         report, note = (observer.report, observer.note) if observer else (None, None)
-        snapshot = self._source.snapshot(steps, report, note or self._note, self._ended())
+        if observer and self._source.silent(steps):
+            report = observer.beside(steps)
+        pids = {i: process.pid for i, process in enumerate(self._processes) if process is not None}
+        snapshot = self._source.snapshot(steps, report, note or self._note, self._ended(), pids)
         self.display.draw(snapshot, self._experiment)
         if not self.display.panel and now - self._printed >= LINES and snapshot.reached >= 0:
             self._printed = now

@@ -5,13 +5,18 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from msg_analysis.common.text import agent_text
+import numpy as np
+
+from msg_agents.stepping.monitoring import silence_text
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.text import agent_text, finite
 from msg_analysis.model.graph_path import HoldingPeriod, holding_periods
 from msg_analysis.model.step_model import first_graph
 
@@ -123,11 +128,13 @@ class Snapshot:
     path: list[HoldingPeriod] = field(default_factory=list)  # holding periods from the oldest of ``report.recent`` on
     events: tuple[tuple[int, str], ...] = ()  # the newest ``MOST_EVENTS``: step that all had reached, text
     last: int | None = None  # last step of a run that ends before its planned end; None: not known to do so
+    silent: frozenset[int] = frozenset()  # in real time: agents (from 0) without a step for a while, others have some
+    warning: str | None = None  # about these
 
     @property
     def reached(self) -> int:
-        """The step that every agent has reached; -1: none. What is done after the end is not a part of the run."""
-        reached = min(self.steps, default=-1)
+        """The step that every agent has reached, but for silent ones; -1: none. What is after the end is no part."""
+        reached = min((step for agent, step in enumerate(self.steps) if agent not in self.silent), default=-1)
         return reached if self.last is None else min(reached, self.last)
 
 
@@ -135,7 +142,8 @@ class SnapshotSource:
     """Makes snapshots of a run from the steps that its agents have reached."""
 
     def __init__(self, experiment: Experiment, clock: Callable[[], float] = time.monotonic) -> None:
-        self._steps = experiment.steps
+        self._steps, self._names = experiment.steps, experiment.names
+        self._silent_after = silent_after(experiment) if experiment.run.pace == "realtime" else math.inf
         self._last: int | None = None  # where the run ends early
         self._holding_periods, self._rates = HoldingPeriods(experiment), StepRates(clock)
         self._presence = Presence(experiment.names, clock)
@@ -151,14 +159,31 @@ class SnapshotSource:
         """Something happened, now."""
         self._events.append((self._reached, text))
 
+    def silent(self, steps: Sequence[int]) -> frozenset[int]:
+        """In real time: agents (from 0) that have made no step for a while, if others have."""
+        ages = self._presence.ages() if len(steps) > 1 else []
+        silent = {i for i, age in enumerate(ages) if age > self._silent_after and -1 < steps[i] < self._steps}
+        return frozenset(silent) if len(silent) < len(steps) else frozenset()
+
     def snapshot(
-        self, steps: Sequence[int], report: LiveReport | None = None, note: str | None = None, ended: Iterable[int] = ()
+        self,
+        steps: Sequence[int],
+        report: LiveReport | None = None,
+        note: str | None = None,
+        ended: Iterable[int] = (),
+        pids: Mapping[int, int] | None = None,
     ) -> Snapshot:
         """The snapshot now, from the newest step of every agent; ``ended``: those (from 0) without a process."""
         now = Snapshot(list(steps), report=report, note=note or (report.note if report else None), last=self._last)
         self._reached = max(self._reached, now.reached)
         for text in self._presence.add(steps, ended):
             self.happened(text)
+        if silent := self.silent(steps):
+            ages = self._presence.ages()
+            quiet, others = min(ages[i] for i in silent), len(steps) - len(silent)
+            words = silence_text(sorted(silent), quiet, others, pids or {}, self._names)
+            now = replace(now, silent=silent, warning=words)
+        self._reached = max(self._reached, now.reached)
         for reason, count in (report.refused if report else {}).items():
             if reason not in self._refused:
                 self.happened(f"messages are refused: {reason} ({count} so far)")
@@ -175,11 +200,17 @@ class SnapshotSource:
         return now if recent is None else replace(now, path=self._holding_periods.since(int(recent.steps[0])))
 
 
+def silent_after(experiment: Experiment) -> float:
+    """Seconds without a new step after which an agent is shown as silent."""
+    run = experiment.run
+    return max(SILENT, 5 * experiment.step_length / run.speed if run.pace == "realtime" else 0.0)
+
+
 def run_description(experiment: Experiment) -> dict[str, Any]:
     """What does not change in a run, for a page that draws it: agents, graphs, positions."""
     from msg_analysis.report.look import places
 
-    where, realtime = places(experiment.graph_list), experiment.run.pace == "realtime"
+    where = places(experiment.graph_list)
     return {
         "name": experiment.name,
         "problem": experiment.problem,
@@ -188,7 +219,7 @@ def run_description(experiment: Experiment) -> dict[str, Any]:
         "steps": experiment.steps,
         "dt": experiment.step_length,
         "pace": experiment.run.pace,
-        "silent": max(SILENT, 5 * experiment.step_length / experiment.run.speed if realtime else 0.0),
+        "silent": silent_after(experiment),
         "leaders": list(experiment.spec.leaders.agents) if experiment.spec.leaders else [],
         "reference": experiment.reference if experiment.spec.leaders else None,
         "graphs": [
@@ -218,7 +249,7 @@ def snapshot_document(snapshot: Snapshot, before: Mapping[str, Any] | None = Non
         "system": report.system.to_json() if report else None,
         "nodes": [node.to_json() for node in report.nodes] if report else None,
         "any_time": report.any_time.to_json() if report else None,
-        "values": None if recent is None else recent.states[-1].tolist(),
+        "values": None if recent is None else finite(_newest(recent.states).tolist()),
         "values_step": None if recent is None else int(recent.steps[-1]),
         "trace": None if recent is None else _trace(snapshot, recent, before and before["trace"]),
         "lateness": report.lateness if report else None,
@@ -226,7 +257,15 @@ def snapshot_document(snapshot: Snapshot, before: Mapping[str, Any] | None = Non
         "gone": sorted(snapshot.gone),
         "events": [list(event) for event in snapshot.events],
         "note": snapshot.note,
+        "warning": snapshot.warning,
     }
+
+
+def _newest(states: FloatArray) -> FloatArray:
+    """(m,) newest state of every agent, of (b, m) with NaN where there is none."""
+    there = ~np.isnan(states)
+    rows = len(states) - 1 - np.argmax(there[::-1], axis=0)
+    return np.asarray(states[rows, range(states.shape[1])])
 
 
 def _trace(snapshot: Snapshot, recent: Recent, before: Mapping[str, Any] | None) -> Mapping[str, Any]:
@@ -236,6 +275,6 @@ def _trace(snapshot: Snapshot, recent: Recent, before: Mapping[str, Any] | None)
         return before
     return {
         "steps": steps,
-        "agents": [[float(f"{x:.4g}") for x in column] for column in recent.states.T[:MOST_TRACED].tolist()],
+        "agents": finite([[float(f"{x:.4g}") for x in column] for column in recent.states.T[:MOST_TRACED].tolist()]),
         "path": [[each.mode, each.first_step, each.last_step] for each in snapshot.path],
     }

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from msg_agents.stepping.monitoring import ClockDetector, ClockOffsets, LagDetector, StallDetector
+from msg_agents.stepping.monitoring import ClockDetector, ClockOffsets, Lag, LagDetector, StallDetector, silence_text
 
 
 class Clock:
@@ -35,16 +35,32 @@ def test_a_run_that_keeps_up(clock: Clock) -> None:
     detector = LagDetector(100.0, clock)
     for tick in range(1000):
         clock.now = 100.0 + 0.05 * tick
-        assert detector.update(max(0, 20 * int(5 * (clock.now - 100.5)))) is None
+        assert detector.update([max(0, 20 * int(5 * (clock.now - 100.5)))] * 2) is None
 
 
 def test_a_run_at_half_the_speed(clock: Clock) -> None:
     detector, told = LagDetector(100.0, clock), []
     for second in range(40):
         clock.now = 100.0 + second
-        if behind := detector.update(50 * second):
-            told.append((second, behind))
-    assert told == [(4, 2.0), (8, 4.0), (16, 8.0), (32, 16.0)]
+        if lag := detector.update([50 * second] * 3):
+            told.append((second, lag))
+    assert told == [(second, Lag(second / 2.0, ())) for second in (4, 8, 16, 32)]
+
+
+def test_one_silent_agent_is_not_a_slow_network(clock: Clock) -> None:
+    """It stands still from second 10 on; the others are on time, until they are as slow."""
+    detector, told = LagDetector(100.0, clock), []
+    for second in range(30):
+        clock.now = 100.0 + second
+        on_time = 100 * second - (50 * (second - 13) if second > 13 else 0)
+        if lag := detector.update([on_time, on_time, 100 * min(second, 10)]):
+            told.append(lag)
+    assert told[0] == Lag(2.0, (2,), 2.0)
+    assert told[1:] == [Lag(4.0, (2,), 4.0), Lag(8.0, ()), Lag(16.0, ())]
+    words = silence_text((2,), 2.0, 2, {2: 1234}, None)
+    assert words == "agent 3 (PID 1234) has made no step for 2.0 s; the other 2 are on time"
+    two = silence_text((0, 2), 2.0, 1, {}, ["a", "b", "c"])
+    assert two == "agents a, c have made no step for 2.0 s; the other 1 is on time"
 
 
 def test_a_clock_that_is_set(clock: Clock) -> None:

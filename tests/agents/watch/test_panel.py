@@ -200,6 +200,22 @@ def test_an_agent_that_goes_and_comes_back() -> None:
     ]
 
 
+def test_a_silent_agent_in_real_time_stops_nobody_else() -> None:
+    """The run goes on where the others are, with a warning; in lockstep all wait, and none is named."""
+    clock = SimpleNamespace(now=100.0)
+    for pace, reached, silent in (("realtime", 90, {1}), ("lockstep", 50, set())):
+        source = SnapshotSource(_experiment().with_run(pace=pace), lambda: clock.now)
+        source.snapshot([50] * 5)
+        clock.now += 2.0
+        source.snapshot([90, 50, 90, 90, 90])
+        clock.now += 0.1
+        found = source.snapshot([90, 50, 90, 90, 90], pids={1: 77})
+        assert (found.reached, found.silent) == (reached, silent)
+        document = snapshot_document(found)
+        said = "agent 2 (PID 77) has made no step for 2.1 s; the other 4 are on time" if silent else None
+        assert document["warning"] == said
+
+
 def test_the_states_for_the_page_have_the_graphs_of_their_steps() -> None:
     ours = _experiment()
     trajectory = simulate(ours)

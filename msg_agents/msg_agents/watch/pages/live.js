@@ -105,7 +105,7 @@ function keys(agents) {
 
 function show(data) {
   if (!setting) return;
-  if (!over) say("", data.reached < 0 ? "the network is starting" : "running");
+  if (!over) say(data.warning ? "late" : "", data.reached < 0 ? "the network is starting" : data.warning || "running");
   const reached = Math.max(data.reached, 0);
   const last = data.last === null ? setting.steps : data.last;  // a run may end before its planned end
   at("progress").value = reached / last;
@@ -123,10 +123,12 @@ function show(data) {
   const silent = (agent) => !over && !finished(agent) && data.ages.length > 0 && data.ages[agent] > setting.silent && data.reached >= 0;
   const away = (agent) => gone.has(agent) || silent(agent);
   if (data.values) {
-    const middle = setting.reference === null ? data.values.reduce((sum, value) => sum + value, 0) / data.values.length : setting.reference;
-    const square = data.values.reduce((sum, value) => sum + (value - middle) ** 2, 0) / data.values.length;
+    const there = data.values.filter((value) => value !== null), mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
+    const middle = setting.reference === null ? mean(there) : setting.reference;
+    const square = mean(there.map((value) => (value - middle) ** 2));
     scale = scale ? scale + 0.1 * (square - scale) : square;
     data.values.forEach((value, agent) => {
+      if (value === null) return;
       balls[agent].shape.setAttribute("fill", colour((value - middle) / (2 * Math.sqrt(scale) || 1)));
       balls[agent].title.textContent = `agent ${called(agent)}: ${number(value)} at step ${data.values_step}`;
     });
@@ -193,7 +195,7 @@ function trace() {
   const { box, width, height } = drawn, left = 46, right = width - 8, top = 6, bottom = height - 44;
   const first = steps[0], last = Math.max(steps[steps.length - 1], first + 1);
   const shown = agents.map((values, agent) => [agent, values]).filter(([agent]) => !off.has(agent));
-  const all = shown.flatMap(([, values]) => values), reference = setting.reference;
+  const all = shown.flatMap(([, values]) => values.filter((value) => value !== null)), reference = setting.reference;
   if (reference !== null) all.push(reference);
   if (!all.length) all.push(0);
   let low = Math.min(...all), high = Math.max(...all);
@@ -213,7 +215,8 @@ function trace() {
     const pieces = [];
     values.forEach((value, place) => {
       // A line joins successive steps only: what is missing stays a gap.
-      if (!place || steps[place] !== steps[place - 1] + 1) pieces.push([]);
+      if (value === null) return;
+      if (!place || values[place - 1] === null || steps[place] !== steps[place - 1] + 1) pieces.push([]);
       pieces[pieces.length - 1].push(`${x(steps[place]).toFixed(1)},${y(value).toFixed(1)}`);
     });
     for (const piece of pieces) {
