@@ -18,8 +18,8 @@ from typing import Any, Literal
 
 from msg_analysis.bags.files import METADATA_FILE, first_file, starting_time
 from msg_analysis.bags.stored_file import BAG_SUFFIXES
-from msg_analysis.common.files import REPORT_FILE, RESULT_FILE, read_text
-from msg_analysis.common.text import HALF_WIDTH_95, agent_name, with_names
+from msg_analysis.common.files import REPORT_FILE, RESULT_FILE, read_text, write_whole
+from msg_analysis.common.text import HALF_WIDTH_95, agent_name, json_text, with_names
 from msg_analysis.errors import BagError, InputError
 
 _WANTED = "expected what `msg-analysis compare --json` or `msg-agents run` wrote"
@@ -65,6 +65,17 @@ def read_document(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise InputError(f"{file}: not a JSON object: {_WANTED}")
     return {_RENAMED.get(key) or key: value for key, value in document.items()}
+
+
+def keep_result(bag: Path, document: dict[str, Any]) -> None:
+    """Keep a comparison with its bag, as ``result.json``, beside what a network has said of it there; OSError."""
+    try:
+        before = read_document(bag)
+    except InputError:
+        before = {"bag": str(bag)}
+    if before.get("run") not in (None, document["run"]):  # not of this run
+        before = {"bag": str(bag)}
+    write_whole(bag / RESULT_FILE, json_text(before | document | {"until": before.get("until")}, 1).encode() + b"\n")
 
 
 def _file(path: Path) -> Path:
@@ -237,6 +248,8 @@ def _compared(folder: Path, date: datetime, report: str | None) -> RunEntry:
     untested = {"measured": row.measured, "standard_error": None, "predicted": row.predicted}
     tested = tested_error(document, folder / RESULT_FILE) or untested
     measured, error, predicted = tested["measured"], tested["standard_error"], tested["predicted"]
+    if row.verdict == "incomplete" and not row.simulated_time:
+        measured = error = None  # nothing was compared
     low = high = z = None
     if measured is not None and error is not None:
         low, high = measured - HALF_WIDTH_95 * error, measured + HALF_WIDTH_95 * error

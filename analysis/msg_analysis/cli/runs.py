@@ -172,6 +172,7 @@ def diff(a: Path, b: Path, *, as_json: bool) -> None:
 @click.argument("bags", metavar="BAG...", nargs=-1, required=True, type=BAG)
 @level_option("Probability of a false 'disagrees', over all tests.")
 @max_missed_option
+@click.option("--save/--no-save", default=True, help="Keep the result with a single bag (result.json), for `runs`.")
 @click.option("--report", type=FILE, metavar="FILE", help="Also write an HTML report.")
 @verbose_option
 @json_option
@@ -182,6 +183,7 @@ def compare(
     *,
     level: float,
     max_missed: float,
+    save: bool,
     report: Path | None,
     verbose: bool,
     as_json: bool,
@@ -195,6 +197,7 @@ def compare(
     from msg_analysis.cli.console import WorkProgress
     from msg_analysis.common.files import require_place
     from msg_analysis.inference.pool import compare as compare_runs
+    from msg_analysis.runs import keep_result
 
     require_place(report)
     with WorkProgress() as progress, watched(progress):
@@ -203,6 +206,11 @@ def compare(
             from msg_analysis.report.page import write_report
 
             write_report(comparison, report)
+    if save and len(bags) == 1 and bags[0].is_dir():
+        try:
+            keep_result(bags[0], comparison.to_json())
+        except OSError as error:
+            print_note(f"{bags[0]}: the result could not be kept ({error.strerror}): --no-save leaves it out")
     if as_json:
         print_json(comparison.to_json())
     else:

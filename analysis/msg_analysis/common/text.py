@@ -69,7 +69,7 @@ def duration_text(seconds: float) -> str:
     return f"{whole // 60} min {whole % 60} s" if whole < 3600 else f"{whole // 3600} h {whole % 3600 // 60} min"
 
 
-_NUMBER = r"(?<![\w.])\d+(?![\w.])"
+_NUMBER = r"(?<![\w.])\d+(?!\w|\.\d)"
 _AGENTS = re.compile(rf"\b([Aa]gents? )({_NUMBER}(?:(?:,| and|, and) {_NUMBER})*)(?! to \d)")
 
 

@@ -465,6 +465,12 @@ class Experiment(Variants):
         return self.run.steps
 
     @property
+    def holding_times(self) -> list[float | None]:
+        """Mean time in each graph before it is left [units of simulated time]; None where it is never left."""
+        unit = self.step_length if self.time == "discrete" else 1.0
+        return [None if time is None else unit * time for time in self.chain.holding_times]
+
+    @property
     def step_length(self) -> float:
         """Simulated time of a step, ``run.dt`` [units of simulated time]; 1 in discrete time."""
         return self.run.dt

@@ -74,7 +74,7 @@ class MarkovChain:
 
     @property
     def holding_times(self) -> list[float | None]:
-        """Mean time in each graph before it is left [units of simulated time]; None where it is never left."""
+        """Mean time in each graph before it is left, in discrete time in steps; None where it is never left."""
         leaving = (self.matrix - np.diag(np.diag(self.matrix))).sum(axis=1)
         return [1.0 / rate if rate > 0 else None for rate in leaving.tolist()]
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -165,7 +166,13 @@ class Run:
         """
         from msg_analysis.inference.pool import compare
 
-        return compare(self, level=level, max_missed=max_missed)
+        found = compare(self, level=level, max_missed=max_missed)
+        if getattr(self.network, "bag", None) is not None:  # for the list of runs
+            from msg_analysis.runs import keep_result
+
+            with suppress(OSError):
+                keep_result(Path(self.network.bag), found.to_json())
+        return found
 
     def to_dataframe(self, table: Table = "states") -> pd.DataFrame:
         """The run as a data frame of pandas, with the columns of ``msg-analysis export``.

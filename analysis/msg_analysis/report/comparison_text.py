@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,17 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from msg_analysis.common.text import agent_text, measured_text, number_text, p_text, percent, with_names, z_text
+from msg_analysis.common.text import (
+    agent_text,
+    counted,
+    listed,
+    measured_text,
+    number_text,
+    p_text,
+    percent,
+    with_names,
+    z_text,
+)
 from msg_analysis.inference.realtime_laws import SUPPORT
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import step_law
@@ -93,6 +104,10 @@ def _facts(document: dict[str, Any]) -> list[str]:
         ended = f"The run ended in order at step {step} of {until['planned_steps']}: {why}."
         missed = f"--until {until['rule']}: {until.get('reason') or 'not reached before the planned end'}."
         lines.append(ended if until["ended_early"] else missed)
+    if restarts := document.get("restarts"):
+        nodes = Counter(line.partition(":")[0].replace("agent_", "agent ") for line in restarts)
+        each = listed([node + (f" {times} times" if times > 1 else "") for node, times in nodes.items()])
+        lines.append(with_names(f"{counted(len(restarts), 'restart')} ({each})", document.get("names")))
     lines += gaps(count)
     if document.get("unpredicted"):
         lines.append(f"No prediction: {document['unpredicted']}.")

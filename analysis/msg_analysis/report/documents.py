@@ -250,7 +250,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
                 "stability_limit": limit,
             }
             for graph, share, holding_time, limit in zip(
-                experiment.graph_list, chain.stationary, chain.holding_times, limits, strict=True
+                experiment.graph_list, chain.stationary, experiment.holding_times, limits, strict=True
             )
         ],
         "stability_limit": min((limit for limit in limits if limit is not None), default=None),

@@ -249,7 +249,7 @@ def explain(experiment: Experiment) -> list[str]:
 
 def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
     """Of every graph; ``share``: of time; ``held``: mean holding time [units of simulated time], None: never left."""
-    rows = zip(experiment.graph_list, experiment.chain.stationary, experiment.chain.holding_times, strict=True)
+    rows = zip(experiment.graph_list, experiment.chain.stationary, experiment.holding_times, strict=True)
     return [
         {
             "name": graph.name,
@@ -293,7 +293,7 @@ def _switching(experiment: Experiment) -> str:
     begin = f"The first graph is {begin}."
     if chain.time == "discrete":
         return f"The graph switches between {modes} graphs: a Markov chain that may jump in every step. {begin}"
-    times = [time for time in experiment.chain.holding_times if time is not None]
+    times = [time for time in experiment.holding_times if time is not None]
     held = f"{min(times):.3g}" if max(times) - min(times) < 1e-9 else f"{min(times):.3g} to {max(times):.3g}"
     return (
         f"The graph switches between {modes} graphs: a Markov chain in continuous time, with mean holding time "

@@ -49,7 +49,7 @@ from msg_analysis.report.plot_style import (
     show_values,
 )
 
-MOST_DECADES = 12  # of evidence, shown either way
+MOST_DECADES = 12, 300  # of evidence that are shown, below and above 1
 MOST_LINES = 8  # agents whose convergence is drawn at once
 _POINTS = 200  # at most, on the line of an agent
 
@@ -83,7 +83,7 @@ def convergence(running: Mapping[str, FloatArray], predicted: float | None) -> U
 
 def evidence(time: FloatArray, logarithms: FloatArray, threshold: float, crossed: float | None) -> UIElement:
     """The evidence against the prediction after some steps, (points,) each, its threshold, and when it was exceeded."""
-    shown = np.clip(logarithms, -MOST_DECADES * np.log(10.0), MOST_DECADES * np.log(10.0))
+    shown = np.clip(logarithms, -MOST_DECADES[0] * np.log(10.0), MOST_DECADES[1] * np.log(10.0))
     x_range = (0.0, float(time[-1]))
     plot = new_figure(230, x_axis_label="simulated time", y_axis_label="evidence", x_range=x_range, y_axis_type="log")
     source = ColumnDataSource({"time": time, "evidence": np.exp(shown)})
@@ -272,7 +272,7 @@ def _column(rows: Sequence[Mapping[str, Any]], key: str) -> FloatArray:
     return np.array([entry.get(key) for entry in rows], dtype=float)  # None: nan
 
 
-_NUMBERED = 8  # most agents with which heat maps show numbers
+_NUMBERED = 5  # most agents with which heat maps show numbers
 _NORMAL = 3.0  # standard errors that the scale of the difference has at least
 TITLES = {
     "measured": "measured",

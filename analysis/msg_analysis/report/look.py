@@ -9,15 +9,16 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.arrays import BoolArray, FloatArray
 from msg_analysis.experiment.graphs import Graph
 
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
     *("#000000", "#E69F00", "#56B4E9", "#009E73"),
     *("#F0E442", "#0072B2", "#D55E00", "#CC79A7"),
 )
-MODE_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION, YELLOW, BLACK)
-LINE_COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK, "#8a7d00")  # thin lines on white: no yellow
+# Dull colours for graphs, saturated ones for agents; vermillion is what is rejected.
+MODE_COLOURS = ("#64788c", "#77864a", "#93709c", "#7a5c3e", "#4f8a8b", "#a0705a", "#7f8794", "#4b4f57")
+LINE_COLOURS = (BLUE, GREEN, PURPLE, ORANGE, SKY, BLACK, "#8a7d00", "#6a4fb3")  # thin lines on white: no yellow
 INK, DARK_GREY, GREY, LIGHT_GREY, PALE = "#374151", "#4b5563", "#6b7280", "#9ca3af", "#e5e7eb"
 
 
@@ -46,8 +47,33 @@ def shifted(places: FloatArray, values: FloatArray, series: int, count: int, *, 
     return places * np.exp(way) if logarithmic else places + way
 
 
+def _grid_of(links: BoolArray) -> tuple[int, int] | None:
+    """Rows and columns of a grid with these links (m, m), its agents row by row; None if there is none of two rows."""
+    m = len(links)
+    for rows in range(2, m // 2 + 1):
+        if m % rows == 0:
+            numbers = np.arange(m).reshape(rows, -1)
+            pairs = np.concatenate(
+                [
+                    np.stack([numbers[:, :-1], numbers[:, 1:]], -1).reshape(-1, 2),
+                    np.stack([numbers[:-1], numbers[1:]], -1).reshape(-1, 2),
+                ]
+            )
+            expected = np.zeros_like(links)
+            expected[pairs[:, 0], pairs[:, 1]] = expected[pairs[:, 1], pairs[:, 0]] = True
+            if np.array_equal(links, expected):
+                return rows, m // rows
+    return None
+
+
 def places(graph_list: Sequence[Graph]) -> Mapping[int, FloatArray]:
     """Position (2,) of every agent, from 0, within about -1 to 1; laid out by the union of all graphs."""
+    for graph in graph_list:
+        if (shape := _grid_of(graph.adjacency > 0)) is not None:
+            rows, columns = np.indices(shape)
+            scale = max(*shape, 2) - 1
+            ends = np.stack([2 * columns - shape[1] + 1, shape[0] - 1 - 2 * rows], axis=-1).reshape(-1, 2) / scale
+            return dict(enumerate(ends))
     import networkx as nx
 
     union = nx.from_numpy_array(sum((g.adjacency + g.adjacency.T > 0) for g in graph_list) > 0)

@@ -26,14 +26,15 @@ from bokeh.resources import Resources
 from markupsafe import Markup
 
 from msg_analysis.common.files import write_whole
-from msg_analysis.common.text import counted, p_text, percent, with_names
-from msg_analysis.errors import InputError
+from msg_analysis.common.text import counted, measured_text, p_text, percent, with_names
+from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.observation import bounded
 from msg_analysis.inference.realtime_laws import SUPPORT
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.report import drawings, error_plots, plot_style, run_plots
 from msg_analysis.report.comparison_text import (
+    CORRECTED,
     QUANTILES,
     REAL_TIME_LAWS,
     TIMES,
@@ -52,6 +53,7 @@ from msg_analysis.report.error_plots import covariances
 from msg_analysis.report.plot_style import Candidates
 from msg_analysis.report.run_plots import Event, run_events
 from msg_analysis.theory.prediction import LAW_NAMES
+from msg_analysis.twin.check import check
 
 
 @cache
@@ -249,6 +251,9 @@ def render(
         law_name=LAW_NAMES["emulated" if document["law"] == "synchronous" else document["law"]],
         support=SUPPORT,
         explanation=_explanation(document),
+        decided=min(filter(lambda test: test["rejected"], document["tests"]), key=_adjusted, default=None),
+        next_step=_next_step(comparison, document),
+        sequence=_sequence(comparison, document),
         causes=[with_names(sentence(cause["words"]), experiment.names) for cause in document["causes"]],
         cause_known=bool(document["causes"]) and document["causes"][0]["kind"] != "unknown",
         plus_minus=plus_minus,
@@ -301,12 +306,13 @@ def _models(
     experiment, steps = trajectory.record.experiment, max(document["steps"], 0)
     covariance, ratios = document["covariance"], document["innovations"]["ratios"]
     predicted, nodes, names = document["system_error"]["predicted"], agent_errors(document)[0], experiment.names
+    drawn_nodes = ((document.get("given_path") or {}).get("node_errors") or []) or nodes
     measured, expected, z = (
         None if covariance[key] is None else np.array(covariance[key], dtype=float)
         for key in ("measured", "predicted", "z")
     )
     models: dict[str, UIElement | None] = {
-        "nodes": error_plots.node_errors(nodes, document["level"], candidates, names),
+        "nodes": error_plots.node_errors(drawn_nodes, document["level"], candidates, names),
         **covariances(measured, expected, z, candidates, names),
     }
     if len(comparison.running["time"]) > 1:
@@ -360,6 +366,49 @@ def _explanation(document: dict[str, Any]) -> str:
     named = with_names(", ".join(shown), document["names"])
     more = f" and {len(rejected) - 6} more" if len(rejected) > 6 else ""
     return f"Rejected: {len(rejected)} of {len(tests)} tests: {named}{more}. {chance}"
+
+
+def _adjusted(test: dict[str, Any]) -> float:
+    return float(test["p_adjusted"])
+
+
+def _sequence(comparison: Comparison, document: dict[str, Any]) -> str:
+    """Whether the errors in the plot of the agents are corrected for the run's graph sequence, and else what it was."""
+    experiment, given = comparison.trajectory.record.experiment, document.get("given_path")
+    if given and given["node_errors"]:
+        return f"Errors of the agents {CORRECTED}."
+    modes = comparison.trajectory.modes[: max(document["steps"], 0)]
+    if document["unpredicted"] or len(experiment.graph_list) == 1 or not len(modes):
+        return ""
+    shares = np.bincount(modes[modes >= 0], minlength=len(experiment.graph_list)) / len(modes)
+    mode = int(np.abs(shares - experiment.chain.stationary).argmax())
+    words = f"Not {CORRECTED}: {experiment.graph_list[mode].name} was active in {percent(shares[mode])} of the steps, "
+    words += f"{percent(experiment.chain.stationary[mode])} on average, which moves all errors together."
+    if given:
+        error = given["system_error"]
+        words += f" The system error {CORRECTED} is {measured_text(error['measured'], error['interval'])}."
+    return words
+
+
+MOST_CHECKED = 2e7  # numbers of a run that is checked for its report
+
+
+def _next_step(comparison: Comparison, document: dict[str, Any]) -> str | None:
+    """Of one run that disagrees: whether it is that of its record to the last bit, which `check` says."""
+    run = comparison.trajectory
+    if document["verdict"] != "disagrees" or comparison.pool or run.states.size > MOST_CHECKED:
+        return None
+    try:
+        difference = check(run).difference
+    except NotAvailableError:
+        return None
+    if difference is None:
+        return (
+            "Next: `msg-agents check` finds no difference: to the last bit, every state is what the file and the seed "
+            "give, so the agents did what the file says. One correct run in a hundred disagrees by chance: run again "
+            "with another seed."
+        )
+    return f"Next: `msg-agents check` finds the first difference to what the file and the seed give: {difference}."
 
 
 def _node_tests(document: dict[str, Any]) -> dict[str, Any] | None:

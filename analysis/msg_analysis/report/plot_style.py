@@ -64,14 +64,18 @@ class Candidates:
 NOBODY = Candidates()
 
 
-# Those of lines and graphs are the Okabe-Ito colours, which colour-blind readers can tell apart, darker where their
-# contrast to white is below 3; shapes and line styles differ as well. The page's script exchanges them in the plots.
+# Those of agents are saturated, mostly Okabe-Ito colours, which colour-blind readers can tell apart, darker where their
+# contrast to white is below 3; those of graphs are dull; vermillion is what is rejected or named by the verdict, alone.
+# Shapes and line styles differ as well. The page's script exchanges the colours in the plots.
 BLUE, ORANGE, GREEN, PURPLE = "#0072b2", "#b97a00", "#00875f", "#b4598c"
 SKY, VERMILLION, OLIVE, BLACK = "#2a8fcb", "#c85000", "#8a7d00", "#000000"
-GRAPHS = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION, OLIVE, BLACK)
-LINES = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK, OLIVE)
+VIOLET = "#6a4fb3"
+LINES = (BLUE, GREEN, PURPLE, ORANGE, SKY, BLACK, OLIVE, VIOLET)
+GRAPHS = ("#64788c", "#77864a", "#93709c", "#7a5c3e", "#4f8a8b", "#a0705a", "#7f8794", "#4b4f57")
+_DARK_GRAPHS = ("#9fb3c8", "#b5c486", "#c8a8d1", "#b8977a", "#86c2c2", "#d6a58c", "#b9c0cc", "#e3e6ea")
 INK, GREY, PALE, PAGE = "#374151", "#6b7280", "#e5e7eb", "#ffffff"
 DARK = {
+    **dict(zip(GRAPHS, _DARK_GRAPHS, strict=True)),
     BLUE: "#4da3e0",
     ORANGE: "#f0b030",
     GREEN: "#2fc79a",
@@ -79,6 +83,7 @@ DARK = {
     SKY: "#9adbff",
     VERMILLION: "#ff8a4c",
     OLIVE: "#f0e442",
+    VIOLET: "#b3a3f0",
     BLACK: "#f9fafb",
     INK: "#d1d5db",
     GREY: "#9ca3af",

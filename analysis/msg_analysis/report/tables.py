@@ -306,7 +306,7 @@ def _state_of(file: dict[str, Any]) -> str:
         return ""
     words = [counted(file["messages"], "message")]
     if file["compression"]:
-        words.append(str(file["compression"]))
+        words.append("not compressed" if file["compression"] == "none" else str(file["compression"]))
     if file["torn"]:
         words.append(f"torn: {file['torn']}")
     if file["damaged_chunks"]:

@@ -36,7 +36,11 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
     print_rows(console, "Graphs", ["graph", "share of time"], shares)
     for key, title in LAW_NAMES.items():
         if key in document and document[key] is None:
-            console.print(f"{title.capitalize()}: infinite, or not defined with this noise", style="dim")
+            why, apart = "not defined with this noise", document.get("disconnected")
+            if key == "static" and apart and document.get("continuous"):
+                do = "does" if len(apart) == 1 else "do"
+                why = f"infinite, since {listed(apart)} alone {do} not connect all agents"
+            console.print(Text(f"{title.capitalize()}: {why}"), style="dim")
     if LAW_NAMES["sequential"] in laws:
         console.print("Sequential steps: in real time, if no step is late and every message arrives at once.")
     for line in tails_words(document):

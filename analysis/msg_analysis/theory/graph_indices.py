@@ -17,7 +17,7 @@ import scipy.linalg
 
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.graphs import Graph, hops
+from msg_analysis.experiment.graphs import Graph, hops, widest_reaching
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.jump_system import JumpSystem
@@ -45,6 +45,9 @@ class GraphIndices:
 
 def algebraic_connectivity(graph: Graph) -> float:
     """Second smallest real part of the Laplacian's eigenvalues, at least 0: the rate of agreement (Fiedler 1973)."""
+    leads = graph.adjacency.T > 0
+    if (hops(leads, widest_reaching(leads)[:1]) < 0).any():  # exactly, where rounding would leave a little
+        return 0.0
     laplacian = graph.laplacian
     values = np.linalg.eigvalsh(laplacian) if graph.symmetric else np.linalg.eigvals(laplacian)
     return max(float(np.sort(values.real)[1]), 0.0)

@@ -183,9 +183,15 @@ class Prediction:
     @cached_property
     def static_moments(self) -> Moments | None:
         """``static``; None without ``paper``, or where one of the graphs cannot keep the agents together."""
-        if self.paper is None or not all(_holds_together(self.experiment, mode) for mode in range(self.step.modes)):
+        if self.paper is None or self.disconnected:
             return None
         return _static(self.paper, self.experiment.names)
+
+    @cached_property
+    def disconnected(self) -> list[str]:
+        """The graphs that, held fixed, cannot keep the agents together."""
+        held = enumerate(self.experiment.graph_list)
+        return [graph.name for mode, graph in held if not _holds_together(self.experiment, mode)]
 
     def laws(self) -> dict[str, Moments]:
         """Those moments that there are, by the name that texts give them."""
@@ -255,6 +261,7 @@ class Prediction:
             document["continuous"] = self.continuous_moments.to_json() if self.continuous_moments else None
             document["emulated"] = self.emulated.to_json()
         document["static"] = self.static_moments.to_json() if self.static_moments else None
+        document["disconnected"] = self.disconnected
         document["fourth_moment"] = self.fourth_moment.to_json()
         return document
 

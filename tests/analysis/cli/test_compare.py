@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,20 @@ def results(bags: list[Path], tmp_path_factory: pytest.TempPathFactory) -> list[
         saved.append(directory / f"{bag.name}.json")
         saved[-1].write_text(call("compare", bag, "--json").stdout, encoding="utf-8")
     return saved
+
+
+def test_the_result_of_one_bag_is_kept_with_it(bags: list[Path], tmp_path: Path) -> None:
+    """For `runs`, beside what its network has said; not of several bags, and not with --no-save."""
+    bag = Path(shutil.copytree(bags[0], tmp_path / "bag"))
+    (bag / "result.json").unlink(missing_ok=True)
+    call("compare", bag, bags[1])
+    document = json.loads(call("compare", bag, "--no-save", "--json").stdout)
+    assert not (bag / "result.json").exists()
+    (bag / "result.json").write_text(json.dumps({"run": document["run"], "rate": 7.0, "restarts": ["agent_1: x"]}))
+    call("compare", bag)
+    saved = json.loads((bag / "result.json").read_text())
+    assert (saved["rate"], saved["restarts"], saved["verdict"]) == (7.0, ["agent_1: x"], document["verdict"])
+    assert json.loads(call("runs", tmp_path, "--json").stdout)["runs"][0]["verdict"] == document["verdict"]
 
 
 def test_several_bags_get_one_verdict(bags: list[Path], tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ from msg_analysis.common import arrays
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.report import plot_style
 from msg_analysis.report.drawings import chain_drawing, graph_drawings, interval_bars, plus_minus
-from msg_analysis.report.error_plots import covariances
+from msg_analysis.report.error_plots import covariances, evidence
+from msg_analysis.report.look import places
 from msg_analysis.report.page import render
 from msg_analysis.report.plot_style import Candidates, envelope, thin, thin_together
 from msg_analysis.report.run_plots import run_events, trajectory_plots
@@ -275,9 +276,30 @@ def test_contrast(dark: bool) -> None:
         assert _contrast(seen[colour], page) >= 3.0, colour
 
 
+def test_agents_graphs_and_what_is_rejected_have_different_colours() -> None:
+    agents, graphs = set(plot_style.LINES), set(plot_style.GRAPHS)
+    assert len(agents) == len(graphs) == 8
+    assert not agents & graphs
+    assert plot_style.VERMILLION not in agents | graphs
+
+
+def test_grids_are_drawn_as_grids() -> None:
+    """Row by row, in steps of one length, whatever the other graphs."""
+    other = {"path": [*range(1, 13)]}
+    where = places(line_ring(12, graphs={"path": other, "grid": {"grid": [3, 4]}}).graph_list)
+    steps = np.array([where[i + 1] - where[i] for i in (0, 1, 2, 4, 5)])
+    np.testing.assert_allclose(steps, np.tile(steps[0] * [1, 0], (5, 1)), atol=1e-12)
+    np.testing.assert_allclose(where[4] - where[0], [0.0, -steps[0, 0]], atol=1e-12)
+
+
 def test_colours_are_read_and_have_their_own_in_the_dark() -> None:
     for scale, ink in (
         (plot_style.SCALE, plot_style.BLACK),
         (plot_style.DARK_SCALE, plot_style.DARK[plot_style.BLACK]),
     ):
         assert min(_contrast(colour, ink) for colour in scale) >= 4.5
+
+
+def test_evidence_is_drawn_as_large_as_it_is() -> None:
+    plot = evidence(np.array([0.0, 1.0]), np.array([0.0, 255 * np.log(10.0)]), 100.0, 0.5)
+    assert plot.y_range.end > 1e255

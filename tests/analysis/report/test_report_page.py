@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from experiments import Completeness, compare, late, line_ring, simulate
+from experiments import Completeness, claimed, compare, late, line_ring, simulate
 from msg_analysis import Experiment, InputError
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.report import page as report_page
@@ -174,6 +174,25 @@ def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "The agents follow the model, given what they received; the prediction for real time is supported." in text
     assert "600 of 600 (0 %)" not in text
     assert "0 of 600 (0 %)" in text
+
+
+def test_a_run_that_disagrees_says_what_decided_and_what_check_finds(tmp_path: Path) -> None:
+    """Also where the twin finds no difference: the same run, judged by a level that few correct runs pass."""
+    wrong = simulate(line_ring(noise={"process": [1.0, 1.0, 2.0]}))
+    for run, level, words in (
+        (
+            claimed(wrong, line_ring()),
+            0.01,
+            "finds the first difference to what the file and the seed give: agent 3 at",
+        ),
+        (simulate(line_ring()), 0.5, "finds no difference"),
+    ):
+        found = dataclasses.replace(compare(run), level=level)
+        tests = [dataclasses.replace(test, rejected=True) for test in found.tests]
+        text = " ".join(Page(render(dataclasses.replace(found, tests=tests))).text.split())
+        least = min(test.p_adjusted for test in tests)
+        assert any(f"Decided by{test.name}, p = " in text for test in tests if test.p_adjusted == least)
+        assert words in text
 
 
 def test_lockstep_has_no_timing_and_no_runs_no_rows(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from PIL import Image
 from experiments import Completeness, Experiment, Run, claimed, compare, document, late, simulate
 from msg_analysis.inference.pool import compare_pooled
 from msg_analysis.report.page import write_report
-from msg_analysis.report.plot_style import BLUE, DARK
+from msg_analysis.report.plot_style import DARK, GRAPHS
 
 # Not stationary: a run of 100 agents from their stationary law has a long past to be simulated.
 HUNDRED: dict[str, Any] = {"duration": 35, "replicas": 16, "start": "zero"}
@@ -199,7 +199,7 @@ def test_screens_of_all_kinds(tab: Tab, disagrees: Path) -> None:
             assert page.evaluate(FAINT) == []
             _check(page, log, path)
             shown = page.evaluate("Bokeh.documents[0].get_model_by_name('graphs').data.colour[0]")
-            assert shown == (BLUE if scheme == "light" else DARK[BLUE])
+            assert shown == (GRAPHS[0] if scheme == "light" else DARK[GRAPHS[0]])
     # On paper, the colours are those for white pages.
     page.evaluate(
         """() => window.addEventListener("beforeprint", () => {
@@ -211,9 +211,9 @@ def test_screens_of_all_kinds(tab: Tab, disagrees: Path) -> None:
         "RGBA"
     )
     seen = {colour for _, colour in printed.getcolors(printed.width * printed.height)}
-    assert (*bytes.fromhex(BLUE[1:]), 255) in seen
-    assert (*bytes.fromhex(DARK[BLUE][1:]), 255) not in seen
-    assert page.evaluate("Bokeh.documents[0].get_model_by_name('graphs').data.colour[0]") == DARK[BLUE]
+    assert (*bytes.fromhex(GRAPHS[0][1:]), 255) in seen
+    assert (*bytes.fromhex(DARK[GRAPHS[0]][1:]), 255) not in seen
+    assert page.evaluate("Bokeh.documents[0].get_model_by_name('graphs').data.colour[0]") == DARK[GRAPHS[0]]
 
     page.focus("a")
     reached = set()

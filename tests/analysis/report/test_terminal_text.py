@@ -135,8 +135,17 @@ def test_prediction() -> None:
     law = {"system_error": 3.5, "node_errors": [1.5, 2.0], "system_certainty": 2 / 7, "node_certainty": [2 / 3, 0.5]}
     document = {"agents": 2, "modes": ["[red]", "b"], "stationary": [0.25, 0.75]}
     document |= {"continuous": law, "emulated": law, "static": None, "fourth_moment": {"finite": True}}
+    document["disconnected"] = ["b"]
     output = shown(theory_text.print_prediction, document)
-    parts = "[red]", "continuous time", "steps of the run", "3.5", "0.285714", "0.25", "Graphs held fixed: infinite"
+    parts = (
+        "[red]",
+        "continuous time",
+        "steps of the run",
+        "3.5",
+        "0.285714",
+        "0.25",
+        "infinite, since b alone does not connect all agents",
+    )
     assert [part for part in parts if part not in output] == []
 
 

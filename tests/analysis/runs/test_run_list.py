@@ -58,6 +58,11 @@ def test_a_run_with_a_result(tmp_path: Path, bag: Path) -> None:
     assert entry.to_json() == kept | {"low": pytest.approx(1.01, abs=1e-4), "high": pytest.approx(1.99, abs=1e-4)}
 
 
+def test_a_run_without_a_step_has_no_error(tmp_path: Path) -> None:
+    result(tmp_path / "pair_20261125_130501", verdict="incomplete", simulated_time=0.0)
+    assert (only(tmp_path).measured, only(tmp_path).z) == (None, None)
+
+
 def test_a_result_of_before(tmp_path: Path) -> None:
     """Its causes have another key."""
     cause = {"words": "the noise is too large"}

@@ -29,7 +29,7 @@
     return { agents: [...chosen].sort((a, b) => a - b) };
   };
 
-  const colour = (agent) => window.shade(COLOURS[(agent - 1) % COLOURS.length]);
+  const colour = (agent) => window.shade(CANDIDATES.has(agent) ? document.body.dataset.alarm : COLOURS[(agent - 1) % COLOURS.length]);
 
   function draw(agents) {
     const lines = model("lines"), bands = model("bands"), all = model("all_agents");

@@ -153,7 +153,7 @@
     return low;
   }
 
-  const colour = (agent) => window.shade(COLOURS[(agent - 1) % COLOURS.length]);
+  const colour = (agent) => window.shade(CANDIDATES.has(agent) ? document.body.dataset.alarm : COLOURS[(agent - 1) % COLOURS.length]);
   const dash = (agent) => DASHES[Math.floor((agent - 1) / COLOURS.length) % DASHES.length];
 
   function draw() {
@@ -205,7 +205,7 @@
       button.type = "button";
       button.dataset.agent = agent;
       button.setAttribute("aria-label", `agent ${window.called(agent)}${CANDIDATES.has(agent) ? ", candidates" : ""}`);
-      mark.style.borderTopColor = `var(--line-${(agent - 1) % COLOURS.length})`;
+      mark.style.borderTopColor = CANDIDATES.has(agent) ? "var(--disagrees)" : `var(--line-${(agent - 1) % COLOURS.length})`;
       mark.style.borderTopStyle = { dotdash: "dashed" }[dash(agent)] || dash(agent);
       button.append(mark, CANDIDATES.has(agent) ? `${window.called(agent)} ✗` : window.called(agent));
       button.addEventListener("click", () => {

@@ -105,7 +105,7 @@ function keys(agents) {
 
 function show(data) {
   if (!setting) return;
-  if (!over) say(data.warning ? "late" : "", data.reached < 0 ? "the network is starting" : data.warning || "running");
+  if (!over) say(data.warning ? "late" : "", data.reached < 0 ? "the network is starting" : data.warning || (data.reached >= (data.last ?? setting.steps) ? "all steps are made: the run is closed and compared with the prediction" : "running"));
   const reached = Math.max(data.reached, 0);
   const last = data.last === null ? setting.steps : data.last;  // a run may end before its planned end
   at("progress").value = reached / last;
