@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from rich.progress import Task
     from rich.text import Text
 
+    from msg_analysis.experiment.experiment import Experiment
+    from msg_analysis.sweeps.grid import SweepGrid
+
 
 # Our models have no plugins. pydantic would look for some in all packages that are installed: 30 ms of each command.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "true")
@@ -200,6 +203,12 @@ def print_note(line: str) -> None:
     from msg_analysis.common import console
 
     console.print_note(line)
+
+
+def print_notes(read: Experiment | SweepGrid) -> None:
+    """Print the notes on the files with graphs of an experiment or a sweep."""
+    for note in read.notes:
+        print_note(note)
 
 
 _LINE_PERIOD = 10.0  # s between two lines where there is no terminal

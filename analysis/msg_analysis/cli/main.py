@@ -208,14 +208,13 @@ def figures(
 @json_option
 def info(source: Path, as_json: bool) -> None:
     """Describe an experiment file or a bag."""
-    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.report import tables
     from msg_analysis.report.documents import describe_bag, describe_experiment
 
     if is_bag(source):
         document, show = describe_bag(source), tables.print_bag
     else:
-        document, show = describe_experiment(Experiment.load(source)), tables.print_experiment
+        document, show = describe_experiment(load_experiment(source)), tables.print_experiment
     if as_json:
         print_json(document)
     else:

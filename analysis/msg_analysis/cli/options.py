@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
+from msg_analysis.cli.console import print_notes
 from msg_analysis.errors import InputError
 
 if TYPE_CHECKING:
@@ -135,14 +136,17 @@ def with_changes(document: Any, changes: Sequence[str]) -> Any:
 
 
 def load_experiment(path: Path, changes: Sequence[str] = ()) -> Experiment:
-    """The experiment of a file with the values of ``--set``."""
+    """The experiment of a file with the values of ``--set``; its notes are printed."""
     from msg_analysis import Experiment
     from msg_analysis.experiment.loading import read_yaml
 
     if not changes:
-        return Experiment.load(path)
-    document = with_changes(read_yaml(path), changes)
-    return Experiment.parse(document, source=source_of(path, changes), directory=path.parent)
+        experiment = Experiment.load(path)
+    else:
+        document = with_changes(read_yaml(path), changes)
+        experiment = Experiment.parse(document, source=source_of(path, changes), directory=path.parent)
+    print_notes(experiment)
+    return experiment
 
 
 def source_of(path: Path, changes: Sequence[str]) -> str:

@@ -22,6 +22,7 @@ from msg_analysis.cli.options import (
     json_option,
     level_option,
     max_missed_option,
+    load_experiment,
     seed_option,
     verbose_option,
 )
@@ -149,11 +150,10 @@ def diff(a: Path, b: Path, *, as_json: bool) -> None:
             document = bag_difference(a, b)
     else:
         from msg_analysis.cli.console import SolveProgress
-        from msg_analysis.experiment.experiment import Experiment
         from msg_analysis.report.differences import experiment_difference
         from msg_analysis.report.differences import print_experiment_difference as show
 
-        one, other = (Experiment.load(path) for path in (a, b))
+        one, other = (load_experiment(path) for path in (a, b))
         with SolveProgress("leaders") as search:
             document = experiment_difference(one, other, search)
     if as_json:

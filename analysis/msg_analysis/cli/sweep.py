@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from msg_analysis.cli.console import complain, examples, print_json, print_note, print_text, result_console
+from msg_analysis.cli.console import complain, examples, print_json, print_note, print_notes, print_text, result_console
 from msg_analysis.cli.options import YAML, choice_option, json_option, out_option
 from msg_analysis.errors import ExitCode, InputError, killed_by
 from msg_analysis.sweeps.points import require_libraries
@@ -91,6 +91,7 @@ def sweep(
             checking.done(done, total)
 
         plan = load_sweep(sweep_file, checked)
+    print_notes(plan)
     from msg_analysis.common.files import write_whole
     from msg_analysis.common.text import finite
     from msg_analysis.report.list_pages import render_sweep

@@ -62,6 +62,8 @@ class Experiment(Variants):
         where the experiment came from, for messages
     protocol
         the protocol that replaces the built-in law; None for the built-in law
+    notes
+        what was not read of the files with graphs, or might be understood in another way, one line each
     """
 
     spec: ExperimentSpec
@@ -71,6 +73,7 @@ class Experiment(Variants):
     loss: FloatArray
     source: str = "experiment"
     protocol: ChosenProtocol | None = None
+    notes: tuple[str, ...] = ()
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Experiment):
@@ -155,7 +158,7 @@ class Experiment(Variants):
         sections.resolve(directory or Path())
         if sections.problems:
             raise ExperimentError(source, sections.problems)
-        experiment = cls(**sections.parts(), source=source)
+        experiment = cls(**sections.parts(), source=source, notes=tuple(sections.notes))
         return experiment._bound(recorded) if experiment.protocol else experiment
 
     def _bound(self, recorded: ProtocolInfo | None) -> Self:

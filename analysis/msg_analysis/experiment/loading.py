@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import os
 import re
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +19,13 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.files import SAFE_LOADER, load_yaml, read_text
 from msg_analysis.common.text import listed
 from msg_analysis.errors import InputError
-from msg_analysis.experiment import graph_sources, protocols, validation
-from msg_analysis.experiment.graph_sources import ForeignGraph, GraphError
+from msg_analysis.experiment import graph_files, graph_sources, protocols, validation
+from msg_analysis.experiment.graph_files import ForeignGraph, GraphError
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.markov_chain import MarkovChain, Time
 from msg_analysis.experiment.problems import WEIGHT, problem, show, translate
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
-from msg_analysis.experiment.spec import ExperimentSpec, GraphSpec, NoiseSpec, RunSpec
+from msg_analysis.experiment.spec import BESIDE, ExperimentSpec, GraphSpec, NoiseSpec, RunSpec
 
 
 class _StrictLoader(SAFE_LOADER):  # type: ignore[misc]  # one of two classes: see there
@@ -210,9 +210,6 @@ def _section(key: str, mapping: Mapping[Any, Any]) -> Any:
     return ExperimentSpec.model_fields[key].get_default(call_default_factory=True, validated_data={})
 
 
-_OWN_WEIGHTS = ("path", "cycle", "star", "grid", "complete")  # kinds of graphs that a ``weight`` may stand beside
-
-
 class Sections:
     """A document that is being checked: a section is None as long as it is not known to be valid."""
 
@@ -221,6 +218,8 @@ class Sections:
         document, self._networkx = graph_sources.plain_document(mapping)
         self._foreign: dict[str, ForeignGraph] = {}  # read, but not numbered yet
         self._named_by_files = False
+        self._numbers_are_names = False
+        self.notes: list[str] = []  # what was not read of files with graphs, or might be understood in another way
         self.keys: dict[str, str] = {}  # of the graphs, for messages
         bad: set[str] = set()
         try:
@@ -315,12 +314,14 @@ class Sections:
                 self.problems.append(problem("graphs", "'stationary'", wanted, "rename the graph"))
             if len(spec.kinds) != 1:
                 given = " and ".join(spec.kinds) or "nothing"
-                wanted = f"expected one of {', '.join(GraphSpec.model_fields)}"
+                wanted = f"expected one of {', '.join(key for key in GraphSpec.model_fields if key not in BESIDE)}"
                 self.problems.append(problem(f"graphs.{name}", given, wanted, "give exactly one"))
                 continue
-            if spec.weight is not None and spec.kinds[0] not in _OWN_WEIGHTS:
-                wanted = f"expected with {', '.join(_OWN_WEIGHTS)} only"
-                self.problems.append(problem(f"graphs.{name}.weight", spec.weight, wanted, WEIGHT))
+            for beside, kinds in BESIDE.items():
+                if (value := getattr(spec, beside)) is not None and spec.kinds[0] not in kinds:
+                    remedy = WEIGHT if beside == "weight" else "remove it"
+                    wanted = f"expected with {', '.join(kinds)} only"
+                    self.problems.append(problem(f"graphs.{name}.{beside}", value, wanted, remedy))
             self.keys[name] = key = f"graphs.{name}" if name in self._networkx else f"graphs.{name}.{spec.kinds[0]}"
             try:
                 self._read(name, key, spec, directory)
@@ -347,14 +348,17 @@ class Sections:
         if name in self._networkx:
             self._foreign[name] = graph_sources.from_networkx(key, self._networkx[name])
         elif spec.graphml is not None:
-            self._foreign[name] = graph_sources.read_graphml(key, directory / spec.graphml)
+            self._foreign[name] = graph_files.read_graphml(key, directory / spec.graphml)
         elif spec.csv is not None:
-            self._foreign[name] = graph_sources.read_csv(key, directory / spec.csv)
+            self._foreign[name] = graph_files.read_csv(key, directory / spec.csv)
         elif spec.adjacency is not None:
             rows = spec.adjacency
             if isinstance(rows, str):
-                rows = graph_sources.read_matrix(key, directory / rows)
+                rows = graph_files.read_matrix(key, directory / rows)
             self.values["graphs"][name] = graph_sources.from_adjacency(key, rows)
+        if name in self._foreign:
+            self._foreign[name] = self._foreign[name].joined(spec.parallel)
+            self.notes += [f"{key}: {note}" for note in self._foreign[name].notes]
 
     def _number_nodes(self, graphs: dict[str, GraphSpec]) -> bool:
         """Numbers instead of nodes in ``graphs``, and the names of the agents; False where these have mistakes."""
@@ -366,30 +370,57 @@ class Sections:
         named = {
             name: ForeignGraph(nodes, [], directed=False)
             for name, spec in graphs.items()
-            if name not in self._foreign and (nodes := graph_sources.named_agents(spec))
+            if name not in self._foreign
+            and (nodes := [agent for agent in graph_sources.written_agents(spec) if isinstance(agent, str)])
         }
         if not self._foreign and not named:
             return True
         sources = {name: graph for name in graphs if (graph := self._foreign.get(name) or named.get(name))}
+        others = [spec for name, spec in graphs.items() if name not in self._foreign]
         try:
-            numbers, names = graph_sources.numbered(sources.values(), given)
+            numbers, names = graph_sources.numbered(sources.values(), given, others, self.values["agents"])
         except KeyError as error:
             node, wanted = error.args[0], f"expected one of the names {listed(given or [])}"
             place = next(self.keys[name] for name, graph in sources.items() if node in graph.nodes)
             self.problems.append(problem(place, f"node {show(node)}", wanted, "correct it, or add it to `names`"))
             return False
-        graphs |= {name: graph_sources.as_spec(graph, numbers) for name, graph in self._foreign.items()}
-        graphs |= {name: graph_sources.with_numbers(graphs[name], numbers) for name in named}
         self._named_by_files = given is None and bool(self._foreign)
+        self._numbers_are_names = self._named_by_files and all(map(graph_files.is_whole, names or ["no"]))
+        places: dict[int | str, int] = dict(numbers.items())
+        if self._numbers_are_names:
+            places |= {int(node): number for node, number in numbers.items()}
+        graphs |= {
+            name: graph_sources.as_spec(self._foreign[name], numbers)
+            if name in self._foreign
+            else graph_sources.with_numbers(spec, places)
+            for name, spec in graphs.items()
+        }
         self.values["names"] = names
+        self._note_nodes(names or [])
         return True
+
+    def _note_nodes(self, names: Sequence[str]) -> None:
+        """Say which agent a node is, where it might be another one."""
+        made = [self.keys[name] for name, graph in self._foreign.items() if graph.made_ids]
+        if self._numbers_are_names:
+            self.notes.append(
+                f"the nodes {listed(names, 3)} are not numbered from 1 to {len(names)}: these are the agents' names"
+            )
+        elif made and len(self._foreign) > 1:
+            words = "the nodes have no names that are all different: nodes with the same id are the same agent"
+            self.notes.append(f"{listed(made)}: {words}")
+
+    def _name(self, agent: int | str) -> int | str:
+        """An agent as the document has it; a number is a name where the nodes of files are numbers that are names."""
+        return str(agent) if self._numbers_are_names else agent
 
     def _name_leaders(self) -> None:
         """Numbers instead of names in ``leaders``; what is not a name of an agent is a mistake."""
         leaders, names = self.values["leaders"], self.values["names"] or []
         if leaders is None:
             return
-        numbers = [names.index(agent) + 1 if agent in names else agent for agent in leaders.agents]
+        written = [self._name(agent) for agent in leaders.agents]
+        numbers = [names.index(str(agent)) + 1 if agent in names else agent for agent in written]
         unknown = [agent for agent in numbers if isinstance(agent, str)]
         if self.agents is not None:
             self.problems += [validation.unknown_name("leaders.agents", agent, names) for agent in unknown]
@@ -403,7 +434,7 @@ class Sections:
         if self.agents is None or run is None or not isinstance(run.start, dict):
             return
         values = [0.0] * self.agents
-        for agent, value in run.start.items():
+        for agent, value in ((self._name(agent), value) for agent, value in run.start.items()):
             number = names.index(agent) + 1 if agent in names else agent
             if isinstance(number, str) or number > self.agents:
                 others = f"expected agents 1 to {self.agents}"
@@ -415,7 +446,10 @@ class Sections:
     def _resolve_losses(self, noise: NoiseSpec, time: Time) -> None:
         """Numbers instead of names in ``noise.loss``, and the probability of every link."""
         names: list[str] | None = self.values["names"]
-        loss, found = validation.numbered_losses(noise.loss, names or [])
+        links = {
+            k: [(self._name(i), self._name(j), p) for i, j, p in getattr(noise.loss, k)] for k in ("edges", "arcs")
+        }
+        loss, found = validation.numbered_losses(noise.loss.model_copy(update=links), names or [])
         if not found:
             self.values["noise"] = noise.model_copy(update={"loss": loss})
             self.loss, found = validation.loss_matrix(loss, self.graphs, time, names)
@@ -437,7 +471,11 @@ class Sections:
         graphs: dict[str, GraphSpec] = self.values["graphs"]
         found: list[str] = []
         for name, spec in graphs.items():
-            found += graph_sources.link_problems(self.keys[name], spec, self.agents, self.values["names"])
+            key = self.keys[name]
+            remedy = "remove the duplicate"
+            if key.endswith(tuple(f".{kind}" for kind in BESIDE["parallel"])) and name not in self._networkx:
+                remedy += ", or give `parallel: sum` or `parallel: first` beside the file"
+            found += graph_sources.link_problems(key, spec, self.agents, self.values["names"], remedy)
         self.problems += found
         if not found:
             self.graphs = tuple(graph_sources.build_graph(name, spec, self.agents) for name, spec in graphs.items())

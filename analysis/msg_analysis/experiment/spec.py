@@ -122,6 +122,10 @@ MATRIX_FILES = (".csv", ".npy")
 Rows = Annotated[list[list[NonNegative]], Field(min_length=2)]
 
 
+BESIDE = {"weight": ("path", "cycle", "star", "grid", "complete"), "parallel": ("graphml", "csv")}
+"""Keys of a graph that may stand beside some of its kinds."""
+
+
 class GraphSpec(Section):
     """One graph, given in one of these ways. Agents are numbered from 1, or have names."""
 
@@ -145,15 +149,15 @@ class GraphSpec(Section):
     graphml: str | None = Field(
         None,
         min_length=1,
-        description="a GraphML file, relative to the experiment file; node ids that are whole numbers are the agents' "
-        "numbers, others their names; edge attribute 'weight', default 1",
+        description="a GraphML file, relative to the experiment file; nodes are called by their names, labels or ids: "
+        "whole numbers from 1 or 0 are the agents' numbers, others names; edge attribute 'weight', default 1",
         examples=["network.graphml"],
     )
     csv: str | None = Field(
         None,
         min_length=1,
-        description="a CSV file, relative to the experiment file, with the header source,target[,weight][,type]; "
-        "target listens to source; nodes as with graphml; type directed (default) or undirected",
+        description="a CSV file, relative to the experiment file, with the columns source,target[,weight][,type], or "
+        "from,to; target listens to source; nodes as with graphml; type directed (default) or undirected",
         examples=["edges.csv"],
     )
     adjacency: Annotated[Rows, WrapValidator(_matrix, json_schema_input_type=Rows | str)] | None = Field(
@@ -165,12 +169,18 @@ class GraphSpec(Section):
     weight: Positive | None = Field(
         None, description="of all links of path, cycle, star, grid or complete; 1 by default", examples=[0.5]
     )
+    parallel: Literal["sum", "first"] | None = Field(
+        None,
+        description="with graphml or csv: parallel links are one, with the sum of their weights or with the first; by "
+        "default they are an error",
+        examples=["sum"],
+    )
 
     @property
     def kinds(self) -> list[str]:
         """Ways in which this graph is given (one, in a valid file)."""
         given = [key for key in type(self).model_fields if getattr(self, key) is not None]
-        return [key for key in given if key != "weight"]
+        return [key for key in given if key not in BESIDE]
 
 
 class SwitchingSpec(Section):

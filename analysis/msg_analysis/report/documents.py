@@ -257,6 +257,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
         "predicted_system_error": predicted,
         "memory": {"states": states, "matrices": matrices},
         "unavailable": validation.unavailable(experiment),
+        "notes": list(experiment.notes),
     }
 
 

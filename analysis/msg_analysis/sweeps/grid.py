@@ -254,6 +254,7 @@ class SweepGrid:
     experiment: str  # name of the experiment
     points: tuple[Point, ...]  # in the order of the file: first key slowest, repetitions fastest
     names: Sequence[str] | None = None  # of the agents, if all points have the same
+    notes: tuple[str, ...] = ()  # of the experiments
 
     @property
     def kind(self) -> JobKind:
@@ -322,6 +323,7 @@ def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: P
     wrong: dict[str, list[int]] = {}  # line: indices of the combinations that have it
     points: list[Point] = []
     name, named = "", set()
+    notes: dict[str, None] = {}
     for number, values in enumerate(combinations):
         document: Mapping[str, Any] = base
         try:
@@ -338,12 +340,13 @@ def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: P
         if not wrong:
             name = experiment.name
             named.add(tuple(experiment.names or ()))
+            notes |= dict.fromkeys(experiment.notes)
             points += _runs(spec, values, experiment)
         checked(number + 1, len(combinations))
     if wrong:
         raise ExperimentError(str(path), _grouped(wrong, combinations))
     (names,) = named if len(named) == 1 else [()]
-    return SweepGrid(path.stem, spec, name, tuple(points), names or None)
+    return SweepGrid(path.stem, spec, name, tuple(points), names or None, tuple(notes))
 
 
 def _runs(spec: SweepSpec, values: Mapping[str, Any], experiment: Experiment) -> Iterator[Point]:

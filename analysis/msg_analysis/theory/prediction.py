@@ -263,6 +263,7 @@ class Prediction:
         document["static"] = self.static_moments.to_json() if self.static_moments else None
         document["disconnected"] = self.disconnected
         document["fourth_moment"] = self.fourth_moment.to_json()
+        document["notes"] = list(self.experiment.notes)
         return document
 
 

@@ -22,7 +22,7 @@ from msg_agents.cli.run_result import finish
 from msg_agents.cli.watching import WebCommand, announce, page, web_options
 from msg_agents.environment import LAST_DOMAIN, RESTARTS, USER_TIMEOUT
 from msg_agents.terminal import Interruption
-from msg_analysis.cli.console import CommandGroup, examples
+from msg_analysis.cli.console import CommandGroup, examples, print_notes
 from msg_analysis.cli.options import (
     RUN_RECORD,
     YAML,
@@ -193,6 +193,7 @@ def run(
         change=lambda document: with_changes(document, changes),
         source=source_of(experiment, changes),
     )
+    print_notes(what)
     channel = None
     if channel_file is not None:
         if use_sim_time or readers:

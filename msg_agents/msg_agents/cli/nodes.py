@@ -24,6 +24,7 @@ from msg_analysis.cli.options import (
     PATH,
     RUN_RECORD,
     experiment_argument,
+    load_experiment,
     out_option,
     positive_option,
     storage_options,
@@ -110,10 +111,9 @@ def prepare(experiment: Path) -> None:
 
     Single nodes are started with this file.
     """
-    from msg_analysis.experiment.experiment import Experiment
     from msg_analysis.twin.simulate import new_record
 
-    what = Experiment.load(experiment)
+    what = load_experiment(experiment)
     what.require_available()
     click.echo(new_record(what).to_json(with_key=True))
 

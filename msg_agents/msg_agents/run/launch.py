@@ -23,6 +23,7 @@ from msg_agents.replay import parse_rate
 from msg_agents.run.folder import load_with_overrides, make_bag_directory, temporary_directory
 from msg_agents.run.supervisor import failure_of
 from msg_analysis.bags.stored_file import MEGABYTE, SMALLEST_SPLIT, Storage
+from msg_analysis.cli.console import print_notes
 from msg_analysis.common.files import REPORT_FILE
 from msg_analysis.common.resources import SINGLE_THREAD
 from msg_analysis.errors import ExitCode, InputError
@@ -127,6 +128,7 @@ def load_experiment(arguments: Mapping[str, str]) -> Experiment:
     except InputError as error:
         raise InputError(f"experiment:={error}") from error
     experiment = load_with_overrides(file, changes, name=lambda key: f"{key}:={arguments[key].strip()}")
+    print_notes(experiment)
     experiment.require_available()
     if "speed" in changes and experiment.run.pace == "lockstep":
         raise InputError(f"speed:={arguments['speed']}: a run in lockstep has no speed: add pace:=realtime")

@@ -204,6 +204,7 @@ class RunResult:
             "clocks": self.clocks,
             "channel": self.channel,
             "until": self.until,
+            "notes": list(self.experiment.notes),
         }
 
     def write(self) -> None:

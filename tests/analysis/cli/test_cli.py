@@ -61,6 +61,17 @@ def test_predict_json_is_the_prediction() -> None:
     assert json.loads(result.stdout) == json.loads(json.dumps(predict(golden("line_ring")).to_json()))
 
 
+@pytest.mark.parametrize("command", ["predict", "info"])
+def test_notes_on_files_with_graphs(command: str, tmp_path: Path) -> None:
+    """On stderr, and in the JSON."""
+    (tmp_path / "net.csv").write_text("source,target,cost\n1,2,3\n")
+    (tmp_path / "net.yaml").write_text("name: net\ngraphs: {net: {csv: net.csv}}\n")
+    result = call(command, tmp_path / "net.yaml", "--json")
+    note = "graphs.net.csv: no `weight`, so every link has 1; not read: cost"
+    assert result.stderr == f"note: {note}\n"
+    assert json.loads(result.stdout)["notes"] == [note]
+
+
 @pytest.mark.parametrize("command", ["predict", "simulate", "info"])
 def test_bad_files_are_errors_of_the_user(command: str, tmp_path: Path) -> None:
     file = tmp_path / "bad.yaml"
