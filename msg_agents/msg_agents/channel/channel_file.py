@@ -174,8 +174,8 @@ class Channel:
         except ValidationError as error:
             raise ExperimentError(source, [translate(each, root=ChannelSpec) for each in error.errors()]) from error
         hosts, problems = _hosts(spec, experiment)
-        default = _settings(spec.default, LinkSettings(), "default", problems)
-        own = _pairs(spec, default, [BASE, *hosts], problems)
+        default = _settings(spec.default, LinkSpec(), "default", problems)
+        own = _pairs(spec, [BASE, *hosts], problems)
         if problems:
             raise ExperimentError(source, problems)
         links = {
@@ -227,9 +227,7 @@ def _hosts(spec: ChannelSpec, experiment: Experiment) -> tuple[dict[str, tuple[i
     return {name: tuple(sorted(number - 1 for number in host.agents)) for name, host in spec.hosts.items()}, problems
 
 
-def _pairs(
-    spec: ChannelSpec, default: LinkSettings, hosts: Sequence[str], problems: list[str]
-) -> Mapping[tuple[str, str], LinkSettings]:
+def _pairs(spec: ChannelSpec, hosts: Sequence[str], problems: list[str]) -> Mapping[tuple[str, str], LinkSettings]:
     """Settings of the pairs that have their own; mistakes are added to ``problems``."""
     found: dict[tuple[str, str], LinkSettings] = {}
     for number, pair in enumerate(spec.pairs, start=1):
@@ -237,7 +235,7 @@ def _pairs(
         if not pair.directions:
             wanted = "expected sender and receiver, or between"
             problems.append(problem(key, "which pair", wanted, "between: [left, right]"))
-        settings = _settings(pair, default, key, problems)
+        settings = _settings(pair, spec.default, key, problems)
         for direction in pair.directions:
             words = f"from {direction[0]} to {direction[1]}"
             unknown = [name for name in direction if name not in hosts]
@@ -253,34 +251,41 @@ def _pairs(
     return found
 
 
-def _settings(spec: LinkSpec, default: LinkSettings, key: str, problems: list[str]) -> LinkSettings:
-    """Of a link; what is not given is that of ``default``. Mistakes are added to ``problems``."""
-    given: dict[str, Any] = {
-        "delay": None if spec.delay_ms is None else spec.delay_ms / SECOND,
-        "jitter": None if spec.jitter_ms is None else spec.jitter_ms / SECOND,
-        "rate": spec.rate_mbit,
-        "queue": spec.queue,
-    }
-    if spec.loss is not None:
-        given["loss"] = LossModel(spec.loss.good, spec.loss.bad, spec.loss.to_bad, spec.loss.to_good)
-        if not spec.loss.to_good:
-            problems.append(problem(f"{key}.loss.to_good", "0", "expected a number > 0", "or give a number as loss"))
-    settings = replace(default, **{name: value for name, value in given.items() if value is not None})
-    if spec.burst is not None:
-        burst = spec.burst
-        loss = spec.loss.good if spec.loss is not None and spec.loss.good == spec.loss.bad else None
-        if loss is None:
+def _settings(spec: LinkSpec, default: LinkSpec, key: str, problems: list[str]) -> LinkSettings:
+    """Of a link; what is not given is that of ``default``. Mistakes are added to ``problems``, at the keys given."""
+    given = {name: value for name in LinkSpec.model_fields if (value := getattr(spec, name)) is not None}
+    link = default.model_copy(update=given)
+    settings = LinkSettings(
+        delay=(link.delay_ms or 0.0) / SECOND,
+        jitter=(link.jitter_ms or 0.0) / SECOND,
+        rate=inf if link.rate_mbit is None else link.rate_mbit,
+        queue=LinkSettings().queue if link.queue is None else link.queue,
+    )
+    loss, burst = link.loss, link.burst
+    if loss is not None:
+        settings = replace(settings, loss=LossModel(loss.good, loss.bad, loss.to_bad, loss.to_good))
+    if "loss" in given and loss is not None and not loss.to_good:
+        problems.append(problem(f"{key}.loss.to_good", "0", "expected a number > 0", "or give a number as loss"))
+    if loss is None or loss.good != loss.bad:
+        if "burst" in given:
             wanted, remedy = "expected a number as loss beside it", "give one, or remove burst"
             problems.append(problem(f"{key}.burst", burst, wanted, remedy))
-        elif burst < (least := loss / (1 - loss)):
-            wanted, remedy = f"expected at least {least:.4g}", f"with loss {loss:g} bursts are longer"
-            problems.append(problem(f"{key}.burst", burst, wanted, remedy))
+    elif burst is not None and burst >= (least := loss.good / (1 - loss.good)):
+        settings = replace(settings, loss=LossModel.bursts(loss.good, burst))
+    elif "burst" in given:
+        wanted, remedy = f"expected at least {least:.4g}", f"with loss {loss.good:g} bursts are longer"
+        problems.append(problem(f"{key}.burst", burst, wanted, remedy))
+    elif burst is not None and "loss" in given:
+        wanted = f"expected at most {burst / (1 + burst):.4g} with burst {burst:g}, which is that of `default`"
+        problems.append(problem(f"{key}.loss", loss.good, wanted, "give a longer burst beside it"))
+    if settings.jitter > settings.delay and given.keys() & {"jitter_ms", "delay_ms"}:
+        jitter, delay, late = settings.jitter * SECOND, settings.delay * SECOND, "no packet arrives before it is sent"
+        if "jitter_ms" in given:
+            problems.append(problem(f"{key}.jitter_ms", jitter, f"expected at most delay_ms, {delay:g}", late))
         else:
-            settings = replace(settings, loss=LossModel.bursts(loss, burst))
-    if settings.jitter > settings.delay:
-        jitter, wanted = settings.jitter * SECOND, f"expected at most delay_ms, {settings.delay * SECOND:g}"
-        problems.append(problem(f"{key}.jitter_ms", jitter, wanted, "no packet arrives before it is sent"))
-    if spec.queue is not None and settings.rate == inf:
+            wanted = f"expected at least {jitter:g}, the jitter_ms of `default`"
+            problems.append(problem(f"{key}.delay_ms", delay, wanted, late))
+    if "queue" in given and settings.rate == inf:
         without = "has no effect without rate_mbit"
         problems.append(problem(f"{key}.queue", spec.queue, without, "give one, or remove it"))
     return settings

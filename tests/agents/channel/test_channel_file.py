@@ -74,6 +74,28 @@ def test_bursts_and_states() -> None:
     assert channel.links["left", "right"].loss.mean == pytest.approx(0.25 * 0.6)
 
 
+STATES = {"bad": 0.6, "to_bad": 0.1, "to_good": 0.3}
+
+
+@pytest.mark.parametrize(
+    ("default", "pair", "wanted"),  # good, bad, to_bad, to_good of the pair
+    [
+        ({"loss": 0.2, "burst": 4}, {"loss": 0.5}, (0, 1, 0.25, 0.25)),
+        ({"loss": 0.2, "burst": 4}, {"burst": 5}, (0, 1, 0.05, 0.2)),
+        ({"loss": 0.2}, {"burst": 5}, (0, 1, 0.05, 0.2)),
+        ({"loss": 0.2, "burst": 4}, {"loss": 0.5, "burst": 1}, (0, 1, 1, 1)),
+        ({"loss": 0.2, "burst": 4}, {"loss": STATES}, (0, 0.6, 0.1, 0.3)),
+        ({"loss": STATES}, {"loss": 0.5}, (0.5, 0.5, 0, 1)),
+        ({"loss": STATES}, {"delay_ms": 1}, (0, 0.6, 0.1, 0.3)),
+    ],
+)
+def test_a_pair_keeps_the_losses_of_the_default(default: Any, pair: Any, wanted: tuple[float, ...]) -> None:
+    """By hand: bursts of b packets with loss p end with 1 / b and begin with p / (b (1 - p))."""
+    channel = parse(hosts=TWO, default=default, pairs=[{"between": ["left", "right"], **pair}])
+    loss = channel.links["left", "right"].loss
+    assert (loss.good, loss.bad, loss.to_bad, loss.to_good) == pytest.approx(wanted)
+
+
 def test_links_of_the_graphs_join_hosts() -> None:
     """Hosts {1, 2} and {3, 4, 5}: the line joins them by 2 - 3, the other graph by 5 - 1, in one direction only."""
     used = np.zeros((3, 5, 5), dtype=bool)
@@ -93,8 +115,16 @@ def test_links_of_the_graphs_join_hosts() -> None:
         ({"default": {"loss": 0.5, "burst": 0.5}}, "default.burst: 0.5: expected a number >= 1"),
         ({"default": {"loss": 0.9, "burst": 2}}, "default.burst: 2.0: expected at least 9"),
         (
-            {"default": {"loss": 0.1}, "pairs": [{"between": [BASE, "agent_1"], "burst": 2}]},
-            "expected a number as loss",
+            {"default": {"loss": STATES}, "pairs": [{"between": [BASE, "agent_1"], "burst": 2}]},
+            "pairs[1].burst: 2.0: expected a number as loss",
+        ),
+        (
+            {"default": {"loss": 0.1, "burst": 2}, "pairs": [{"between": [BASE, "agent_1"], "loss": 0.9}]},
+            "pairs[1].loss: 0.9: expected at most 0.6667 with burst 2, which is that of `default`",
+        ),
+        (
+            {"default": {"delay_ms": 3, "jitter_ms": 2}, "pairs": [{"between": [BASE, "agent_1"], "delay_ms": 1}]},
+            "pairs[1].delay_ms: 1.0: expected at least 2, the jitter_ms of `default`",
         ),
         ({"default": {"delay_ms": -1}}, "default.delay_ms: -1: expected a number of milliseconds from 0 to 60000"),
         ({"default": {"delay_ms": 1, "jitter_ms": 2}}, "default.jitter_ms: 2.0: expected at most delay_ms, 1"),
