@@ -1,5 +1,6 @@
 """The single nodes, as another launcher would start them."""
 
+import json
 import re
 import signal
 import time
@@ -86,6 +87,31 @@ def test_the_others_end_without_an_agent(network: Any, domain: int) -> None:
     trajectory = read_bag(bag)
     assert (trajectory.completeness.complete, check(trajectory).difference) == (False, None)
     assert "complete: 'false'" in (bag / "metadata.yaml").read_text()
+
+
+@pytest.mark.parametrize("other", ["agents", "recorder"])
+def test_two_records_of_one_run(network: Any, domain: int, record: Path, other: str) -> None:
+    """One process has a record with another seed, but the same id and key: it ends, and says so; the others end, too.
+
+    One that has not found all others by then waits for the end of its time for that.
+    """
+    document = json.loads(record.read_text())
+    document["experiment"]["run"]["seed"] += 1
+    changed = record.with_name("changed.json")
+    changed.write_text(json.dumps(document))
+    files = {"agents": record, "recorder": record} | {other: changed}
+    options = ("--await", "recorder", "--timeout", "2", "--discovery-timeout", "30")
+    nodes = {
+        "switcher": network.start("switcher", record, *options),
+        "agents": network.start("agent", files["agents"], *agents("12345"), *options),
+        "recorder": network.start(
+            "recorder", files["recorder"], "--out", network.directory / "runs/mine", *options[2:]
+        ),
+    }
+    words = f"has another run record than the switcher, both of run {document['run']}: give"
+    assert words in network.ended(nodes.pop(other), 2)[1]
+    for node in nodes.values():
+        assert re.search("left the network|did not discover", network.ended(node, 2)[1])
 
 
 @pytest.mark.timeout(150)

@@ -20,7 +20,7 @@ from msg_analysis.arithmetic.reproducible import StepClock
 from msg_analysis.arithmetic.update_law import all_finite
 from msg_analysis.messages.cdr import CdrError
 from msg_analysis.messages.messages import ActiveGraph, AgentState, Progress, StateFrame, decode_string, encode_string
-from msg_analysis.messages.topics import END, EPOCH, STOP, Topic
+from msg_analysis.messages.topics import END, EPOCH, RECORD, STOP, Topic
 from msg_analysis.model.graph_path import HoldingPeriod, PathWindow
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import first_graph
@@ -135,7 +135,7 @@ class RunRules:
         message = decode_of_run(Progress, data, self._record.run.bytes)
         if isinstance(message, str):
             return message
-        if message.agent > (0 if topic in (END, EPOCH, STOP) else self._record.experiment.agents):
+        if message.agent > (0 if topic in (END, EPOCH, STOP, RECORD) else self._record.experiment.agents):
             return Refusal.UNKNOWN_AGENT
         if message.step > self._record.experiment.steps:
             return Refusal.OUT_OF_RANGE

@@ -100,13 +100,15 @@ EPOCH = Topic("epoch", messages.PROGRESS, LATCHED, "switcher", "agents")
 END = Topic("end", messages.PROGRESS, LATCHED, "switcher", "agents, recorder, live, markers")
 # Before the end of a run that ends early (`--until`): at which step. Recorded, so that a bag is that of a shorter run.
 STOP = Topic("stop", messages.PROGRESS, LATCHED, "switcher", "agents, recorder", recorded=True)
+# By which nodes that were started one by one know that they have the same run record: its digest as stamp.
+RECORD = Topic("record", messages.PROGRESS, LATCHED, "switcher", "agents, recorder")
 LEAVE = Topic("leave", messages.PROGRESS, LATCHED, "agents, switcher, recorder", "agents, switcher, recorder")
 ESTIMATE = Topic("estimate", messages.ESTIMATE, NEWEST, "live", "")
 MARKERS = Topic("markers", MessageType("visualization_msgs", "MarkerArray"), NEWEST, "markers", "")
 DIAGNOSTICS = Topic("/diagnostics", MessageType("diagnostic_msgs", "DiagnosticArray"), RECENT, "every process", "")
 CLOCK = Topic("/clock", MessageType("rosgraph_msgs", "Clock"), RECENT, "player", "nodes with use_sim_time")
 TOPICS = (
-    *(EXPERIMENT, GRAPH, STATE, TRUTH, STATES, TRUTHS, PROGRESS, RESEND, EPOCH, END, STOP, LEAVE),
+    *(EXPERIMENT, GRAPH, STATE, TRUTH, STATES, TRUTHS, PROGRESS, RESEND, EPOCH, END, STOP, RECORD, LEAVE),
     *(ESTIMATE, MARKERS, DIAGNOSTICS, CLOCK),
 )
 

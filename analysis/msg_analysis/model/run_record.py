@@ -10,6 +10,7 @@ does any bag of the network, whoever recorded it.
 from __future__ import annotations
 
 import datetime
+import hashlib
 import json
 import platform
 import re
@@ -116,6 +117,15 @@ class RunRecord:
     def planned_steps(self) -> int:
         """Number of steps that were planned before the run."""
         return self.planned or self.experiment.steps
+
+    @cached_property
+    def digest(self) -> int:
+        """A number below 2**60 that two records share only if their runs are the same, whatever wrote them."""
+        document = [str(self.run), self.experiment.to_document(), str(self.until), self.planned]
+        found = hashlib.sha256(json.dumps(document, sort_keys=True).encode() + self.start.tobytes())
+        for matrix in (*self.matrices.weights, *self.matrices.noise_gain) if self.matrices else ():
+            found.update(matrix.tobytes())
+        return int.from_bytes(found.digest()[:8]) >> 4
 
     def ended(self, step: int) -> RunRecord:
         """The record of this run, which has ended at a step before its last one: that of a complete, shorter run."""

@@ -283,6 +283,7 @@ def _run_nodes(
     executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")
     throughput = record.experiment.run.pace == "lockstep"
     options |= {"status_file": status_file, "relay": introduction, "peer_timeout": timeout}
+    options["one_record"] = lifeline is not None and timeout is None
     if not run_nodes(nodes, executor=executor, throughput=throughput, **options):
         sys.exit(ExitCode.INCOMPLETE)
 

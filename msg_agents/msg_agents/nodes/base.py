@@ -166,6 +166,17 @@ class NetworkNode(LeanNode):
         if not self.done.done():
             self.done.set_exception(error)
 
+    def compare_record(self) -> None:
+        """Fail where the switcher has another record of this run: each would wait for what the other never sends."""
+
+        def receive(data: bytes) -> None:
+            message = self.decode_progress(data, topics.RECORD)
+            if message and message.stamp != self.record.digest:
+                words = f"{self.get_name()} has another run record than the switcher, both of run {self.record.run}"
+                self.fail(InputError(f"{words}: give all nodes the same file, and the same version of this software"))
+
+        self.subscribe(topics.RECORD, receive)
+
     def finish_at_end(self, nodes: Iterable[NetworkNode] | None = None) -> None:
         """End these nodes of the process (default: this one) when the switcher announces the end of the run."""
         # With a node that ends earlier, unread messages or acknowledgements that others need would be lost.

@@ -105,6 +105,7 @@ def run_nodes(
     status_file: Path | None = None,  # written once a second and at the end
     relay: int | None = None,  # descriptor of ``DiscoveryRelay``
     peer_timeout: float | None = None,  # s, see ``PeerPresence``; None: no limit
+    one_record: bool = True,  # whether one process gave all of them their record, so that it need not be compared
 ) -> bool:
     """Run nodes until each has done its part; False if the process was stopped (SIGINT, SIGTERM) before."""
     show_stacks_when_asked()
@@ -134,6 +135,8 @@ def run_nodes(
         if relay is not None:
             prefix = own_prefix(nodes[0])
             report_ready(relay, nodes[0].get_name(), prefix)
+        if not one_record:
+            nodes[0].compare_record()
         reporter = HealthReporter(nodes, status_file)
         presence = None if peer_timeout is None else PeerPresence(nodes, peer_timeout)
         spinner = make_executor(executor)

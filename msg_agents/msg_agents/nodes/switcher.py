@@ -109,6 +109,12 @@ class Switcher(NetworkNode):
         """Health once all agents have started; ``values``: facts to include."""
         raise NotImplementedError
 
+    def compare_record(self) -> None:
+        """Let the others compare their records with this one."""
+        self.publish(
+            self.publisher_of(topics.RECORD), self.progress(topics.RECORD, NOT_AN_AGENT, 0, self.record.digest)
+        )
+
     def begin(self) -> None:
         """Publish the experiment."""
         self.publish(self._experiment, encode_string(self.record.to_json()))
