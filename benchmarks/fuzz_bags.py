@@ -19,7 +19,7 @@ from fuzz_documents import mutate_document, mutate_text
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from msg_analysis.bags.mcap_reading import MAGIC
+from msg_analysis.bags.mcap_records import MAGIC
 from msg_analysis.bags.stored_file import COMPRESSIONS, Storage
 from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.experiment.experiment import Experiment

@@ -256,6 +256,8 @@ class FileInventory:
             self._channel(number)
         if self.file.torn is None and isinstance(self.file, McapFile):
             self.summary, self.stated_messages = summary_of(self.file.path)
+            if self.stated_messages is None and self.file.stated is not None:
+                self.stated_messages = self.file.stated.message_count
 
     def _channel(self, number: int) -> ChannelCount:
         if number not in self._channels:

@@ -3,7 +3,8 @@
 
 """The messages of an MCAP file, whole or torn, in batches that numpy can work on.
 
-Damaged chunks are counted and left out; a tear ends the reading.
+Damaged chunks are counted and left out. Behind a damaged record, reading goes on at the next whole one, with the
+schemas and channels of the summary; a tear ends it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,23 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, ChunkIndex, Header, Metadata, Schema, Statistics
 
+from msg_analysis.bags.mcap_records import (
+    CHUNK,
+    FOOTER,
+    INDEX_HEAD,
+    LAST_OPCODE,
+    LENGTH,
+    MAGIC,
+    RECORD,
+    RECORD_HEAD,
+    SUMMARY_OPCODES,
+    Source,
+    fits,
+    is_message,
+    read_summary,
+    run_of_messages,
+    walk,
+)
 from msg_analysis.bags.stored_file import (
     MESSAGE_HEAD,
     RECORD_LIMIT,
@@ -31,18 +49,11 @@ from msg_analysis.bags.stored_file import (
     gather,
     no_time,
 )
-from msg_analysis.common.arrays import AnyArray, IntArray
+from msg_analysis.common.arrays import IntArray
 from msg_analysis.errors import BagError
 
-MAGIC = b"\x89MCAP0\r\n"
-RECORD = struct.Struct("<BQ")  # opcode and length, before the content of every record
 CHUNK_TIMES = struct.Struct("<QQ")  # first and last log time, at the start of a chunk
-_CHUNK = struct.Struct("<QQQII")  # start and end time, size, CRC (0: none), length of the compression's name
-INDEX_HEAD = 6  # bytes before the entries of a message index record: channel, length; an entry: time, offset
-_RECORD_HEAD = np.dtype([("opcode", "u1"), ("length", "<u8")])
-_LENGTH = struct.Struct("<Q")
 CHUNK_CRC = slice(RECORD.size + 24, RECORD.size + 28)  # place of the CRC in the record of a chunk
-_ALIKE = 16  # records of equal length in a row, after which more are expected
 MOST_OTHERS = 2**18  # records of a chunk that are no messages: two for every number of a channel
 MOST_DESCRIBED = 2**26  # bytes of the schemas and channels in the chunks of a file: what they describe is kept
 _LOOSE = 2**18  # bytes of a batch of messages that are not in chunks
@@ -64,39 +75,6 @@ class _Chunk:
             self.index.append(content)
 
 
-class _Source:
-    """A stream of records that gives out many message records in a row at once; nothing else may read the stream."""
-
-    def __init__(self, stream: io.BufferedReader, loose: int) -> None:
-        self._stream, self._loose = stream, loose
-        self._buffer, self._at = b"", 0  # bytes read from the stream, and how many of them were given out
-
-    def read(self, size: int) -> bytes:
-        """So many bytes; fewer at the end."""
-        found = self._buffer[self._at : self._at + size]
-        self._at += size
-        if len(found) < size:
-            self._buffer, self._at = b"", 0
-            found += self._stream.read(size - len(found))
-        return found
-
-    def messages(self, head: bytes) -> tuple[bytes, IntArray, IntArray, int]:
-        """Buffer, (messages,) offsets and sizes of contents, and bytes, of message records; ``head``: of the first."""
-        if self._at >= len(head):
-            self._at -= len(head)
-        else:
-            self._buffer, self._at = head, 0
-        for _ in range(2):
-            start, size, end = run_of_messages(self._buffer, self._at)
-            if len(start):
-                break
-            self._buffer, self._at = self._buffer[self._at :] + self._stream.read(self._loose), 0
-        length, self._at = end - self._at, end
-        if not length:  # cut off, or longer than ``loose``: the head counts as read again
-            self._at += len(head)
-        return self._buffer, start, size, length
-
-
 @dataclass(slots=True)
 class McapFile(StoredFile):
     """An MCAP file to be read once, by iterating over ``batches()``; compressed as a whole if named *.zstd."""
@@ -104,7 +82,12 @@ class McapFile(StoredFile):
     statistics: Statistics | None = None
     false_indexes: int = 0  # chunks whose index is wrong: here the records decide, other programs use the index
     loose: int = _LOOSE  # bytes of a batch of messages that are not in chunks
+    stated: Statistics | None = None  # by a whole summary, which is read where something is damaged
     _described: int = 0  # bytes of the schemas and channels in the chunks
+    _chunks: int = 0  # so far, damaged ones too
+    _skipped: int = 0  # damaged records outside chunks that may have held messages
+    _damaged: bool = False
+    _ended: bool = False  # whether only the summary follows
 
     def _stored(self) -> Iterator[Batch]:
         try:
@@ -132,7 +115,7 @@ class McapFile(StoredFile):
         _keep_memory()
         zstd = zstandard.ZstdDecompressor()  # for all chunks: making one takes longer than a small chunk
         chunk: _Chunk | None = None
-        for opcode, content, places in self._records(_Source(stream, self.loose), size):
+        for opcode, content, places in self._records(Source(stream, self.loose), size):
             if opcode == Opcode.MESSAGE_INDEX and chunk is not None:
                 chunk.add_index(content)
                 continue
@@ -140,44 +123,104 @@ class McapFile(StoredFile):
                 yield from self._chunk(chunk, zstd)
                 chunk = None
             if opcode == Opcode.CHUNK:
+                self._chunks += 1
                 chunk = _Chunk(content, self.whole_bytes)
             elif opcode == Opcode.MESSAGE:
-                yield _loose_batch(content, *places, self.whole_bytes)
+                yield _loose_batch(content, *places, self.whole_bytes, chunks=self._chunks > 0)
             else:
                 with contextlib.suppress(DamageError):
                     self.note(opcode, content)
         if chunk is not None:
             yield from self._chunk(chunk, zstd)
+        stated = self.stated.chunk_count if self.stated else 0
+        self.damaged_chunks += max(0, stated - self._chunks) if stated else self._skipped
 
-    def _records(self, stream: _Source, size: int) -> Iterator[tuple[int, bytes, tuple[IntArray, IntArray]]]:
-        """Opcode, content and (offsets, sizes) of each record; message records in a row come together."""
+    def _records(self, source: Source, size: int) -> Iterator[tuple[int, bytes, tuple[IntArray, IntArray]]]:
+        """Opcode, content and (offsets, sizes) of each record; message records in a row come together; 0: a gap."""
+        none = np.empty(0, dtype=np.int64)
         while True:
-            head = stream.read(RECORD.size)
+            head = source.read(RECORD.size)
             if len(head) < RECORD.size:
                 self.torn = f"ends after {self.whole_bytes} bytes without a footer"
                 return
             opcode, length = RECORD.unpack(head)
             content = b""
-            if opcode == Opcode.MESSAGE:
-                data, start, sizes, whole = stream.messages(head)
+            if opcode == Opcode.MESSAGE and not self._only_in_chunks:
+                data, start, sizes, whole = source.messages(head)
                 if whole:
                     self.whole_bytes += whole
                     yield opcode, data, (start, sizes)
                     continue
-            if not opcode:  # a power cut leaves zeros
-                self.torn = f"no record at byte {self.whole_bytes}, where one should be"
-                return
             if length <= min(RECORD_LIMIT, size - self.whole_bytes):
-                content = stream.read(length)
-            if len(content) < length:
+                content = source.read(length)
+            if len(content) == length and self._belongs(opcode, content, source):
+                self.whole_bytes += RECORD.size + length
+                if opcode == Opcode.FOOTER:
+                    if source.read(len(MAGIC)) != MAGIC:
+                        self.torn = "the closing magic bytes are missing"
+                    return
+                self._ended |= opcode in SUMMARY_OPCODES
+                yield opcode, content, (np.array([0]), np.array([length]))
+                continue
+            self._consult_summary()
+            whole_one = opcode not in (Opcode.CHUNK, Opcode.MESSAGE_INDEX) and fits(opcode, content)
+            if whole_one and not self._ended:  # the next one is damaged, or bytes of this one are lost
+                yield opcode, content, (np.array([0]), np.array([length]))
+            chunk = opcode == Opcode.CHUNK or fits(Opcode.CHUNK, content)
+            # Of a damaged chunk that is not compressed, no message is taken: nothing would tell that it was changed.
+            inside = bool(self._chunks or chunk or (self.stated and self.stated.chunk_count)) and not self._ended
+            source.unread(head + content)
+            skipped = source.skip((Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL) if inside else ())
+            if skipped is None:
+                fitting = bool(content) and fits(opcode, content)
+                self.whole_bytes += (RECORD.size + length) * fitting
                 self.torn = f"the record at byte {self.whole_bytes} is cut off or damaged"
+                if not opcode or fitting:  # a power cut leaves zeros
+                    self.torn = f"no record at byte {self.whole_bytes}, where one should be"
                 return
-            self.whole_bytes += RECORD.size + length
-            if opcode == Opcode.FOOTER:
-                if stream.read(len(MAGIC)) != MAGIC:
-                    self.torn = "the closing magic bytes are missing"
-                return
-            yield opcode, content, (np.array([0]), np.array([length]))
+            index = self._chunks and (opcode == Opcode.MESSAGE_INDEX or fits(Opcode.MESSAGE_INDEX, content))
+            self._skipped += chunk or not (index or self._ended)
+            self.false_indexes += 1
+            self.whole_bytes += skipped
+            yield 0, b"", (none, none)
+
+    @property
+    def _only_in_chunks(self) -> bool:
+        """Whether a message outside chunks is a sign of damage."""
+        return self._ended or (self._damaged and self._chunks > 0)
+
+    def _belongs(self, opcode: int, content: bytes, source: Source) -> bool:
+        """Whether a record can stand where it does; not the opcode and length of something else."""
+        if opcode == Opcode.MESSAGE:
+            return not self._only_in_chunks and source.followed(content)
+        if opcode == Opcode.FOOTER:
+            return len(content) == FOOTER.size
+        if opcode == Opcode.CHUNK:  # where bytes of it are lost, it would end in the next one
+            return not self._ended and (source.record_at(0) or _is_right(content))
+        if self._ended and opcode <= LAST_OPCODE:
+            return opcode in SUMMARY_OPCODES or fits(opcode, content)
+        if fits(opcode, content):
+            return source.record_at(0)
+        # Types of later versions of the format are left out, unless they look like one of this.
+        number = int.from_bytes(content[:2], "little")
+        message = not self._chunks and number in self.channels and len(content) >= MESSAGE_HEAD.itemsize
+        other = message or any(fits(each, content) for each in Opcode)
+        return opcode > LAST_OPCODE and not other and source.record_at(0)
+
+    def _consult_summary(self) -> None:
+        """Take the topics of the summary: the chunk that describes them may be lost."""
+        if self._damaged or self.path.suffix == ZSTD_SUFFIX:
+            return
+        self._damaged = True
+        summary = McapFile(self.path)
+        for opcode, content in read_summary(self.path) or ():
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
+                with contextlib.suppress(DamageError):
+                    summary.note(opcode, content)
+        self.stated = summary.statistics
+        self.schemas = summary.schemas | self.schemas
+        for number in summary.channels.keys() - self.channels.keys():
+            self.add_channel(summary.channels[number])
 
     def note(self, opcode: int, content: bytes) -> None:
         """Take the content of a record that is no message; DamageError: not of its type; BagError: too many topics."""
@@ -217,6 +260,7 @@ class McapFile(StoredFile):
             raise
         except Exception:  # decompressors and the library raise many kinds of errors on damage
             self.damaged_chunks += 1
+            self._consult_summary()
         else:
             yield batch
 
@@ -244,6 +288,17 @@ class McapFile(StoredFile):
         return np.concatenate([none, *starts]), np.concatenate([none, *sizes])
 
 
+def _is_right(chunk: bytes) -> bool:
+    """Whether the content of a chunk ends where its record does, and has the right checksum or whole records."""
+    try:
+        data = unpack(chunk, zstandard.ZstdDecompressor())
+    except Exception:  # decompressors raise many kinds of errors on damage
+        return False
+    crc = CHUNK.unpack_from(chunk)[3]
+    walked = crc or sum(RECORD.size + len(content) for _, content in walk(data, 0, len(data)))
+    return fits(Opcode.CHUNK, chunk) and walked in (crc, len(data))
+
+
 def _keep_memory() -> None:
     """Let the C library keep large blocks that are freed from chunk to chunk."""
     # Mapping fresh pages each time takes longer than all that is done with a chunk. Freeing one large block raises the
@@ -251,10 +306,11 @@ def _keep_memory() -> None:
     np.empty(2**24, np.uint8)
 
 
-def _loose_batch(data: bytes, start: IntArray, size: IntArray, end: int) -> Batch:
+def _loose_batch(data: bytes, start: IntArray, size: IntArray, end: int, *, chunks: bool) -> Batch:
     """Messages that are not in a chunk; damaged ones are left out one by one."""
     start, size = start[size >= MESSAGE_HEAD.itemsize], size[size >= MESSAGE_HEAD.itemsize]
-    timed = ~no_time(gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD))
+    head = gather(data, start, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
+    timed = ~no_time(head) & is_message(data, start, size, head, chunks=chunks)
     return Batch.of_contents(data, start[timed], size[timed], end)
 
 
@@ -262,20 +318,20 @@ def chunk_head(index: ChunkIndex) -> bytes:
     """The first bytes of the record of a chunk, before its data, as its index describes it; with 0 as CRC."""
     name = index.compression.encode()
     times = (index.message_start_time, index.message_end_time)
-    content = _CHUNK.pack(*times, index.uncompressed_size, 0, len(name)) + name + _LENGTH.pack(index.compressed_size)
+    content = CHUNK.pack(*times, index.uncompressed_size, 0, len(name)) + name + LENGTH.pack(index.compressed_size)
     head: bytes = RECORD.pack(Opcode.CHUNK, index.chunk_length - RECORD.size) + content
     return head
 
 
 def unpack(content: bytes, zstd: zstandard.ZstdDecompressor, limit: int = RECORD_LIMIT) -> bytes:
     """The records in a chunk, from the content of its record; DamageError: too large, or a wrong checksum."""
-    _, _, size, crc, name_size = _CHUNK.unpack_from(content)
-    at = _CHUNK.size + name_size
-    name = content[_CHUNK.size : at]
-    (packed_size,) = _LENGTH.unpack_from(content, at)
-    at += _LENGTH.size
+    _, _, size, crc, name_size = CHUNK.unpack_from(content)
+    at = CHUNK.size + name_size
+    name = content[CHUNK.size : at]
+    (packed_size,) = LENGTH.unpack_from(content, at)
+    at += LENGTH.size
     packed = memoryview(content)[at : at + packed_size]
-    if size > limit:
+    if size > limit or not (crc or fits(Opcode.CHUNK, content)):
         raise DamageError
     if name == b"zstd":
         if zstandard.frame_content_size(packed) > limit:
@@ -302,49 +358,12 @@ def locate(data: bytes, index: Sequence[bytes]) -> tuple[IntArray, IntArray] | N
     if start is None or not len(start) or len(data) < RECORD.size or start[-1] > len(data) - RECORD.size:
         return None
     start = start.astype(np.int64)
-    head = gather(data, start, RECORD.size).view(_RECORD_HEAD)
+    head = gather(data, start, RECORD.size).view(RECORD_HEAD)
     start += RECORD.size
     size = np.minimum(head["length"], RECORD_LIMIT + 1).astype(np.int64)
     end = start + size
     followed = start[0] == RECORD.size and end[-1] == len(data) and (start[1:] - end[:-1] == RECORD.size).all()
     return (start, size) if followed and (head["opcode"] == Opcode.MESSAGE).all() else None
-
-
-def run_of_messages(data: bytes, at: int) -> tuple[IntArray, IntArray, int]:
-    """(messages,) offsets and sizes of the contents of the whole message records that follow ``at``, and their end."""
-    starts: list[IntArray] = []
-    sizes: list[IntArray] = []
-    walked: list[tuple[int, int]] = []
-    before, alike, end = -1, 0, len(data) - RECORD.size
-
-    def keep_walked() -> None:
-        if walked:
-            places = np.array(walked, dtype=np.int64)
-            starts.append(places[:, 0])
-            sizes.append(places[:, 1])
-            walked.clear()
-
-    while at <= end:
-        opcode, length = RECORD.unpack_from(data, at)
-        step = RECORD.size + length
-        if opcode != Opcode.MESSAGE or at + step > len(data):
-            break
-        alike = alike + 1 if length == before else 0
-        before = length
-        if alike < _ALIKE:  # one by one while the lengths differ; then all of the same length at once
-            walked.append((at + RECORD.size, length))
-            at += step
-            continue
-        heads: AnyArray = np.ndarray((len(data) - at) // step, _RECORD_HEAD, data, at, (step,))
-        others = np.flatnonzero((heads["opcode"] != Opcode.MESSAGE) | (heads["length"] != length))
-        count = int(others[0]) if len(others) else len(heads)
-        keep_walked()
-        starts.append(at + RECORD.size + step * np.arange(count))
-        sizes.append(np.full(count, length))
-        at, before = at + step * count, -1
-    keep_walked()
-    none = np.empty(0, dtype=np.int64)
-    return np.concatenate([none, *starts]), np.concatenate([none, *sizes]), at
 
 
 def _indexed_places(index: Sequence[bytes]) -> IntArray | None:

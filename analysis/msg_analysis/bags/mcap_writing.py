@@ -28,7 +28,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, AttachmentIndex, Channel, McapRecord, Metadata, MetadataIndex, Schema
 
 from msg_analysis.bags.files import ChannelCount, FileCount, bag_information, dump
-from msg_analysis.bags.mcap_reading import MAGIC
+from msg_analysis.bags.mcap_records import MAGIC
 from msg_analysis.bags.stored_file import MESSAGE_HEAD, Compression, Storage, gather, scatter
 from msg_analysis.common.arrays import AnyArray, IntArray
 from msg_analysis.messages.topics import Qos, Topic

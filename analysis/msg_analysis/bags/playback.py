@@ -22,7 +22,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
 from msg_analysis.bags.files import bag_files, offered_profiles, stored_file
-from msg_analysis.bags.mcap_reading import CHUNK_TIMES, INDEX_HEAD, MAGIC, RECORD, McapFile
+from msg_analysis.bags.mcap_reading import CHUNK_TIMES, McapFile
+from msg_analysis.bags.mcap_records import INDEX_HEAD, MAGIC, RECORD
 from msg_analysis.bags.stored_file import DamageError
 from msg_analysis.errors import BagError
 

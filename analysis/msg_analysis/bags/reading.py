@@ -22,7 +22,7 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from msg_analysis.bags.files import FileInventory, bag_files, first_file, stored_file
-from msg_analysis.bags.mcap_reading import MAGIC, RECORD
+from msg_analysis.bags.mcap_records import MAGIC, RECORD
 from msg_analysis.bags.mcap_writing import RECORD_NAME
 from msg_analysis.bags.states import Collector
 from msg_analysis.bags.stored_file import RECORD_LIMIT, Batch, StoredFile

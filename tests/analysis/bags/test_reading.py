@@ -27,7 +27,7 @@ from msg_analysis.messages.cdr import CdrError
 from msg_analysis.messages.messages import AGENT_STATE, STRING, ActiveGraph, AgentState, encode_string
 
 STEPS, AGENTS, WIDTH, LOST = 5, 3, 2, 2**64 - 1
-MESSAGE, METADATA_INDEX, FOOTER, HEAD = 5, 13, 2, 22
+MESSAGE, PRIVATE, FOOTER, HEAD = 5, 0x80, 2, 22
 NEIGHBOURS = ([0, 0, 0], [1, 2, 1], [2, 1, 1])  # how many: no graph, line, star
 KINDS = ("plain", "loss", "realtime", "late", "hold")
 thorough = settings(max_examples=60, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -287,11 +287,9 @@ def test_the_same_arcs_again_and_arcs_that_are_wrong() -> None:
                 ActiveGraph.decode(data + bytes(8))
 
 
-# Runs of equal and of different lengths; of 21 bytes a message is damaged, the other opcode is none.
+# Runs of equal and of different lengths; of 21 bytes a message is damaged, the other opcode is an application's own.
 runs = st.lists(
-    st.tuples(
-        st.sampled_from([MESSAGE] * 4 + [METADATA_INDEX]), st.sampled_from([21, 22, 30, 98, 700]), st.integers(1, 60)
-    ),
+    st.tuples(st.sampled_from([MESSAGE] * 4 + [PRIVATE]), st.sampled_from([21, 22, 30, 98, 700]), st.integers(1, 60)),
     max_size=12,
 )
 

@@ -186,7 +186,7 @@ def test_a_bag_of_files_of_every_kind(in_place: bool, tmp_path: Path) -> None:
 
 
 def test_damaged_chunks(tmp_path: Path) -> None:
-    """Of 2, 3, 3 and 1 messages; how many were lost is known from the end of the file. The topic is in the first."""
+    """Of 2, 3, 3 and 1 messages; how many were lost, and the topic of the first, the end of the file says."""
     (tmp_path / "x").mkdir()
     for number, lost in enumerate(([4], [6, 8], [1])):
         data = whole(tmp_path / f"x/x_{number}.mcap")
@@ -194,9 +194,9 @@ def test_damaged_chunks(tmp_path: Path) -> None:
             data = data.replace(bytes([time]) * 40, b"?" * 40, 1)
         (tmp_path / f"x/x_{number}.mcap").write_bytes(data)
     report = salvage(tmp_path / "x", tmp_path / "out")
-    assert (report.kept_messages, report.lost_messages, report.damaged_chunks) == (11, 16, 4)
+    assert (report.kept_messages, report.lost_messages, report.damaged_chunks) == (18, 9, 4)
     assert (report.dropped_bytes, report.torn) == (0, None)
-    for number, kept in enumerate(([0, 1, 5, 6, 7, 8], [0, 1, 2, 3, 4], [])):
+    for number, kept in enumerate(([0, 1, 5, 6, 7, 8], [0, 1, 2, 3, 4], [2, 3, 4, 5, 6, 7, 8])):
         found = content(tmp_path / f"out/out_{number}.mcap")
         assert found["messages"] == [("/a", 0, 100 + time, time, bytes([time]) * 40) for time in kept]
         assert found["header"] == ("ros2", "theirs")
