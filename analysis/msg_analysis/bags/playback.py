@@ -74,14 +74,23 @@ class Playback:
 
     def __init__(self, path: Path, most_held: int = MOST_HELD) -> None:
         self._most_held = most_held  # bytes
-        self._outlines = [_quick_outline(file) or _outline(file) for file in bag_files(Path(path))]
+        self._outlines: list[_Outline] = []
+        unreadable: list[BagError] = []
+        for file in bag_files(Path(path)):
+            try:
+                self._outlines.append(_quick_outline(file) or _outline(file))
+            except (BagError, OSError) as error:  # as for other readers, the rest of the bag counts
+                unreadable.append(BagError(str(error)))
+        if not self._outlines:
+            raise unreadable[0]
         starts = [outline.start for outline in self._outlines if outline.start is not None]
         ends = [outline.end for outline in self._outlines if outline.end is not None]
         if not starts:
             raise BagError(f"{path}: has no messages: there is nothing to play")
         self.start, self.end = min(starts), max(ends)  # extreme log times [ns]
         # A line per damaged file, some only after reading.
-        self.damage = [f"{outline.path}: {outline.damage}" for outline in self._outlines if outline.damage]
+        self.damage = [f"{error}: left out" for error in unreadable]
+        self.damage += [f"{outline.path}: {outline.damage}" for outline in self._outlines if outline.damage]
         self.topics: dict[str, BagTopic] = {}  # with messages, by name
         for outline in self._outlines:
             for number, channel in outline.channels.items():

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
+from mcap_by_hand import MAGIC
 
 from msg_analysis.bags.playback import Playback
 from msg_analysis.errors import BagError
@@ -195,3 +196,28 @@ def test_a_length_beyond_the_file(tmp_path: Path, flipped: int) -> None:
         assert len(found) == 100 - lost
         assert set(found) <= set(expected(messages))
         assert Playback(path).damage == [f"{path}: damaged chunks that are left out: 1"][: lost // 4]
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("b_2.mcap", b""),
+        ("b_2.mcap", bytes(5000)),
+        ("._b_0.mcap", b"\0\5\26\7Mac OS X"),
+        ("b_2.db3", b""),
+        ("b_2.db3", b"x" * 99),
+    ]
+    + [("b_2.mcap.zstd", b"no frame"), ("b_2.mcap", MAGIC), ("0.db3.zstd", bytes(99))],
+)
+def test_one_file_that_cannot_be_read(tmp_path: Path, name: str, content: bytes) -> None:
+    """The others are played, and the file is named."""
+    messages = [("/a", 1000 + i) for i in range(30)]
+    write(tmp_path / "b_1.mcap", messages)
+    (tmp_path / name).write_bytes(content)
+    bag = Playback(tmp_path)
+    assert [message.topic for message in bag.messages(set(bag.topics))] == ["/a"] * 30
+    (line,) = bag.damage
+    assert str(tmp_path / name) in line
+    (tmp_path / "b_1.mcap").unlink()
+    with pytest.raises(BagError):
+        Playback(tmp_path)
