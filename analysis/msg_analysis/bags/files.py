@@ -206,7 +206,7 @@ def _named_as_files(path: Path) -> list[Path]:
 
 def _refuse_unknown(path: Path, information: dict[str, Any]) -> None:
     storage = information.get("storage_identifier")
-    if storage not in ("mcap", "sqlite3"):
+    if storage not in ("mcap", "sqlite3", "", None):  # the latter of a reindexed bag: the names of its files tell
         raise BagError(
             f"{path}: its storage is {storage}, expected mcap or sqlite3: record with `ros2 bag record -s mcap`, or "
             "convert it"

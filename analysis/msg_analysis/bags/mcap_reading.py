@@ -48,6 +48,7 @@ from msg_analysis.bags.stored_file import (
     StoredFile,
     gather,
     no_time,
+    ros_type,
 )
 from msg_analysis.common.arrays import IntArray
 from msg_analysis.errors import BagError
@@ -231,6 +232,7 @@ class McapFile(StoredFile):
                 self.profile, self.library = header.profile, header.library
             elif opcode == Opcode.SCHEMA:
                 schema = Schema.read(stream)
+                schema.name = ros_type(schema.name)
                 self.schemas[schema.id] = schema
             elif opcode == Opcode.CHANNEL:
                 self.add_channel(Channel.read(stream))

@@ -153,9 +153,10 @@ class _Contents:
             tell(f"reading {file.path.name}", min(batch.end, size), size)
             for number, channel in itertools.islice(file.channels.items(), known, None):
                 schema = file.schemas.get(channel.schema_id)
-                pattern = _TOPICS.get(schema.name if schema else "")
-                if pattern and (found := pattern.search(channel.topic)):
-                    kind_of[number] = _NUMBERS[found[1]]
+                patterns = _TOPICS.values() if schema is None or not schema.name else [_TOPICS.get(schema.name)]
+                for pattern in patterns:  # without a type, the name of the topic counts
+                    if pattern and (found := pattern.search(channel.topic)):
+                        kind_of[number] = _NUMBERS[found[1]]
             known = len(file.channels)
             yield batch, kind_of[batch.channel]
 

@@ -9,6 +9,8 @@ Also how new files are compressed and split, and the files of rosbag2's sqlite3 
 from __future__ import annotations
 
 import contextlib
+import re
+import shutil
 import sqlite3
 import tempfile
 from collections.abc import Iterator
@@ -88,6 +90,8 @@ FREE_EXPANSION = 2**26
 MOST_CHANNELS = 2**13  # of a file: writing the metadata of each topic takes a tenth of a millisecond
 _ZSTD_FRAME = b"\x28\xb5\x2f\xfd"  # first bytes; no CDR message begins like that
 _UNPACKED = 2**22  # bytes of a batch of messages that were unpacked one by one
+_DDS_TYPE = re.compile(r"(\w+)(?:::|/)msg(?:::|/)dds_(?:::|/)(\w+)_")
+_SHORT_TYPE = re.compile(r"(\w+)(?:/|::|::msg::)(\w+)")
 # The sqlite3 storage. Of `topics`, the last two columns are not in all versions of rosbag2.
 _AT_ONCE = 2**20  # bytes of a batch of rows, and of a file that are unpacked together
 _WAL = 2  # write version in the head of a file in the mode WAL
@@ -205,6 +209,12 @@ class StoredFile:
         return unpacked
 
 
+def ros_type(name: str) -> str:
+    """A type as ROS 2 names it, from the name in DDS, such as ``std_msgs::msg::dds_::String_``, or that of ROS 1."""
+    found = _DDS_TYPE.fullmatch(name) or _SHORT_TYPE.fullmatch(name)
+    return f"{found[1]}/msg/{found[2]}" if found else name
+
+
 def no_time(head: AnyArray) -> BoolArray:
     """(messages,) whether the log or publish time is 2^63 ns or more, which no clock shows."""
     octets = head.view(np.uint8).reshape(len(head), MESSAGE_HEAD.itemsize)
@@ -242,9 +252,21 @@ class SqliteFile(StoredFile):
                 if file.suffix == ZSTD_SUFFIX:
                     file = stack.enter_context(self._unpacked())
                 size = file.stat().st_size
-                connection = _connect(file)
-                stack.callback(connection.close)
-                numbers = self._read_topics(connection)
+                try:
+                    connection = _connect(file)
+                    stack.callback(connection.close)
+                    numbers = self._read_topics(connection)
+                except sqlite3.OperationalError:  # SQLite would have to write: to finish what its log or journal holds
+                    logs = [log for end in ("-wal", "-journal") if (log := file.with_name(file.name + end)).exists()]
+                    if not logs:
+                        raise
+                    folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+                    for each in (file, *logs):
+                        shutil.copyfile(each, folder / each.name)
+                    self.channels.clear()
+                    connection = _connect(folder / file.name, "rw")
+                    stack.callback(connection.close)
+                    numbers = self._read_topics(connection)
             except (OSError, sqlite3.Error, zstandard.ZstdError) as error:
                 raise BagError(f"{self.path}: cannot be read ({error})") from error
             yield from self._rows(connection, numbers, size)
@@ -281,6 +303,7 @@ class SqliteFile(StoredFile):
         schemas: dict[str, int] = {}
         for topic, *texts in connection.execute(f"SELECT {wanted} FROM topics ORDER BY id LIMIT {MOST_CHANNELS + 1}"):
             name, kind, encoding, qos, type_hash = map(str, texts)
+            kind = ros_type(kind)
             if kind not in schemas:
                 schemas[kind] = len(schemas) + 1
                 definition = str(definitions.get(kind, "")).encode()
@@ -317,14 +340,14 @@ class SqliteFile(StoredFile):
             yield batch_of(pieces, np.array(heads, MESSAGE_HEAD), self.whole_bytes)
 
 
-def _connect(file: Path) -> sqlite3.Connection:
-    """Open a file without changing anything, also in a directory that cannot be written."""
+def _connect(file: Path, mode: str = "ro") -> sqlite3.Connection:
+    """Open a file; with the mode "ro" without changing anything, also in a directory that cannot be written."""
     with file.open("rb") as stream:
         head = stream.read(_WRITE_VERSION + 1)
     log = file.with_name(file.name + "-wal")
     # Without a log beside it, the mode WAL would make one.
     alone = head[_WRITE_VERSION:] == bytes([_WAL]) and not (log.exists() and log.stat().st_size)
-    connection = sqlite3.connect(f"{file.absolute().as_uri()}?{'immutable=1' if alone else 'mode=ro'}", uri=True)
+    connection = sqlite3.connect(f"{file.absolute().as_uri()}?{'immutable=1' if alone else f'mode={mode}'}", uri=True)
     connection.text_factory = lambda text: text.decode(errors="replace")
     connection.execute("PRAGMA writable_schema=ON")  # or a file that is cut off could not be read at all
     connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, RECORD_LIMIT)

@@ -256,3 +256,36 @@ def test_rows_that_are_no_messages(ours: Run, messages: list[Message], tmp_path:
     found = read_bag(file)
     assert np.array_equal(found.states, ours.states)
     assert found.completeness.refused == {"damaged chunk": 4}
+
+
+def test_a_hot_journal(ours: Run, messages: list[Message], tmp_path: Path) -> None:
+    """Copied while the file was written: rolled back in a copy, and nothing is changed."""
+    connection = sqlite3.connect(database(tmp_path / "x.db3", messages))
+    for statement in ("journal_mode=DELETE", "cache_size=1"):
+        connection.execute(f"PRAGMA {statement}")
+    connection.execute("UPDATE messages SET data = zeroblob(3000)")
+    (tmp_path / "copy").mkdir()
+    for file in tmp_path.glob("x.db3*"):
+        shutil.copy(file, tmp_path / "copy")
+    connection.close()
+    before = {file.name: file.read_bytes() for file in (tmp_path / "copy").iterdir()}
+    assert set(before) == {"x.db3", "x.db3-journal"}
+    assert np.array_equal(read_bag(tmp_path / "copy").states, ours.states)
+    assert {file.name: file.read_bytes() for file in (tmp_path / "copy").iterdir()} == before
+
+
+@pytest.mark.parametrize("form", ["{}::msg::dds_::{}_", "{}/{}", "{}::msg::{}", "{}/msg/{}", ""])
+def test_names_of_types(form: str, ours: Run, messages: list[Message], tmp_path: Path) -> None:
+    """Those of DDS and ROS 1, and none: then the names of the topics count."""
+    named = [("rt" + topic, form.format(*kind.split("/msg/")), time, data) for topic, kind, time, data in messages]
+    database(tmp_path / "x.db3", named)
+    assert np.array_equal(read_bag(tmp_path).states, ours.states)
+
+
+@pytest.mark.parametrize("identifier", ["storage_identifier: ''", "other: 1"])
+def test_no_storage_in_the_metadata(identifier: str, ours: Run, tmp_path: Path) -> None:
+    """As after a reindex: the names of the files tell."""
+    write_trajectory(ours, tmp_path / "bag")
+    file = tmp_path / "bag/metadata.yaml"
+    file.write_text(file.read_text().replace("storage_identifier: mcap", identifier))
+    assert np.array_equal(read_bag(tmp_path / "bag").states, ours.states)
