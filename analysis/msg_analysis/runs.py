@@ -23,6 +23,8 @@ from msg_analysis.common.text import HALF_WIDTH_95, agent_name, json_text, with_
 from msg_analysis.errors import BagError, InputError
 
 _WANTED = "expected what `msg-analysis compare --json` or `msg-agents run` wrote"
+LARGEST = 1e150  # of numbers: their squares are finite
+LONGEST_INTEGER = 300  # digits; floats have 309
 _RENAMED = {"blame": "causes", "strangers": "rejected_messages"}  # keys of results of before
 
 
@@ -56,8 +58,11 @@ def read_result(path: Path) -> Result:
 def read_document(path: Path) -> dict[str, Any]:
     """The document of a saved result, which only ``result_row`` checks; arguments and errors as of ``read_result``."""
     file = _file(path)
+    if file != path and file.exists() and not file.is_file():
+        raise InputError(f"{file}: not a regular file: {_WANTED}")
     try:
-        document = json.loads(read_text(file))
+        document = json.loads(read_text(file), parse_int=_bounded)
+        json.dumps(document, ensure_ascii=False).encode()  # UnicodeEncodeError: half of a surrogate pair
     except OSError as error:
         raise InputError(f"{file}: {error.strerror}: {_WANTED}") from error
     except (ValueError, RecursionError) as error:
@@ -65,6 +70,13 @@ def read_document(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise InputError(f"{file}: not a JSON object: {_WANTED}")
     return {_RENAMED.get(key) or key: value for key, value in document.items()}
+
+
+def _bounded(digits: str) -> int:
+    """An integer that is not too large for a float; ValueError: it is."""
+    if len(digits) > LONGEST_INTEGER:
+        raise ValueError(f"an integer of {len(digits)} digits")
+    return int(digits)
 
 
 def keep_result(bag: Path, document: dict[str, Any]) -> None:
@@ -84,11 +96,18 @@ def _file(path: Path) -> Path:
 
 def result_row(path: Path, document: dict[str, Any]) -> Result:
     """The row of a document of ``read_document``; InputError if it is not a result."""
+    try:
+        return _row(path, document)
+    except (ArithmeticError, LookupError, TypeError, RecursionError) as error:
+        raise InputError(f"{_file(path)}: {error}: {_WANTED}") from error
+
+
+def _row(path: Path, document: dict[str, Any]) -> Result:
     file = _file(path)
     total = _part(document, "system_error", dict, file)
     interval = total.get("interval")
     if not isinstance(interval, list) or len(interval) != 2:
-        raise InputError(f"{file}: system_error.interval: {interval!r}: {_WANTED}")
+        raise InputError(f"{file}: system_error.interval: {_short(interval)}: {_WANTED}")
     bags = _parts(document, "bags", file)
     seeds = [run.get("seed") for run in bags or [document]]
     tests = [_number(test, "p_adjusted", file) for test in _parts(document, "tests", file)]
@@ -119,10 +138,15 @@ def result_row(path: Path, document: dict[str, Any]) -> Result:
     )
 
 
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 100 else f"{text[:100]}..."
+
+
 def _part(document: dict[str, Any], key: str, kind: type, file: Path) -> Any:
     value = document.get(key)
     if not isinstance(value, kind):
-        raise InputError(f"{file}: {key}: {value!r}: expected that of a result of `msg-analysis compare --json`")
+        raise InputError(f"{file}: {key}: {_short(value)}: expected that of a result of `msg-analysis compare --json`")
     return value
 
 
@@ -138,8 +162,8 @@ def _number(document: Any, key: str, file: Path) -> float | None:
     value = document.get(key) if isinstance(document, dict) else document
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{file}: {key}: {value!r}: expected a number")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
+        raise InputError(f"{file}: {key}: {_short(value)}: expected a number")
     return float(value)
 
 

@@ -245,10 +245,20 @@ def tabulate(results: tuple[Path, ...], form: str, level: float, as_json: bool) 
     A RESULT is a file written by `compare --json` or `msg-agents run`, or the directory of a run. The runs are
     assumed to be independent (different seeds).
     """
+    from msg_analysis.errors import InputError
     from msg_analysis.report import saved_results as saved
     from msg_analysis.runs import read_result
 
-    rows = [read_result(path) for path in results]
+    rows, unreadable = [], []
+    for path in results:
+        try:
+            rows.append(read_result(path))
+        except InputError as error:
+            unreadable.append(error)
+    if not rows:
+        raise unreadable[0]
+    for problem in unreadable:
+        print_note(f"not readable: {problem}")
     if as_json or form == "json":
         print_json(saved.to_json(rows, level))
     elif form == "csv":

@@ -206,8 +206,10 @@ def test_a_length_beyond_the_file(tmp_path: Path, flipped: int) -> None:
         ("._b_0.mcap", b"\0\5\26\7Mac OS X"),
         ("b_2.db3", b""),
         ("b_2.db3", b"x" * 99),
-    ]
-    + [("b_2.mcap.zstd", b"no frame"), ("b_2.mcap", MAGIC), ("0.db3.zstd", bytes(99))],
+        ("b_2.mcap.zstd", b"no frame"),
+        ("b_2.mcap", MAGIC),
+        ("0.db3.zstd", bytes(99)),
+    ],
 )
 def test_one_file_that_cannot_be_read(tmp_path: Path, name: str, content: bytes) -> None:
     """The others are played, and the file is named."""

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 
 from msg_analysis import Experiment, InputError
 from msg_analysis.bags.reading import read_bag
+from msg_analysis.cli.main import main
 from msg_analysis.runs import RunEntry, RunFilter, list_runs, moment, read_result
 
 APART = {"apart": {"path": [1, 2, 3]}}
@@ -34,7 +36,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def result(folder: Path, **changes: Any) -> Path:
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(exist_ok=True, parents=True)
     (folder / "result.json").write_text(json.dumps(RESULT | changes))
     return folder
 
@@ -216,3 +218,39 @@ def test_moments(text: str, end: bool, found: datetime) -> None:
 def test_what_is_not_a_moment(text: str) -> None:
     with pytest.raises(InputError, match=r"--until .*: expected a date"):
         moment(text, "--until", NOW)
+
+
+@pytest.mark.parametrize(
+    ("key", "text"),
+    [
+        ("system_error", '{"measured": 1' + 400 * "0" + ', "interval": [1, 2]}'),
+        ("simulated_time", "1e308"),
+        ("seed", 400 * "9"),
+        ("seed", 5000 * "9"),
+        ("names", 990 * "[" + 990 * "]"),
+        ("names", 100_000 * "["),
+        ("experiment", '"\\ud800"'),
+        ("bags", "7"),
+        ("", ""),  # a FIFO instead of the file
+    ],
+    ids=range(9),
+)
+def test_one_broken_result(tmp_path: Path, key: str, text: str) -> None:
+    """It is one line; the list, the table and the page have the other run."""
+    good, bad = result(tmp_path / "runs/good"), result(tmp_path / "runs/bad")
+    file = bad / "result.json"
+    file.write_text(json.dumps(RESULT | {key: "@"}).replace('"@"', text))
+    if not key:
+        file.unlink()
+        os.mkfifo(file)
+    listed = {Path(run.folder).name: run for run in list_runs(tmp_path / "runs")}
+    assert (listed["good"].status, listed["bad"].status) == ("compared", "damaged")
+    assert str(file) in str(listed["bad"].problem)
+    found = CliRunner().invoke(main, ["tabulate", str(good), str(bad), "--json"])
+    assert [row["file"] for row in json.loads(found.stdout)["results"]] == [str(good)]
+    assert found.stderr.startswith(f"note: not readable: {file}")
+    assert len(found.stderr) < 1000
+    assert (
+        CliRunner().invoke(main, ["runs", str(tmp_path / "runs"), "--page", str(tmp_path / "page.html")]).exit_code == 0
+    )
+    assert CliRunner().invoke(main, ["tabulate", str(bad)]).exit_code == 2
