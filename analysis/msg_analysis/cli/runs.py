@@ -21,8 +21,8 @@ from msg_analysis.cli.options import (
     is_bag,
     json_option,
     level_option,
-    max_missed_option,
     load_experiment,
+    max_missed_option,
     seed_option,
     verbose_option,
 )
