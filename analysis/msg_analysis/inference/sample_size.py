@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from msg_analysis.common.text import HALF_WIDTH_95, agent_text
+from msg_analysis.common.text import HALF_WIDTH_95, agent_text, counted, percent
 from msg_analysis.errors import InputError
 from msg_analysis.inference.fault_power import FaultPower, fault_powers
 from msg_analysis.inference.statistics import simultaneous_half_width
@@ -152,7 +152,8 @@ class RunPlan:
             "system_error": precision.error,
             "pace": experiment.run.pace,
             "rate": self.rate,
-            "variance": {"path": variance.path, "replica": variance.replica, "path_followed": variance.followed},
+            "variance": {"path": variance.path, "replica": variance.replica, "path_followed": variance.exact},
+            "sampling_error": variance.error(replicas),
             "warm_up": precision.warm_up,
             "file": self._run(experiment.steps, replicas),
             "lengths": [self._lengths(r) for r in sorted({replicas, *REPLICAS})],
@@ -219,10 +220,12 @@ class RunPlan:
     def _notes(self) -> list[str]:
         step, precision = self.prediction.step, self.precision
         notes = []
-        if not precision.variance.followed:
+        replicas = self.prediction.experiment.run.replicas
+        if not precision.variance.exact:
             notes.append(
-                "the network is large: the scatter due to the graphs is exact for the principal axes of the states, "
-                "and for the others follows from their mean moments under each graph"
+                "the network is large, so the scatter of the mean is sampled: standard errors and half-widths with "
+                f"{counted(replicas, 'replica')} are known to {percent(precision.variance.error(replicas))} (standard "
+                "error)"
             )
         if step.modes > 1:
             leaving = float((step.stationary * (1.0 - step.transition.diagonal())).min())

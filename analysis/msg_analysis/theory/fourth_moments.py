@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Fourth moments of a jump linear system: whether they are finite.
+"""Fourth moments of a jump linear system: their steps, and whether they are finite.
 
 S_i = E[y y y y; mode i] follow S_j(k+1) = sum_i P_ij E[A_i^(4)] S_i(k) + terms of lower moments, with A_i the random
 matrix of a step and A^(4) its Kronecker power. They stay finite if the spectral radius of this map is below 1 (as for
 second moments: Costa, Fragoso and Marques, Discrete-Time Markov Jump Linear Systems, 2005, Section 3.4).
 
 The matrix of a step comes in stages, in each of which some messages may be lost: z becomes
-(M + sum_e eta_e u_e v_e^T) z, with eta_e = 1 - p_e if message e arrives and -p_e if it is lost, with probability p_e.
-M is the mean, u_e what the message acts on, v_e the difference between what it brings and what takes its place; see
-docs/theory.md, "Messages one by one".
+(M + sum_e eta_e u_e v_e^T) z + noise, with eta_e = p_e if message e arrives and p_e - 1 if it is lost, with probability
+p_e. M is the mean, u_e what the message acts on, v_e the difference between what it brings and what takes its place;
+see docs/theory.md, "Messages one by one".
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse.linalg
 
-from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.model.step_model import StepModel
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.message_steps import Move, message_steps
@@ -34,10 +34,20 @@ from msg_analysis.theory.message_steps import Move, message_steps
 class Stage:
     """Messages that are used, or lost, at the same time; E of them may be lost."""
 
-    matrix: FloatArray  # (k, k) M
+    rows: IntArray  # (r,) entries of z that change
+    matrix: FloatArray  # (r, k) M, these rows
     into: FloatArray  # (E, k) u
     differences: FloatArray  # (E, k) v
     losses: FloatArray  # (E,) p
+    noise: FloatArray  # (r, r) covariance of what is added to these rows, its mean over the losses
+    heard: float  # variance of the noise in what a message that arrives brings: a loss also takes its part of ``noise``
+
+    def whole(self) -> tuple[FloatArray, FloatArray]:
+        """(k, k) M and covariance of the noise."""
+        size = self.matrix.shape[1]
+        matrix, noise = np.eye(size), np.zeros((size, size))
+        matrix[self.rows], noise[np.ix_(self.rows, self.rows)] = self.matrix, self.noise
+        return matrix, noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,8 +56,7 @@ class RandomSteps:
 
     chain: FloatArray  # (n, n) P
     stages: list[list[Stage]]  # of each mode
-    # (k, d) with orthonormal columns: z = embedding @ y before, y = embedding^T z after; None: z is y
-    embedding: FloatArray | None
+    embedding: FloatArray  # (k, d) with orthonormal columns: z = embedding @ y before, y = embedding^T z after
 
 
 def random_steps(step: StepModel, system: JumpSystem) -> RandomSteps:
@@ -56,28 +65,45 @@ def random_steps(step: StepModel, system: JumpSystem) -> RandomSteps:
         whole = message_steps(step)
         embedding = np.zeros((whole.entries, system.dimension))
         embedding[whole.kept] = system.lift
-        stages = [[_stage(move, whole.entries) for move in moves] for moves in whole.moves]
+        stages = [[_stage(move, whole.entries, step.link**2) for move in moves] for moves in whole.moves]
         return RandomSteps(system.chain, stages, embedding)
-    lift = system.lift
-    older = len(lift) - step.agents  # the states that others use come last; without a delay they are the only ones
+    lift, d, m = system.lift, system.dimension, step.agents
+    older = len(lift) - m  # the states that others use come last; without a delay they are the only ones
+    # Who loses a message also loses the noise in it, which all who hear it share: one number more for every sender.
+    spoken = m if step.broadcast and step.loss else 0
+    size = d + spoken
+    nothing, rows = np.empty((0, size)), np.arange(size)
+    added = step.broadcast**2 * np.eye(spoken)
+    before = Stage(rows[d:], np.eye(size)[d:], nothing, nothing, np.empty(0), added, 0.0)
     stages = []
     for mode, matrix in enumerate(system.matrices):
         possible = step.loss_variance[mode] > 0.0
         i, j = np.nonzero(possible)
-        into = step.nominal[mode][possible][:, None] * lift[i]
-        stages.append([Stage(matrix, into, lift[older + j] - lift[i], step.losses[possible])])
-    return RandomSteps(system.chain, stages, None)
+        into, differences = np.zeros((2, len(i), size))
+        into[:, :d] = step.nominal[mode][possible][:, None] * lift[i]
+        differences[:, :d] = lift[older + j] - lift[i]
+        both, noise = np.zeros((2, size, size))
+        both[:d, :d], noise[:d, :d] = matrix, system.noise[mode]
+        if spoken:
+            heard = step.nominal[mode] * ~np.eye(m, dtype=np.bool_)
+            both[:d, d:] = lift[:m].T @ ((1.0 - step.losses) * heard)
+            own = step.noise_gain[mode] @ step.noise_gain[mode].T
+            own += step.link**2 * np.diag(((1.0 - step.losses) * heard**2).sum(axis=1))
+            noise[:d, :d] = lift[:m].T @ own @ lift[:m]
+            differences[range(len(j)), d + j] = 1.0
+        one = Stage(rows, both, into, differences, step.losses[possible], noise, step.link**2)
+        stages.append([before, one] if spoken else [one])
+    return RandomSteps(system.chain, stages, np.eye(size)[:, :d])
 
 
-def _stage(move: Move, size: int) -> Stage:
-    matrix = np.eye(size)
-    matrix[move.rows] = move.matrix
+def _stage(move: Move, size: int, heard: float) -> Stage:
     into, differences = np.zeros((2, len(move.losses), size))
     for event, (entry, brings, instead, _, weight) in enumerate(move.losses):
         into[event, entry] = weight
         differences[event, brings] += 1.0
         differences[event, instead] -= 1.0
-    return Stage(matrix, into, differences, np.array([loss[3] for loss in move.losses]))
+    losses = np.array([loss[3] for loss in move.losses])
+    return Stage(np.array(move.rows, dtype=np.int64), move.matrix, into, differences, losses, move.noise, heard)
 
 
 MAX_WORK = 3e7  # multiplications of one step of all fourth moments, at most: a second for the radius
@@ -134,8 +160,7 @@ def fourth_moment(step: StepModel, system: JumpSystem) -> FourthMoment:
 
 def fourth_radius(steps: RandomSteps) -> float | None:
     """Spectral radius of the map of the fourth moments, by Arnoldi on tensors (n, d, d, d, d); None: not found."""
-    n, k = len(steps.chain), len(steps.stages[0][0].matrix)
-    d = k if steps.embedding is None else steps.embedding.shape[1]
+    n, d = len(steps.chain), steps.embedding.shape[1]
     start = _symmetric(np.multiply.outer(np.eye(d), np.eye(d)))
     return _positive_radius(lambda stack: advance(steps, stack), np.broadcast_to(start, (n, d, d, d, d)))
 
@@ -148,40 +173,80 @@ def second_radius(system: JumpSystem) -> float | None:
 
 def advance(steps: RandomSteps, stack: FloatArray) -> FloatArray:
     """(n, d, d, d, d): the symmetric tensors S_i = E[y y y y; mode i], ``stack``, one step later, without noise."""
+    return np.asarray(np.tensordot(steps.chain, before_jump(steps, stack), axes=(0, 0)))
+
+
+def before_jump(
+    steps: RandomSteps, stack: FloatArray, second: FloatArray | None = None, law: FloatArray | None = None
+) -> FloatArray:
+    """(n, d, d, d, d): ``stack`` after the messages of a step, before the mode jumps.
+
+    S_i = E[y y y y; mode i] without noise. Or, with noise, T_i = E[M M; mode i] of the covariance M of y given all
+    modes and losses so far, where the first two places can be swapped, the last two, and these pairs; then ``second``
+    (n, d, d) are E[M; mode i], and ``law`` (n,) the probabilities of the modes.
+    """
     after = np.empty_like(stack)
     embedding = steps.embedding
     for mode, stages in enumerate(steps.stages):
-        tensor = stack[mode] if embedding is None else _along_all_axes(embedding, stack[mode])
+        tensor, mean, share = _along_all_axes(embedding, stack[mode]), None, 0.0
+        if second is not None and law is not None:
+            mean, share = embedding @ second[mode] @ embedding.T, float(law[mode])
         for stage in stages:
-            tensor = _through(stage, tensor)
-        after[mode] = tensor if embedding is None else _along_all_axes(embedding.T, tensor)
-    return np.asarray(np.tensordot(steps.chain, after, axes=(0, 0)))
+            tensor, mean = _through(stage, tensor, mean, share)
+        after[mode] = _along_all_axes(embedding.T, tensor)
+    return after
 
 
-def _through(stage: Stage, tensor: FloatArray) -> FloatArray:
-    """(k, k, k, k): E[A^(4)] S of A = M + sum_e eta_e u_e v_e^T, eta_e independent of mean 0.
+def _through(
+    stage: Stage, tensor: FloatArray, mean: FloatArray | None, share: float
+) -> tuple[FloatArray, FloatArray | None]:
+    """E[A^(4)] T of A = M + sum_e eta_e u_e v_e^T, eta_e independent of mean 0; and what noise adds, beside ``mean``.
 
     Only products in which no eta_e occurs once are left: M four times; M twice and e twice; M once and e three times;
-    e four times; e twice and another f twice.
+    e four times; e twice and another f twice. The two places of e are in one pair of the tensor, or in both.
     """
-    moved = _along_all_axes(stage.matrix, tensor)
-    if not len(stage.losses):
-        return moved
+    matrix, noise = stage.whole()
+    size, events = len(matrix), len(stage.losses)
+    shape = (size,) * 4
+    moved = _along_all_axes(matrix, tensor)
     u, v, p = stage.into, stage.differences, stage.losses
     second = p * (1.0 - p)  # moments of eta
     third, fourth = second * (2.0 * p - 1.0), second * (1.0 - 3.0 * second)
-    size, events = len(stage.matrix), len(p)
-    pairs = (u[:, :, None] * u[:, None, :]).reshape(events, -1)
-    seen = (v[:, :, None] * v[:, None, :]).reshape(events, -1) @ tensor.reshape(size**2, -1)
-    seen = seen.reshape(events, size, size)  # S(v_e, v_e, ., .)
-    once = np.einsum("eab,eb->ea", seen, v)  # S(v_e, v_e, v_e, .)
-    both = np.einsum("eab,fa,fb->ef", seen, v, v, optimize=True)  # S(v_e, v_e, v_f, v_f)
-    rest = 6.0 * second[:, None, None] * (stage.matrix @ seen @ stage.matrix.T)
-    rest += 4.0 * third[:, None, None] * u[:, :, None] * (once @ stage.matrix.T)[:, None, :]
-    other = 3.0 * np.outer(second, second) * both
-    np.fill_diagonal(other, fourth * np.diag(both))
-    added = pairs.T @ (rest.reshape(events, -1) + other @ pairs)
-    return moved + _symmetric(added.reshape((size,) * 4))
+    pairs = (u[:, :, None] * u[:, None, :]).reshape(events, size**2)
+    if events:
+        inside = (v[:, :, None] * v[:, None, :]).reshape(pairs.shape) @ tensor.reshape(size**2, -1)
+        inside = inside.reshape(events, size, size)  # T(v_e, v_e; ., .)
+        across = np.einsum("ebcd,ec->ebd", (v @ tensor.reshape(size, -1)).reshape(events, *shape[1:]), v)
+        once = np.einsum("eab,eb->ea", inside, v) @ matrix.T
+        beside, apart = (np.einsum("eab,fa,fb->ef", seen, v, v, optimize=True) for seen in (inside, across))
+        weights = np.outer(second, second)
+        np.fill_diagonal(weights, fourth)
+        rest = second[:, None, None] * (matrix @ inside @ matrix.T) + third[:, None, None] * _both(u, once)
+        half = pairs.T @ (rest.reshape(pairs.shape) + 0.5 * (weights * beside) @ pairs)
+        moved += (half + half.T).reshape(shape)
+        np.fill_diagonal(weights, 0.0)
+        rest = second[:, None, None] * (matrix @ across @ matrix.T)
+        half = pairs.T @ (rest.reshape(pairs.shape) + 0.5 * (weights * apart) @ pairs)
+        other = (half + half.T).reshape(shape)
+        moved += other.transpose(0, 2, 1, 3) + other.transpose(0, 2, 3, 1)
+    if mean is None:
+        return moved, None
+    carried, felt = matrix @ mean @ matrix.T, v @ mean
+    squares = (felt * v).sum(axis=1)
+    carried += (u.T * (second * squares)) @ u
+    if events and stage.heard:
+        rest = (second[:, None, None] * _both(u, felt @ matrix.T)).reshape(pairs.shape)
+        rest += (third * squares + 0.5 * second * stage.heard * share)[:, None] * pairs
+        half = stage.heard * pairs.T @ rest
+        moved += (half + half.T).reshape(shape)
+    added = np.multiply.outer(carried + 0.5 * share * noise, noise)
+    return moved + added + added.transpose(2, 3, 0, 1), carried + share * noise
+
+
+def _both(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(E, k, k): a b^T + b a^T of (E, k)."""
+    product = a[:, :, None] * b[:, None, :]
+    return np.asarray(product + product.swapaxes(1, 2))
 
 
 def lyapunov_bound(system: JumpSystem) -> float:
@@ -212,7 +277,7 @@ def _affordable(step: StepModel, system: JumpSystem, work: float) -> RandomSteps
     if system.modes * float(system.dimension) ** 5 > work:
         return None
     steps = random_steps(step, system)
-    size = len(steps.stages[0][0].matrix)
+    size = len(steps.embedding)
     stages = [stage for stages in steps.stages for stage in stages]
     needed = sum(4.0 * size + 2.0 * len(stage.losses) for stage in stages) * float(size) ** 4
     return steps if needed <= work else None

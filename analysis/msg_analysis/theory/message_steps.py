@@ -84,6 +84,7 @@ class Move:
 
     rows: list[int]
     matrix: FloatArray  # (r, K) mean over the losses
+    noise: FloatArray  # (r, r) covariance of what is random and does not depend on z, mean over the losses
     losses: Sequence[_Loss]
 
 
@@ -206,7 +207,7 @@ class _Period:
             matrix = np.concatenate([matrix, _copies([before for _, before in older], len(self.noise))])
             noise = scipy.linalg.block_diag(noise, np.zeros((len(older), len(older))))
             rows = rows + [entry for entry, _ in older]
-        self.moves.append(Move(rows, matrix, losses))
+        self.moves.append(Move(rows, matrix, noise, losses))
         entry, brings, instead = (np.array([loss[part] for loss in losses], dtype=np.int64) for part in range(3))
         variance = np.array([p * (1.0 - p) * weight**2 for *_, p, weight in losses])
         differences = self.matrix[brings] - self.matrix[instead]

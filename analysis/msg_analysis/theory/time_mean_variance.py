@@ -4,31 +4,31 @@
 """Variance of the time mean of the system error over a run, before any run. Discrete time.
 
 Given the path (graphs and losses), a stationary state is y ~ N(0, M), and replicas are independent. M obeys
-m' = A_g m + n_g for the packed m, so X_i = E[m m^T; g = i] solves the equation that the second moments of y solve
-(Costa, Fragoso and Marques, Discrete-Time Markov Jump Linear Systems, 2005), with m in place of y:
-
-    X_j = sum_i P_ij (A_i X_i A_i^T + A_i c_i n_i^T + n_i c_i^T A_i^T + pi_i n_i n_i^T),    c_i = E[m; g = i]
-
-It has all fourth moments of y, for E[(y^T S y)^2 | M] = tr(S M)^2 + 2 tr(S M S M).
+M' = A M A^T + noise with the random matrix A of a step, so T_i = E[M M; mode i] solves linear equations, those of
+``fourth_moments`` with noise. It has all fourth moments of y, for E[(y^T S y)^2 | M] = tr(S M)^2 + 2 tr(S M S M).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 
 import numpy as np
 
-from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.errors import InputError
+from msg_analysis.model.step_model import build_run_model
 from msg_analysis.theory import packed_symmetric
+from msg_analysis.theory.fourth_moments import RandomSteps, Stage, before_jump, random_steps
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver, mode_potential
 from msg_analysis.theory.prediction import Prediction
 
-MAX_WORK = 3e7  # n p^3 for p packed moments: up to it, M is followed along the path
-MAX_ROUNDS = 300  # in which what losses add is found
-ROUND_TOLERANCE = 1e-10
-DIVERGED = 1e10
+MAX_WORK = 1e8  # multiplications of a step of T, up to which it is solved for
+SAMPLED = 5e9  # multiplications of the steps that are sampled otherwise
+PATHS, REPLICAS = 32, 8  # that are sampled, for at least so many steps:
+FEWEST = 200
+STAGE = 2000.0  # multiplications that take as long as the rest of a stage
 HEAVY = (
     "system error: its time mean has no finite variance, because fourth moments of the states do not exist; lower the "
     "weights, losses or run.dt, or look at the innovations only"
@@ -41,222 +41,195 @@ class MeanVariance:
 
     path: float  # of graphs and losses, which replicas share
     replica: float  # of the noise, independent in every replica
-    followed: bool  # whether M is followed along the path; else on its principal axes alone
+    samples: FloatArray | None = None  # (B, 2) path and replica of single sampled paths; None: both are exact
 
     def of(self, replicas: float) -> float:
         """With so many replicas."""
         return self.path + self.replica / replicas
 
+    @property
+    def exact(self) -> bool:
+        """Whether it is not sampled."""
+        return self.samples is None
 
-def mean_variance(prediction: Prediction, *, most_work: float = MAX_WORK) -> MeanVariance:
-    """Asymptotic variance of the time mean of the system error, from its Poisson equation.
+    def error(self, replicas: float) -> float:
+        """Relative standard error of the square root of ``of``, because it was sampled; 0 where it is exact."""
+        if self.samples is None:
+            return 0.0
+        scatter = (self.samples @ [1.0, 1.0 / replicas]).std(ddof=1) / math.sqrt(len(self.samples))
+        return 0.5 * float(scatter) / self.of(replicas)
 
-    The martingale difference of a step (docs/statistics.md, "Standard errors") has a part of the noise, of each loss
-    and of the jump, which are uncorrelated. With the adjoint solutions Y and the potential kappa of the graphs, their
-    means Z_i = sum_j P_ij Y_j, the surprises S_ij = Y_j - Z_i and s_ij alike for kappa, and M' = K_i[M] + N_i:
 
-        noise:  2 tr(Z N Z (N + 2 K[M])) / R
-        loss e: 4 (b^T M v)^2 + 4 ((b^T M b)(v^T M v) + (b^T M v)^2) / R,    b = W^T Z u
-        jump:   sum_j P_ij ((tr(S M') + s)^2 + 2 tr(S M' S M') / R)
+def mean_variance(prediction: Prediction, *, most_work: float = MAX_WORK, sampled: float = SAMPLED) -> MeanVariance:
+    """Asymptotic variance of the time mean of the system error h = y^T H y, from its Poisson equation.
 
-    Noise and jump are exact. Of a loss the first order is taken, which adds u v^T y to W y; noise on the air has its
-    mean over the losses. In a large system (``most_work``) M is its mean given the graph; what following it changes is
-    added for the principal axes of the stationary covariance. InputError: the variance is not finite.
+    Its solution f(y, g) = y^T Y_g y + kappa_g (adjoint solutions Y, potential kappa of the graphs) makes
+    D_k = f(next) - f(now) + h - E[h] a martingale difference (docs/statistics.md, "Standard errors"), whose variance is
+    that of the time mean times N. f has the same distribution before and after a step, so
+
+        E[D^2] = 2 E[f (h - E[h])] - E[(h - E[h])^2]
+
+    which follows from T. In a system too large for T (``most_work`` multiplications), D^2 is averaged over sampled
+    steps (of ``sampled`` multiplications) of several paths, each with several replicas. InputError: the variance is not
+    finite, or cannot be computed.
     """
-    system, solver, losses = prediction.system, prediction.solver, prediction.step.losses
+    system, solver = prediction.system, prediction.solver
     if not system.dimension:
-        return MeanVariance(0.0, 0.0, True)
-    # The largest dimension whose M is followed along the path, with so many graphs.
-    largest = next(d for d in range(1, 1000) if system.modes * float(packed_symmetric.size(d + 1)) ** 3 > most_work)
-    if system.dimension <= largest:
-        return MeanVariance(*_variance(solver, prediction.steady, losses, follow=True), followed=True)
-    rough = _variance(solver, prediction.steady, losses, follow=False)
-    principal = MomentSolver(_principal(system, prediction.steady, largest))
-    steady = principal.steady()
-    exact, near = (_variance(principal, steady, losses, follow=follow) for follow in (True, False))
-    path, replica = (max(a + b - c, 0.0) for a, b, c in zip(rough, exact, near, strict=True))
-    return MeanVariance(path, replica, followed=False)
-
-
-def _principal(system: JumpSystem, steady: FloatArray, rank: int) -> JumpSystem:
-    """The system projected on so many principal axes of its stationary covariance."""
-    axes = np.linalg.eigh(steady.sum(axis=0))[1][:, -rank:]
-    return replace(
-        system,
-        matrices=axes.T @ system.matrices @ axes,
-        noise=axes.T @ system.noise @ axes,
-        lift=system.lift @ axes,
-        readout=None if system.readout is None else system.readout @ axes,
-        losses=system.losses and system.losses.projected(axes),
-        unreduced=None,
-        unreduced_losses=None,
-        messages=None,
-    )
-
-
-def _variance(solver: MomentSolver, steady: FloatArray, links: FloatArray, *, follow: bool) -> tuple[float, float]:
-    """Due to the path, and to the noise of one replica; ``links`` (m, m): probabilities of losses."""
-    system = solver.system
-    values = solver.dual((system.output.T @ system.output)[None])  # (1, n, d, d)
-    kappa = mode_potential(system, values)[1][0]
-    values = values[0]
-    means, levels = np.einsum("ij,jab->iab", system.chain, values), system.chain @ kappa
-    moved = system.propagate(steady)
-    losses = [_losses(system, links, i) for i in range(system.modes)]
-    law = system.stationary
-    before: _Followed | _Averaged = _Averaged(steady, law)
-    after: _Followed | _Averaged = _Averaged(moved + law[:, None, None] * system.noise, law)
-    if follow:
-        before, after = _moments_of_path(system, moved, losses)
-    path = replica = 0.0
-    for i, share in enumerate(system.stationary.tolist()):
-        mean, noise = means[i], system.noise[i]
-        seen = mean @ noise
-        replica += 2.0 * float(np.trace(seen @ seen) * share + 2.0 * np.trace(seen @ mean @ moved[i]))
-        for loss in losses[i]:
-            felt = system.matrices[i].T @ mean @ loss.into
-            cross = _symmetric(felt, loss.difference)
-            own, seen_alone = _symmetric(felt, felt), _symmetric(loss.difference, loss.difference)
-            both = before.product(i, cross, cross)
-            path += 4.0 * both
-            replica += 4.0 * (before.product(i, own, seen_alone) + both)
-        reached = moved[i] + share * noise
-        for j in np.flatnonzero(system.chain[i]).tolist():
-            surprise, level = values[j] - mean, float(kappa[j] - levels[i])
-            probability = float(system.chain[i, j])
-            linear = 2.0 * level * float((surprise * reached).sum()) + level**2 * share
-            path += probability * (after.product(i, surprise, surprise) + linear)
-            replica += probability * 2.0 * after.quartic(i, surprise)
-    return max(path, 0.0), max(replica, 0.0)
-
-
-def _symmetric(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.asarray((np.outer(a, b) + np.outer(b, a)) / 2.0)
-
-
-@dataclass(frozen=True, slots=True)
-class _Loss:
-    """A loss that adds xi u v^T y to W y; xi has mean 0 and variance 1."""
-
-    into: FloatArray  # (d,) u
-    difference: FloatArray  # (d,) v
-    probability: float | None  # of being lost; None: not known here
-
-
-def _losses(system: JumpSystem, losses: FloatArray, mode: int) -> list[_Loss]:
-    """Those under a graph; ``losses`` (m, m) are the probabilities of the links."""
-    if system.losses is not None:
-        pairs = zip(system.losses.into[mode], system.losses.differences[mode], strict=True)
-        return [_Loss(into, difference, None) for into, difference in pairs if into.any()]
-    if system.loss_variance is None:
-        return []
-    variance, m = system.loss_variance[mode], len(losses)
-    return [
-        _Loss(np.sqrt(variance[i, j]) * system.lift[i], system.lift[i] - system.lift[j], float(losses[i, j % m]))
-        for i, j in np.argwhere(variance > 0.0).tolist()
-    ]
-
-
-class _LossSpread:
-    """What losses under a graph add to A X A^T: E[(A' - A) X (A' - A)^T] for the random A' with them.
-
-    With W' = W + sum_e xi_e u_e v_e^T this is a sum over losses and pairs of losses, exactly; the first order in xi
-    where their probabilities are not known, or they are many.
-    """
-
-    def __init__(self, step: FloatArray, losses: list[_Loss]) -> None:
-        effects = [np.outer(loss.into, loss.difference) for loss in losses]
-        self._first = [2.0 * packed_symmetric.product(step, effect) for effect in effects]
-        self._second: list[tuple[FloatArray, float, float]] = []  # map, and moments 3 and 4 - 1 of xi
-        self._pairs: list[FloatArray] = []
-        size = float(packed_symmetric.size(len(step)))
-        if len(losses) ** 2 * size**3 > MAX_WORK:
-            return
-        for loss, effect in zip(losses, effects, strict=True):
-            if loss.probability is None:
-                return
-            variance = loss.probability * (1.0 - loss.probability)
-            skewness, excess = (1.0 - 2.0 * loss.probability) / np.sqrt(variance), (1.0 - 4.0 * variance) / variance
-            self._second.append((packed_symmetric.product(effect, effect), float(skewness), float(excess)))
-        for a, left in enumerate(effects):
-            self._pairs += [2.0 * packed_symmetric.product(left, right) for right in effects[:a]]
-
-    def of(self, moments: FloatArray) -> FloatArray:
-        """(p, p) of X (p, p)."""
-        total = np.zeros_like(moments)
-        for first in self._first:
-            total += first @ moments @ first.T
-        for first, (second, skewness, excess) in zip(self._first, self._second, strict=False):
-            mixed = skewness * (first @ moments @ second.T)
-            total += mixed + mixed.T + excess * (second @ moments @ second.T)
-        for pair in self._pairs:
-            total += pair @ moments @ pair.T
-        return total
-
-
-class _Followed:
-    """Second moments of M given the graph i, times pi_i: X of ``m`` along the path."""
-
-    def __init__(self, moments: FloatArray) -> None:
-        self._moments = moments  # (n, p, p)
-
-    def product(self, mode: int, left: FloatArray, right: FloatArray) -> float:
-        """E[tr(A M) tr(B M); i] of symmetric A and B."""
-        return float(packed_symmetric.pack(left) @ self._moments[mode] @ packed_symmetric.pack(right))
-
-    def quartic(self, mode: int, form: FloatArray) -> float:
-        """E[tr(S M S M); i] of a symmetric S."""
-        return float((packed_symmetric.product(form, form) * self._moments[mode]).sum())
-
-
-class _Averaged:
-    """The same where M is its mean given the graph."""
-
-    def __init__(self, moments: FloatArray, law: FloatArray) -> None:
-        self._moments, self._law = moments, law  # (n, d, d), (n,)
-
-    def product(self, mode: int, left: FloatArray, right: FloatArray) -> float:
-        moments = self._moments[mode]
-        return float((left * moments).sum() * (right * moments).sum() / self._law[mode])
-
-    def quartic(self, mode: int, form: FloatArray) -> float:
-        seen = form @ self._moments[mode]
-        return float((seen * seen.T).sum() / self._law[mode])
-
-
-def _moments_of_path(system: JumpSystem, moved: FloatArray, losses: list[list[_Loss]]) -> tuple[_Followed, _Followed]:
-    """Of M before the step, and after it, before the jump."""
-    law = system.stationary[:, None, None]
-    n, p = system.modes, packed_symmetric.size(system.dimension)
-    basis = packed_symmetric.unpack(np.eye(p), system.dimension)[:, None]  # (p, 1, d, d)
-    images = packed_symmetric.pack(system.propagate(np.broadcast_to(basis, (p, n, *basis.shape[2:]))))
-    maps = np.ascontiguousarray(images.transpose(1, 2, 0))  # (n, p, p) A
-    noise = packed_symmetric.pack(system.noise)  # (n, p)
-    cross = packed_symmetric.pack(moved)[:, :, None] * noise[:, None, :]
-    added = cross + cross.transpose(0, 2, 1) + law * noise[:, :, None] * noise[:, None, :]
-    pairs = zip(system.matrices, losses, strict=True) if system.lossy else ()
-    spreads = [_LossSpread(step, some) for step, some in pairs]
-    moments, spread = np.zeros_like(added), np.zeros_like(added)
-    for _ in range(MAX_ROUNDS):
-        twice = JumpSystem(
-            time="discrete",
-            matrices=maps,
-            noise=(added + spread) / law,
-            chain=system.chain,
-            stationary=system.stationary,
-            lift=np.eye(p),
-        )
-        try:
-            moments = MomentSolver(twice, guess=moments if spreads else None).steady()
-        except InputError as error:
-            raise InputError(HEAVY) from error
-        if not spreads:
-            break
-        before, spread = spread, np.stack([each.of(one) for each, one in zip(spreads, moments, strict=True)])
-        if np.abs(spread - before).max() <= ROUND_TOLERANCE * np.abs(added + spread).max():
-            break
-        if not np.abs(spread).max() < DIVERGED * np.abs(added).max():
-            raise InputError(HEAVY)
-    else:
+        return MeanVariance(0.0, 0.0)
+    if prediction.fourth_moment.finite is False:
         raise InputError(HEAVY)
-    return _Followed(moments), _Followed(maps @ moments @ maps.transpose(0, 2, 1) + added + spread)
+    form = system.output.T @ system.output
+    values = solver.dual(form[None])
+    kappa = mode_potential(system, values)[1][0]
+    steps = random_steps(build_run_model(prediction.experiment, prediction.step), system)
+    size = float(len(steps.embedding))
+    work = sum(size**4 * (4.0 * size + 4.0 * len(one.losses)) for stages in steps.stages for one in stages)
+    if work <= most_work:
+        try:
+            return _exact(steps, system, prediction.steady, form, values[0], kappa)
+        except InputError:  # the equations of T are too ill-conditioned
+            pass
+    return _Sampler(steps, system, prediction.steady).variance(form, values[0], kappa, sampled)
+
+
+def _exact(
+    steps: RandomSteps, system: JumpSystem, steady: FloatArray, form: FloatArray, values: FloatArray, kappa: FloatArray
+) -> MeanVariance:
+    """From T, with replicas that share M: E[y^T Y y y^T H y] of one is tr(Y M) tr(H M) + 2 tr(Y M H M)."""
+    moments = _moments_of_path(steps, system, steady)
+    error = np.einsum("nab,ab->n", steady, form)
+    mean = float(error.sum())
+    twice = 2.0 * values - form
+    path = float(np.einsum("nabcd,nab,cd->", moments, twice, form, optimize=True) + 2.0 * (kappa @ error))
+    path -= mean * (2.0 * float((values * steady).sum() + kappa @ system.stationary) - mean)
+    replica = 2.0 * float(np.einsum("nbcda,nab,cd->", moments, twice, form, optimize=True))
+    return MeanVariance(max(path, 0.0), max(replica, 0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Covariances(JumpSystem):
+    """The packed M as a jump linear system, with K_i in place of W_i; "lost" is all that losses add to K T K^T."""
+
+    steps: RandomSteps | None = None
+
+    @property
+    def lossy(self) -> bool:
+        """Whether K_i alone is not all."""
+        return self.steps is not None
+
+    def lost(self, moments: FloatArray) -> FloatArray:
+        """(..., n, p, p) of T (..., n, p, p)."""
+        assert self.steps is not None
+        d = self.steps.embedding.shape[1]
+        tensors = [
+            _packed(before_jump(self.steps, _unpacked(one, d))) for one in moments.reshape(-1, *self.noise.shape)
+        ]
+        return np.reshape(tensors, moments.shape) - self.matrices @ moments @ self.matrices.swapaxes(-1, -2)
+
+
+def _packed(tensors: FloatArray) -> FloatArray:
+    """(n, p, p) of (n, d, d, d, d)."""
+    first = packed_symmetric.pack(tensors)  # the last pair
+    return packed_symmetric.pack(np.moveaxis(first, -1, 1))
+
+
+def _unpacked(moments: FloatArray, d: int) -> FloatArray:
+    return packed_symmetric.unpack(np.moveaxis(packed_symmetric.unpack(moments, d), 1, -1), d)
+
+
+def _moments_of_path(steps: RandomSteps, system: JumpSystem, steady: FloatArray) -> FloatArray:
+    """(n, d, d, d, d) T, before a step."""
+    n, d, law = system.modes, system.dimension, system.stationary
+    p = packed_symmetric.size(d)
+    basis = packed_symmetric.unpack(np.eye(p), d)[:, None]  # (p, 1, d, d)
+    images = packed_symmetric.pack(system.propagate(np.broadcast_to(basis, (p, n, d, d))))
+    added = _packed(before_jump(steps, np.zeros((n, d, d, d, d)), steady, law))
+    covariances = _Covariances(
+        time="discrete",
+        matrices=np.ascontiguousarray(images.transpose(1, 2, 0)),
+        noise=added / law[:, None, None],
+        chain=system.chain,
+        stationary=law,
+        lift=np.eye(p),
+        steps=steps if system.lossy else None,
+    )
+    return _unpacked(MomentSolver(covariances).steady(), d)
+
+
+class _Sampler:
+    """Paths of graphs and losses, with replicas of the states y (B, R, d)."""
+
+    def __init__(self, steps: RandomSteps, system: JumpSystem, steady: FloatArray) -> None:
+        self._steps, self._steady, self._rng = steps, steady, np.random.default_rng(0)
+        self._chain = system.chain.cumsum(axis=1)
+        self._roots = [[_root(_unheard(one)) for one in stages] for stages in steps.stages]
+        self._modes = self._rng.choice(system.modes, PATHS, p=system.stationary)
+        self._states = np.empty((PATHS, REPLICAS, system.dimension))
+        for mode, at in self._groups():
+            root = _root(steady[mode] / system.stationary[mode])
+            self._states[at] = self._normal(len(at), root.shape[1]) @ root.T
+
+    def variance(self, form: FloatArray, values: FloatArray, kappa: FloatArray, work: float) -> MeanVariance:
+        """From the means of D^2 over about so many multiplications of steps."""
+        mean = float((self._steady * form).sum())
+        each = max(
+            sum(one.matrix.size + 2.0 * one.into.size + STAGE for one in stages) for stages in self._steps.stages
+        )
+        count = max(FEWEST, round(work / (PATHS * REPLICAS * each)))
+        found = np.zeros((PATHS, 2))
+        value = self._values(values, kappa)
+        for step in range(-(count // 4), count):  # before 0, M becomes stationary: at first it is its mean
+            expected = value - ((self._states @ form) * self._states).sum(axis=-1) + mean
+            self._advance()
+            value = self._values(values, kappa)
+            if step >= 0:
+                within = (value - expected).var(axis=1, ddof=1)
+                found += np.stack([(value - expected).mean(axis=1) ** 2 - within / REPLICAS, within], axis=1)
+        found /= count
+        path, replica = found.mean(axis=0).tolist()
+        return MeanVariance(max(path, 0.0), replica, found)
+
+    def _values(self, values: FloatArray, kappa: FloatArray) -> FloatArray:
+        """(B, R): f."""
+        found = np.empty(self._states.shape[:2])
+        for mode, at in self._groups():
+            found[at] = ((self._states[at] @ values[mode]) * self._states[at]).sum(axis=-1) + kappa[mode]
+        return found
+
+    def _advance(self) -> None:
+        embedding, rng = self._steps.embedding, self._rng
+        for mode, at in self._groups():
+            z = self._states[at] @ embedding.T
+            for stage, root in zip(self._steps.stages[mode], self._roots[mode], strict=True):
+                moved = z.copy()
+                moved[..., stage.rows] = z @ stage.matrix.T + self._normal(len(at), root.shape[1]) @ root.T
+                if len(stage.losses):
+                    arrives = (rng.random((len(at), 1, len(stage.losses))) >= stage.losses).astype(float)
+                    change = (arrives - 1.0 + stage.losses) * (z @ stage.differences.T)
+                    if stage.heard:
+                        change += math.sqrt(stage.heard) * arrives * self._normal(len(at), len(stage.losses))
+                    moved += change @ stage.into
+                z = moved
+            self._states[at] = z @ embedding
+        drawn = rng.random((PATHS, 1))
+        self._modes = np.minimum((drawn >= self._chain[self._modes]).sum(axis=1), len(self._chain) - 1)
+
+    def _normal(self, paths: int, size: int) -> FloatArray:
+        return self._rng.standard_normal((paths, REPLICAS, size))
+
+    def _groups(self) -> list[tuple[int, IntArray]]:
+        """Every mode that some path is in, and these paths."""
+        return [(mode, np.flatnonzero(self._modes == mode)) for mode in np.unique(self._modes).tolist()]
+
+
+def _unheard(stage: Stage) -> FloatArray:
+    """(r, r): covariance of the noise without that in messages that may be lost."""
+    into = stage.into[:, stage.rows]
+    return stage.noise - stage.heard * (into.T * (1.0 - stage.losses)) @ into
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """(k, r) B with B B^T = covariance, r its rank."""
+    values, vectors = np.linalg.eigh(covariance)
+    kept = values > 1e-14 * np.abs(values).max(initial=0.0)
+    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))

@@ -152,7 +152,8 @@ def test_faults_that_a_law_cannot_have() -> None:
 def test_notes() -> None:
     large = Experiment.load("hundred_agents").plan(0.02).to_json()
     assert large["variance"]["path_followed"] is False
-    assert "the network is large" in large["notes"][0]
+    assert 0.001 < large["sampling_error"] < 0.05
+    assert "the network is large, so the scatter of the mean is sampled" in large["notes"][0]
     slow = line_ring(replicas=256).plan(0.5).to_json()
     assert "expected switches away from some graph" in slow["notes"][0]
 
