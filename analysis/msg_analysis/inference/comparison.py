@@ -34,7 +34,7 @@ from msg_analysis.inference.given_path import GivenPath
 from msg_analysis.inference.question import Test
 from msg_analysis.inference.realtime_laws import Laws
 from msg_analysis.inference.residuals import ResidualTests
-from msg_analysis.inference.time_means import TimeMeans
+from msg_analysis.inference.time_means import TimeMeans, few_switches
 from msg_analysis.inference.timing import Timing
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
@@ -123,11 +123,11 @@ def _doubt(prediction: Prediction, means: TimeMeans) -> tuple[Reason, str] | Non
         )
     if not means.long_enough:
         return "short_run", "The run is too short for intervals of the errors over all paths of the graphs."
-    if not means.few_switches:
+    few = few_switches(means.switches)
+    if few is None:
         return None
     return "few_switches", (
-        f"This run has few switches (some graph is left {number_text(means.switches, 3)} times on "
-        "average), so the errors over all paths of the graphs depend on a few random lengths: they are far from "
+        f"This run {few}, so the errors over all paths of the graphs depend on a few random lengths: they are far from "
         "normal, and their intervals are too wide."
     )
 

@@ -14,6 +14,7 @@ from msg_analysis.common.text import HALF_WIDTH_95, agent_text, counted, percent
 from msg_analysis.errors import InputError
 from msg_analysis.inference.fault_power import FaultPower, fault_powers
 from msg_analysis.inference.statistics import simultaneous_half_width
+from msg_analysis.inference.time_means import expected_switches, few_switches
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.settling import settling_time
 from msg_analysis.theory.time_mean_variance import MeanVariance, mean_variance
@@ -101,9 +102,6 @@ def precision_of(prediction: Prediction, sought: float) -> Precision:
     noise = experiment.noise
     plain = not (noise.on_air or noise.delay or experiment.run.pace == "realtime")
     return Precision(error, mean_variance(prediction), math.ceil(warm_up), plain)
-
-
-FEW_SWITCHES = 25.0  # away from some graph: with fewer, the scatter of a run is not yet that of a long one
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,14 +225,9 @@ class RunPlan:
                 f"{counted(replicas, 'replica')} are known to {percent(precision.variance.error(replicas))} (standard "
                 "error)"
             )
-        if step.modes > 1:
-            leaving = float((step.stationary * (1.0 - step.transition.diagonal())).min())
-            steps = precision.steps(self.sought, self.prediction.experiment.run.replicas)
-            if steps * leaving < FEW_SWITCHES:
-                notes.append(
-                    f"a run of {steps} steps has {steps * leaving:.2g} expected switches away from some graph: its "
-                    "standard error is not yet that of a long run"
-                )
+        for steps in sorted({self.prediction.experiment.steps, precision.steps(self.sought, replicas)}):
+            if few := few_switches(expected_switches(step, steps)):
+                notes.append(f"a run of {steps} steps {few}: its standard error is not yet that of a long run")
         if not precision.any_time:
             notes.append(
                 "with noise, losses or delay of messages and in real time there is no interval that holds at all times"

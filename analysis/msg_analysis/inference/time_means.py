@@ -20,7 +20,9 @@ from typing import Any, Literal
 import numpy as np
 
 from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.text import number_text
 from msg_analysis.inference.observation import Observation
+from msg_analysis.model.step_model import StepModel
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.first_steps import Start, known_start, steady_start
 from msg_analysis.theory.jump_system import JumpSystem, held
@@ -32,6 +34,20 @@ PARTS = 20  # of a run, whose variances are compared
 MAX_SPREAD = 0.6  # relative standard error of the variance that follows from these parts, at most
 MIN_SWITCHES = 1.0
 FEW_SWITCHES = 10.0  # expected, below which intervals over all paths cover too much: benchmarks/trust.py
+
+
+def expected_switches(step: StepModel, steps: int) -> float:
+    """Of a run with so many steps in its steady state, away from the graph with the fewest; infinite for one graph."""
+    leaving = steps * step.stationary * (1.0 - np.diag(step.transition))
+    return math.inf if step.modes == 1 else float(leaving.min())
+
+
+def few_switches(switches: float) -> str | None:
+    """That a run has few switches, for a sentence about it; None where they are enough."""
+    # Then its errors over all paths depend on a few random lengths, and intervals are much too wide (calibration.md).
+    if switches >= FEW_SWITCHES:
+        return None
+    return f"has few switches (some graph is left {number_text(switches, 3)} times on average)"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,11 +107,6 @@ class TimeMeans:
         parts = np.add.reduceat(self.system_variances, lengths.cumsum() - lengths)
         total = float(parts.sum())
         return total > 0.0 and float((parts / total).std(ddof=1)) * math.sqrt(PARTS) <= MAX_SPREAD
-
-    @property
-    def few_switches(self) -> bool:
-        """Whether some graph is left so seldom that intervals over all paths are much too wide (calibration.md)."""
-        return self.switches < FEW_SWITCHES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,9 +234,6 @@ def time_means(observation: Observation) -> TimeMeans:
     for value, total in zip(values, totals, strict=False):
         if isinstance(value, Value):
             covariance += value.spread(total) / observation.replicas
-    step = observation.step  # in its steady state:
-    leaving = steps * step.stationary * (1.0 - np.diag(step.transition))
-    switches = math.inf if step.modes == 1 else float(leaving.min())
     return TimeMeans.of(
         (forms, nodes, trace),
         totals.sum(axis=0)[:p] / steps,
@@ -233,7 +241,7 @@ def time_means(observation: Observation) -> TimeMeans:
         covariance / steps**2,
         (series, variances),
         joint=False,
-        switches=switches if values else 0.0,
+        switches=expected_switches(observation.step, steps) if values else 0.0,
         heavy=observation.prediction.fourth_moment.finite is not True,
     )
 

@@ -154,8 +154,17 @@ def test_notes() -> None:
     assert large["variance"]["path_followed"] is False
     assert 0.001 < large["sampling_error"] < 0.05
     assert "the network is large, so the scatter of the mean is sampled" in large["notes"][0]
-    slow = line_ring(replicas=256).plan(0.5).to_json()
-    assert "expected switches away from some graph" in slow["notes"][0]
+
+
+@pytest.mark.parametrize("switches", [8, 12])
+def test_plan_and_compare_say_the_same_about_few_switches(switches: int) -> None:
+    """Rates of 0.05: each graph is left 0.025 times per unit of time; between 10 and 25 times, too."""
+    run = {"dt": 0.05, "duration": 40 * switches, "replicas": 4}
+    experiment = experiments.line_ring(5, 0.05, run=run)
+    words = f"has few switches (some graph is left {0.998 * switches:.3g} times on average)"
+    notes = [note for note in experiment.plan(0.9).to_json()["notes"] if f"a run of {experiment.steps} steps" in note]
+    said = [words in text for text in (" ".join(notes), str(compare(simulate(experiment)).trust.words))]
+    assert said == [switches < 10] * 2
 
 
 @pytest.mark.parametrize(
