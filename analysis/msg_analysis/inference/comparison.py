@@ -30,6 +30,7 @@ from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.counts import LossTest, SwitchingTest
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, Ranking
 from msg_analysis.inference.evidence_sums import AnyTimeEvidence
+from msg_analysis.inference.fault_power import RunPower
 from msg_analysis.inference.given_path import GivenPath
 from msg_analysis.inference.question import Test
 from msg_analysis.inference.realtime_laws import Laws
@@ -242,6 +243,8 @@ class Comparison:
         prediction
     max_missed
         in real time: share of missed deadlines above which the verdict is "late"
+    power
+        what the run could have found; None where too few steps arrived, or without a prediction
     """
 
     trajectory: Run
@@ -269,6 +272,7 @@ class Comparison:
     any_time: AnyTimeEvidence | None = None
     trust: Trust | None = None
     max_missed: float = MAX_MISSED
+    power: RunPower | None = None
 
     def __repr__(self) -> str:
         total, runs = self.system_error, f"{len(self.pool.members)} runs" if self.pool else "run"
@@ -399,6 +403,7 @@ class Comparison:
             "tests": self.tests,
             "any_time": self.any_time,
             "trust": self.trust,
+            "power": self.power,
         }
         return {key: _plain(value) for key, value in document.items()}
 

@@ -14,12 +14,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy.linalg
 from scipy import special
 
+from msg_analysis.common.text import HALF_WIDTH_95
+from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.graphs import Switching
 from msg_analysis.inference.messages import CommonGain, Gains
@@ -104,11 +106,49 @@ class FaultPower:
         return high / information
 
 
+@dataclass(frozen=True, slots=True)
+class RunPower:
+    """What a run could have found."""
+
+    half_width: float | None  # of the 95 % interval of the system error, relative to the prediction; None: unknown
+    steps: int
+    fault: FaultPower | None  # the first of ``EXAMPLES`` that the law can have
+
+    def to_json(self) -> dict[str, Any]:
+        """The document; agents from 1."""
+        found = self.fault
+        return {
+            "half_width": self.half_width,
+            "kind": found and found.fault.kind,
+            "factor": found and found.fault.factor,
+            "agent": None if found is None or found.agent is None else found.agent + 1,
+            "sender": None if found is None or found.sender is None else found.sender + 1,
+            "power": found and found.power(self.steps),
+        }
+
+
+EXAMPLES = Fault("noise", 1.1), Fault("gain", 0.5), Fault("switching", 1.4)
+
+
+def run_power(prediction: Prediction, sums: EvidenceSums, steps: int, level: float, error: Estimate | None) -> RunPower:
+    """Of a run of so many steps, with this system ``error``; the ``sums`` are its own."""
+    scale, half_width = prediction.emulated.system_error, None
+    if error and error.standard_error is not None and scale > 0.0:
+        half_width = HALF_WIDTH_95 * error.standard_error / scale
+    replicas = prediction.experiment.run.replicas
+    found = (power for one in EXAMPLES for power in fault_powers(prediction, replicas, level, [one], sums))
+    return RunPower(half_width, steps, next(found, None))
+
+
 def fault_powers(
-    prediction: Prediction, replicas: int, level: float, faults: Sequence[Fault] = FAULTS
+    prediction: Prediction,
+    replicas: int,
+    level: float,
+    faults: Sequence[Fault] = FAULTS,
+    sums: EvidenceSums | None = None,
 ) -> list[FaultPower]:
     """One for each of the ``faults`` that the law can have, not those without noise, links or switching."""
-    step, sums = prediction.step, EvidenceSums(prediction, replicas, in_detail=True)
+    step, sums = prediction.step, sums or EvidenceSums(prediction, replicas, in_detail=True)
     # While a run goes on, diagnostics are not asked.
     families = {name: logs.size for name, logs in sums.families().items()}
     questions = {name: size for name, size in families.items() if not isinstance(sums.questions[name], Diagnostic)}
@@ -144,13 +184,15 @@ def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
     found: _Informations = {}
     bases = [noise_directions(noise)[0] for noise in step.noise]
     dof = sum(rank * (rank + 1) // 2 for rank in (len(base) for base in (bases[:1] if same else bases)))
+    larger = math.sqrt(factor) - 1.0
     for agent in range(step.agents):
         divergence = 0.0
         for share, whitener, gain in zip(step.stationary, bases, step.noise_gain, strict=True):
-            scaled = gain.copy()
-            scaled[agent] *= math.sqrt(factor)
-            change = whitener @ (scaled @ scaled.T - gain @ gain.T) @ whitener.T
-            values = np.linalg.eigvalsh(change)
+            # The covariance changes by c (e w^T + w e^T) + c^2 w_a e e^T, with c = larger, e a unit vector, w = own.
+            own = gain @ gain[agent]
+            pair = np.stack([whitener[:, agent], whitener @ own])
+            change = np.array([[larger**2 * own[agent], larger], [larger, 0.0]]) @ (pair @ pair.T)
+            values = np.linalg.eigvals(change).real
             divergence += float(share * (values - np.log1p(values)).sum())
         if divergence > 0.0:
             found[agent, None] = [StepInformation(Noise.name, dof, replicas * divergence)]

@@ -19,6 +19,7 @@ from msg_analysis.inference.e_values import log_mean
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates, rank_agents
 from msg_analysis.inference.event_order import order_events
 from msg_analysis.inference.evidence_sums import AnyTimeEvidence, WatchedEvidence, any_time_evidence
+from msg_analysis.inference.fault_power import run_power
 from msg_analysis.inference.given_path import GivenPath, means_given_path
 from msg_analysis.inference.observation import Measurement, Observation, spaced_steps
 from msg_analysis.inference.question import Search, Statistics
@@ -229,6 +230,7 @@ def evaluate(
         causes=causes,
         any_time=_any_time(trajectory.record, prediction, evidence, level, families),
         trust=trusted(prediction, means, given=evidence.given is not None) if lockstep else None,
+        power=run_power(prediction, evidence.watched.sums, evidence.steps, level, tested_error),
     )
 
 

@@ -72,7 +72,7 @@ def print_comparison(document: dict[str, Any], console: Console, *, verbose: boo
             console.print(Text(line))
 
     console.print(verdict_line(document), style=_STYLES[document["verdict"]])
-    say(*_facts(document))
+    say(*power_words(document), *_facts(document))
     for cause in document.get("causes") or []:
         console.print(Text(with_names(sentence(cause["words"]), document.get("names"))), style="bold red")
     say(*trust_words(document))
@@ -250,6 +250,22 @@ def _realtime_line(verdict: str, real_time: dict[str, Any]) -> str:
     if verdict == "late":
         return f"{start} (at most {percent(limit)} may be missed). {line}."
     return f"{line}." if verdict in ("agrees", "disagrees") else f"{start}. {line}."
+
+
+_FAULTS = {"noise": "a noise variance of one agent", "gain": "a gain of one link", "switching": "all switching rates"}
+
+
+def power_words(document: dict[str, Any]) -> list[str]:
+    """What a run that agrees could have found, in a sentence; empty where that is not known."""
+    power = document.get("power")
+    if document["verdict"] != "agrees" or not power:
+        return []
+    width, factor = power["half_width"], power["factor"]
+    parts = [] if width is None else [f"The system error is known to ± {percent(width)} (95 %)"]
+    if factor is not None:
+        size = f"{100 * abs(factor - 1.0):.0f} % too {'large' if factor > 1.0 else 'small'}"
+        parts.append(f"{_FAULTS[power['kind']]} {size} would be found with probability {percent(power['power'])}")
+    return [sentence("; ".join(parts))] if parts else []
 
 
 def timing_facts(timing: dict[str, Any]) -> list[tuple[str, str]]:

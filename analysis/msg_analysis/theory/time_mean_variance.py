@@ -25,7 +25,7 @@ from msg_analysis.theory.moments import MomentSolver, mode_potential
 from msg_analysis.theory.prediction import Prediction
 
 MAX_WORK = 1e8  # multiplications of a step of T, up to which it is solved for
-SAMPLED = 5e9  # multiplications of the steps that are sampled otherwise
+SAMPLED = 2e9  # multiplications of the steps that are sampled otherwise
 PATHS, REPLICAS = 32, 8  # that are sampled, for at least so many steps:
 FEWEST = 200
 STAGE = 2000.0  # multiplications that take as long as the rest of a stage

@@ -12,9 +12,13 @@ from tests.support.watched_run import sums_of
 import experiments
 from experiments import compare, observed, predict, simulate
 from msg_analysis import Experiment, InputError, NotAvailableError
-from msg_analysis.inference.fault_power import Fault, FaultPower, StepInformation, fault_powers
+from msg_analysis.common.text import percent
+from msg_analysis.inference.evidence_sums import EvidenceSums
+from msg_analysis.inference.fault_power import Fault, FaultPower, StepInformation, fault_powers, run_power
 from msg_analysis.inference.sample_size import REPLICAS
 from msg_analysis.inference.statistics import simultaneous_half_width
+from msg_analysis.report.comparison_text import power_words
+from msg_analysis.report.page import render
 
 ONE_GRAPH = Experiment.parse({"name": "one", "graphs": {"ring": {"cycle": [1, 2, 3]}}, "run": {"duration": 10}})
 
@@ -106,6 +110,52 @@ def test_noise_is_the_divergence_of_normal_laws() -> None:
     assert found.power(found.steps(0.5)) == pytest.approx(0.5, abs=1e-6)
 
 
+def test_noise_that_agents_share_has_that_divergence_too() -> None:
+    """Against the eigenvalues of the whole change of a covariance with correlations."""
+    gain = np.array([[1.0, 0.4, 0.0], [0.0, 0.5, 0.2], [0.3, 0.0, 0.8]])
+    experiment = experiments.line_ring(noise={"process": gain.tolist()})
+    (found,) = powers(experiment, Fault("noise", 1.5, 1))
+    wrong = np.diag([1.0, math.sqrt(1.5), 1.0]) @ gain
+    values = scipy.linalg.eigvalsh(wrong @ wrong.T, gain @ gain.T) - 1.0
+    divergence = float((values - np.log1p(values)).sum())
+    assert found.tests[0].noncentrality == pytest.approx(experiment.run.replicas * divergence)
+
+
+@pytest.mark.parametrize("duration", [1.0, 100.0])
+def test_a_run_that_agrees_says_what_it_could_have_found(duration: float) -> None:
+    """20 steps, and 2000: the interval of the table, and the power that the plan of this run has."""
+    run = simulate(line_ring(duration=duration))
+    document = compare(run).to_json()
+    power, tested = document["power"], document["given_path"]["system_error"]
+    assert document["verdict"] == "agrees"
+    assert power["half_width"] == pytest.approx(np.diff(tested["interval"])[0] / 2 / tested["predicted"], rel=1e-3)
+    planned = next(row for row in line_ring(duration=duration).plan().to_json()["faults"] if row["factor"] == 1.1)
+    assert [power[key] for key in ("kind", "agent", "power")] == [planned[key] for key in ("kind", "agent", "power")]
+    words = (
+        f"The system error is known to ± {percent(power['half_width'])} (95 %); a noise variance of one agent 10 % too "
+        f"large would be found with probability {percent(power['power'])}."
+    )
+    assert power_words(document) == [words]
+    assert power_words(document | {"verdict": "disagrees"}) == []
+    assert words in render(compare(run))
+
+
+@pytest.mark.parametrize(
+    ("changes", "kind"),
+    [
+        ({}, "noise"),
+        ({"noise": {"process": 0.0, "link": 0.5}}, "gain"),
+        ({"noise": {"process": 0.0}, "run": {"dt": 0.1, "duration": 40, "start": [1.0, 0.0, 2.0]}}, "switching"),
+        ({"run": {"dt": 0.1, "duration": 40, "pace": "realtime"}}, "noise"),
+    ],
+)
+def test_the_fault_is_one_that_the_law_can_have(changes: dict[str, Any], kind: str) -> None:
+    prediction = predict(experiments.line_ring(**changes))
+    found = run_power(prediction, EvidenceSums(prediction, 1, in_detail=True), 100, 0.01, None)
+    assert found.to_json()["kind"] == kind
+    assert found.half_width is None
+
+
 def test_gains_have_the_information_of_a_run() -> None:
     """Of every link: the sum of the squared regressors of a run, over the variance of the noise."""
     experiment = line_ring(duration=4000, replicas=4)
@@ -150,7 +200,7 @@ def test_faults_that_a_law_cannot_have() -> None:
 
 
 def test_notes() -> None:
-    large = Experiment.load("hundred_agents").plan(0.02).to_json()
+    large = experiments.line_ring(30, run={"dt": 0.1, "duration": 40, "replicas": 16}).plan(0.02).to_json()
     assert large["variance"]["path_followed"] is False
     assert 0.001 < large["sampling_error"] < 0.05
     assert "the network is large, so the scatter of the mean is sampled" in large["notes"][0]
