@@ -286,6 +286,7 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Run:
         lost=truth.lost,
         used=truth.used,
         made=truth.made,
+        wrong_stamp=min((part.wrong_stamp for part in parts if part.wrong_stamp), default=None),
         published=published.states if published else None,
     )
 

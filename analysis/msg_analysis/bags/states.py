@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from msg_analysis.arithmetic.reproducible import SECOND
+from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.bags.stored_file import Batch, gather
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray, column, large_zeros, pieces, release
 from msg_analysis.errors import BagError
@@ -260,6 +260,8 @@ class Collected:
             ) from error
         self._unreleased = 0  # states since the last release
         self._contradicted: list[IntArray] = []
+        self._clock = None if self._realtime else StepClock(experiment.step_length)
+        self.wrong_stamp: tuple[int, int, int] | None = None  # see ``Run.wrong_stamp``
         self.lost: BoolArray | None = None
         self.used: IntArray | None = None
         self.made: IntArray | None = None
@@ -271,6 +273,12 @@ class Collected:
         self._unreleased += len(states)
         states, values = self._good(states)
         cell = states.step * self._shape[1] + states.agent - 1
+        if self._clock is not None:
+            wrong = states.stamp != self._clock.times(states.step)
+            if wrong.any():
+                first = states[wrong & (cell == cell[wrong].min())]
+                found = int(first.step[0]), int(first.agent[0]) - 1, int(first.stamp.min())
+                self.wrong_stamp = min(self.wrong_stamp or found, found)
         place = states.position + 1
         before = self._position[cell]
         fresh = not before.any()
@@ -371,6 +379,8 @@ class Collected:
         for name in ("_states", "_position", "_modes", "_used", "_made", "_lost", "_listed"):
             setattr(self, name, getattr(self, name)[:cells])
         self._contradicted = [found[found < cells] for found in self._contradicted]
+        if self.wrong_stamp and self.wrong_stamp[0] > steps:
+            self.wrong_stamp = None
         if self._realtime:
             for piece in pieces(self._used):
                 beyond = (self._used[piece] > steps + 1).any(axis=1)  # of values that are left out

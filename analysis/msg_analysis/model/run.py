@@ -103,6 +103,9 @@ class Run:
     made
         (N + 1, m) in real time: simulated time [ns] at which the state was made, later than that of every value used
         for it; 0 for x(0), -1 where missing. None in lockstep
+    wrong_stamp
+        in lockstep: step, index of the agent from 0 and stamp [ns] of the first logged state that is not stamped with
+        the time of its step; None where all are, and in real time
     network
         of a run that ``msg_agents.run_network`` gives: what only the network knows, such as the directory of the
         ``bag``, ``restarts``, ``failures`` and ``wall_time``; else None
@@ -117,6 +120,7 @@ class Run:
     lost: BoolArray | None = None
     used: IntArray | None = None
     made: IntArray | None = None
+    wrong_stamp: tuple[int, int, int] | None = None
     network: Any = None
 
     def __repr__(self) -> str:

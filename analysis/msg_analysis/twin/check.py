@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.common.resources import tell
 from msg_analysis.model.graph_path import mode_path
@@ -32,8 +33,9 @@ class Check:
 def check(trajectory: Run) -> Check:
     """Compute a run again with the offline twin, and compare every state, lost message and graph bit for bit.
 
-    In lockstep the twin needs only the run record. In real time it also takes from the log which values every agent
-    used in every step, and no value may be used before it was made, according to the stamps.
+    In lockstep the twin needs only the run record, and every state has the stamp of its step. In real time it also
+    takes from the log which values every agent used in every step, and no value may be used before it was made, by the
+    stamps.
 
     Parameters
     ----------
@@ -64,6 +66,7 @@ def _in_lockstep(trajectory: Run, path: IntArray) -> str | None:
         found = [
             *(_first_state(trajectory, block.first, *states) for states in _states(trajectory, block)),
             *_first_messages(trajectory, block, path),
+            _first_stamp(trajectory, block),
             _first_graph(trajectory, block, path),
         ]
         if difference := _earliest(found):
@@ -140,6 +143,16 @@ def _first_graph(trajectory: Run, block: RunBlock, path: IntArray) -> _Found:
         (logged >= 0) & (logged != law),
         block.first,
         lambda k: f"graph of step {block.first + k}: logged {graphs[logged[k]]}, the seed gives {graphs[law[k]]}",
+    )
+
+
+def _first_stamp(trajectory: Run, block: RunBlock) -> _Found:
+    if trajectory.wrong_stamp is None or trajectory.wrong_stamp[0] not in range(block.steps.start, block.steps.stop):
+        return None
+    step, agent, stamp = trajectory.wrong_stamp
+    due = StepClock(trajectory.record.experiment.step_length).nanoseconds(step)
+    return step, (
+        f"agent {agent + 1} at step {step}: stamped {stamp / SECOND} s of simulated time, expected {due / SECOND} s"
     )
 
 

@@ -13,6 +13,7 @@ import secrets
 import uuid
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -314,7 +315,7 @@ def simulate(experiment: Experiment, *, record: RunRecord | None = None) -> Run:
     return Run(record, modes=modes, completeness=count, agent_modes=agent_modes, made=made, **arrays)
 
 
-def _whole(blocks: Iterable[RunBlock], steps: int) -> dict[str, AnyArray]:
+def _whole(blocks: Iterable[RunBlock], steps: int) -> dict[str, Any]:
     """The arrays of ``Run`` of a run of so many steps, by name, from its blocks."""
     length = {"states": steps + 1, "published": steps + 1, "lost": steps, "used": steps}
     arrays: dict[str, AnyArray] = {}

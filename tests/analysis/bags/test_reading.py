@@ -83,7 +83,7 @@ def _rules(messages: list[Any], kind: str) -> dict[str, Any]:
     first: dict[tuple[int, int], Any] = {}
     contradicted: set[tuple[int, int]] = set()
     refused: Counter[str] = Counter()
-    duplicates = 0
+    duplicates, wrong_stamps = 0, []
     for place, message in enumerate(messages):
         if message is None:
             refused["undecodable"] += 1
@@ -111,6 +111,8 @@ def _rules(messages: list[Any], kind: str) -> dict[str, Any]:
             refused[reason] += 1
             continue
         cell = (message.step, message.agent - 1)
+        if kind != "realtime" and stamp != message.step * 50_000_000:
+            wrong_stamps.append((*cell, stamp))
         said = [message.state.tolist(), message.mode]
         said += [] if kind == "plain" else [[*heard, 0, 0][:2]]
         said += [stamp] if kind == "realtime" else []
@@ -129,6 +131,7 @@ def _rules(messages: list[Any], kind: str) -> dict[str, Any]:
         "used": np.full((*shape, 2), -1) if kind in ("realtime", "late", "hold") else None,
         "made": np.full(shape, -1) if kind == "realtime" else None,
         "lost": np.zeros((*shape, 2), bool) if kind in ("loss", "late", "hold") else None,
+        "wrong_stamp": min(wrong_stamps, default=None),
     }
     for cell, (_, message, _, heard, stamp) in taken.items():
         out["states"][cell], out["agent_modes"][cell] = message.state, message.mode - 1
@@ -195,7 +198,7 @@ def test_random_bags(tmp_path: Path, typestore: Any, data: st.DataObject) -> Non
         for encoded, state in zip(stored, states, strict=True)
     ]
     expected, found = _rules(decoded, kind), read_bag(path)
-    for name in ("states", "agent_modes", "used", "made", "lost"):
+    for name in ("states", "agent_modes", "used", "made", "lost", "wrong_stamp"):
         np.testing.assert_array_equal(getattr(found, name), expected[name], name)
     count = found.completeness
     assert (count.received, count.duplicates, count.out_of_order) == tuple(
