@@ -12,6 +12,7 @@ BY_A_BOUND = {
     "residuals: constant state",
     "residuals: largest",
     "residuals: lags to 100",
+    "residuals: replicas",
     "residuals: stale values",
     "residuals: swapped graphs",
 }

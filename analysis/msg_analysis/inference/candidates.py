@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -145,6 +146,12 @@ class Cause:
     expected: float | None = None  # the same according to the experiment; 1 for a factor
     p: float | None = None  # adjusted for all candidate causes; 0 where the law makes it impossible
     steps: tuple[int, int] | None = None  # first and last, where the cause is a stretch of the run
+    log_p: float | None = None  # natural logarithm of ``p``, which may be too small for a number; None where p is 0
+
+    @property
+    def order(self) -> float:
+        """The smaller, the clearer."""
+        return -math.inf if self.log_p is None else self.log_p
 
 
 def numbers_text(value: float, interval: tuple[float, float]) -> str:
@@ -198,6 +205,7 @@ def gains(sums: ResidualSums, excluded: Iterable[int]) -> ParameterGroup | None:
 
 def _gain_classes(terms: Sequence[Term]) -> list[list[Candidate]]:
     weights = np.array([term.weight for term in terms])
+    leaders = sorted({term.agent for term in terms if term.kind == "lead"})
 
     def group(kind: str, part: str, of: Callable[[Term], Hashable]) -> list[Candidate]:
         """One candidate for each value of ``of`` over the terms of a kind."""
@@ -225,17 +233,18 @@ def _gain_classes(terms: Sequence[Term]) -> list[list[Candidate]]:
         group("pull", "receiver in graph", lambda t: (t.agent, t.graph)),
         group("pull", "graph", lambda t: t.graph),
         group("pull", "all", lambda _: None),
-        group("constant", "offset", lambda t: t.agent),
         [Candidate("reference", None, _reference(terms))],
+        [Candidate("reference", i, _reference(terms, i)) for i in leaders],
+        group("constant", "offset", lambda t: t.agent),
     ]
     return [found for found in classes if any(candidate.direction.any() for candidate in found)]
 
 
-def _reference(terms: Sequence[Term]) -> FloatArray:
-    """(K,): effect of a reference that is larger by 1: leaders are pulled that much higher."""
+def _reference(terms: Sequence[Term], leader: int | None = None) -> FloatArray:
+    """(K,): effect of a reference that is larger by 1: leaders, or one of them, are pulled that much higher."""
     pulls: dict[int, list[float]] = {}
     for term in terms:
-        if term.kind == "lead":
+        if term.kind == "lead" and leader in (None, term.agent):
             pulls.setdefault(term.agent, []).append(-term.weight)
     return np.array(
         [np.mean(pulls[term.agent]) if term.kind == "constant" and term.agent in pulls else 0.0 for term in terms]
@@ -311,6 +320,45 @@ def _explained(sums: ResidualSums, change: FloatArray) -> FloatArray:
         less = c[place] * (2.0 * sums.score[a] - gram[place] @ c)
         explained[:, term.agent] += less * (shares if term.graph is None else np.arange(n) == term.graph)
     return explained
+
+
+MAX_NOISE_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
+
+
+@dataclass(frozen=True, slots=True)
+class Correlated:
+    """Two agents whose noise is not as much correlated as it should be."""
+
+    link: tuple[int, int]  # from 1
+    correlation: float
+    interval: tuple[float, float]  # 95 %
+    expected: float
+    log_p: float  # adjusted, see ``select``
+
+
+def correlations(sums: ResidualSums, excluded: Sequence[int], families: int, level: float) -> list[Correlated]:
+    """Pairs whose noise correlation differs from the expected one (Fisher's z)."""
+    agents = [i for i in range(sums.still.shape[1]) if i not in excluded]
+    pairs = list(combinations(agents, 2))
+    samples = int(sums.samples.sum())
+    if not 0 < len(pairs) <= MAX_NOISE_PAIRS or samples < MIN_SAMPLES:
+        return []
+    should, scatter = np.tensordot(sums.samples, sums.noises, axes=1), sums.scatter.sum(axis=0)
+    found = []
+    for j, i in pairs:
+        size, expected_size = scatter[i, i] * scatter[j, j], should[i, i] * should[j, j]
+        if size <= 0.0 or expected_size <= 0.0:
+            continue
+        seen, expected = float(scatter[i, j] / math.sqrt(size)), float(should[i, j] / math.sqrt(expected_size))
+        if 1.0 - expected**2 < 1e-6 or 1.0 - seen**2 < 1e-12:
+            continue
+        z = (math.atanh(seen) - math.atanh(expected)) * math.sqrt(samples - 3)
+        log_p = math.log(2.0 * len(pairs) * families) + float(log_normal_tail(abs(z)))
+        if log_p < math.log(level):
+            half = HALF_WIDTH_95 / math.sqrt(samples - 3)
+            interval = math.tanh(math.atanh(seen) - half), math.tanh(math.atanh(seen) + half)
+            found.append(Correlated((j + 1, i + 1), seen, interval, expected, log_p))
+    return found
 
 
 WIDEST = math.log(1e3)  # largest change of a rate, either way, as a logarithm

@@ -8,17 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
 from operator import attrgetter
 from typing import Self
 
 import numpy as np
 import scipy.fft
 
-from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
-from msg_analysis.common.text import HALF_WIDTH_95, percent
-from msg_analysis.inference import candidates
-from msg_analysis.inference.candidates import Cause, numbers_text
+from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from msg_analysis.common.text import percent
+from msg_analysis.inference.candidates import Cause, Correlated, numbers_text
 from msg_analysis.inference.e_values import Analyses, EventEvidence, coefficient_evidence
 from msg_analysis.inference.question import (
     Block,
@@ -30,11 +28,10 @@ from msg_analysis.inference.question import (
     Question,
     RunningSums,
     Search,
+    SummedDiagnostic,
     agent_words,
 )
 from msg_analysis.inference.statistics import add_sums, binomial_interval, log_normal_tail
-
-MAX_NOISE_PAIRS = 1225  # pairs of agents whose noise is tested for correlation, at most: 50 agents
 
 
 class Whiteness(Question):
@@ -62,37 +59,17 @@ class Whiteness(Question):
 
     @classmethod
     def causes(cls, search: Search) -> list[Cause]:
-        """Pairs whose noise correlation differs from the expected one (Fisher's z); wrong gains correlate it, too."""
-        if search.noise is None or search.selected_gains[1].any():
-            return []
-        sums, families, level = search.residuals, search.families, search.level
-        agents = [i for i in range(sums.still.shape[1]) if i not in search.excluded]
-        pairs = list(combinations(agents, 2))
-        if not 0 < len(pairs) <= MAX_NOISE_PAIRS:
-            return []
-        samples = int(sums.samples.sum())
-        should = np.tensordot(sums.samples, sums.noises, axes=1)
-        scatter = sums.scatter.sum(axis=0)
-        found = []
-        for j, i in pairs:
-            size, expected_size = scatter[i, i] * scatter[j, j], should[i, i] * should[j, j]
-            if size <= 0.0 or expected_size <= 0.0 or samples < candidates.MIN_SAMPLES:
-                continue
-            seen, expected = scatter[i, j] / math.sqrt(size), should[i, j] / math.sqrt(expected_size)
-            if 1.0 - expected**2 < 1e-6 or 1.0 - seen**2 < 1e-12:
-                continue
-            z = (math.atanh(seen) - math.atanh(expected)) * math.sqrt(samples - 3)
-            log_p = math.log(2.0 * len(pairs) * families) + float(log_normal_tail(abs(z)))
-            if log_p < math.log(level):
-                half = HALF_WIDTH_95 / math.sqrt(samples - 3)
-                interval = math.tanh(math.atanh(seen) - half), math.tanh(math.atanh(seen) + half)
-                words = (
-                    f"the noise of agents {j + 1} and {i + 1} has correlation {numbers_text(seen, interval)}, "
-                    f"not {expected:.3g}"
-                )
-                link = (j + 1, i + 1)
-                found.append(Cause("correlation", words, None, link, None, seen, interval, expected, math.exp(log_p)))
-        return found
+        """Pairs of agents."""
+        return [_correlation_cause(one) for one in search.correlated]
+
+
+def _correlation_cause(one: Correlated) -> Cause:
+    words = (
+        f"the noise of agents {one.link[0]} and {one.link[1]} has correlation "
+        f"{numbers_text(one.correlation, one.interval)}, not {one.expected:.3g}"
+    )
+    numbers = one.correlation, one.interval, one.expected, math.exp(one.log_p)
+    return Cause("correlation", words, None, one.link, None, *numbers, log_p=one.log_p)
 
 
 LAGS = 100
@@ -149,6 +126,7 @@ class LagSums:
             estimate=float(score[row, column] / known),
             standard_error=1.0 / math.sqrt(known),
             expected=0.0,
+            possible=(-1.0, 1.0),
         )
 
 
@@ -227,6 +205,105 @@ class LongLags(Diagnostic):
         return f"the noise of {whose} has correlation {found.numbers} with its own {steps} steps before, not 0"
 
 
+MOST_REPLICAS = 32  # of whom each two are asked about
+
+
+class Replicas(SummedDiagnostic):
+    """Regression of the residuals of each replica on those of earlier ones: by agent, of all, and of each two."""
+
+    name = "residuals: replicas"
+    meaning = "the noise of the replicas is not independent: random numbers are used twice"
+    kind = "replicas"
+
+    def __init__(self, law: Law) -> None:
+        super().__init__(law)
+        pairs = law.replicas if law.apart and 2 < law.replicas <= MOST_REPLICAS else 0
+        self._pairs: IntArray = np.column_stack(np.tril_indices(pairs, -1))  # (P, 2) later and earlier
+        # Score, information and squares of each agent; products of each two replicas; samples.
+        agents, count = np.zeros(len(self.agents)), np.zeros((), np.int64)
+        self.sums = [agents, agents, agents, np.zeros((pairs, pairs)), count]
+
+    def between(self, block: Block) -> list[AnyArray]:
+        """See ``sums``."""
+        analyses, white = block.analyses, block.white[:, self.agents]
+        earlier = white.cumsum(axis=2) - white
+        parts = [analyses.sums(each.sum(axis=2)) for each in (white * earlier, earlier**2, white**2)]
+        products = np.zeros((analyses.count, *self.sums[3].shape))
+        if len(self._pairs):
+            for row, begin, end in zip(products, analyses.begins.tolist(), analyses.ends.tolist(), strict=True):
+                flat = white[begin:end].reshape(-1, white.shape[2])
+                row += flat.T @ flat
+        return [*parts, products, analyses.lengths]
+
+    def finding(self) -> Finding | None:
+        """The clearest agent, or all, or two replicas."""
+        replicas, steps = self.law.replicas, int(self.sums[4])
+        if replicas < 2 or not len(self.agents) or steps * replicas < MIN_SAMPLES:
+            return None
+        score, information = self._rows(self.sums)
+        z = np.abs(score) / np.sqrt(np.maximum(information, np.finfo(float).tiny))
+        squares, agents = self.columns(self.sums[2]), len(self.agents)
+        ends = np.cumsum([agents, int(self.together), len(self._pairs)])
+        kinds = [(begin, end) for begin, end in zip([0, *ends[:-1]], ends, strict=True) if end > begin]
+        begin, end = min(kinds, key=lambda kind: log_normal_tail(z[slice(*kind)].max()) + math.log(kind[1] - kind[0]))
+        row = begin + int(np.argmax(z[begin:end]))
+        log_p = math.log(2.0 * (end - begin) * len(kinds)) + float(log_normal_tail(z[row]))
+        if row < ends[1]:  # the intraclass correlation and its error (Fisher 1925)
+            among, column = replicas, self.agent(row)
+            rho = float(score[row] / squares[row]) * 2.0 / (replicas - 1.0)
+            numbers, which = steps * (agents if column is None else 1), ()
+        else:
+            among, column, numbers, which = 2, None, steps * agents, tuple(self._pairs[row - ends[1]].tolist()[::-1])
+            own = np.diag(self.sums[3])[list(which)]
+            rho = float(score[row] / math.sqrt(own.prod()))
+        error = (1.0 - rho) * (1.0 + (among - 1.0) * rho) * math.sqrt(2.0 / (among * (among - 1.0) * numbers))
+        return Finding(
+            min(0.0, log_p),
+            agent=column,
+            replicas=which,
+            estimate=rho,
+            standard_error=abs(error),
+            expected=0.0,
+            possible=(-1.0 / (among - 1.0), 1.0),
+        )
+
+    def _rows(self, sums: Sequence[AnyArray]) -> tuple[FloatArray, FloatArray]:
+        """Score and information (..., agents [+ 1] + P)."""
+        later, earlier = self._pairs.T
+        products = sums[3]
+        score = np.concatenate([self.columns(sums[0]), products[..., later, earlier]], axis=-1)
+        return score, np.concatenate([self.columns(sums[1]), products[..., earlier, earlier]], axis=-1)
+
+    def of_sums(self, sums: Sequence[AnyArray]) -> FloatArray:
+        """(..., agents [+ 1] + P, K)."""
+        if self.law.replicas < 2:
+            return np.empty((*sums[4].shape, 0, 1))
+        return coefficient_evidence(*self._rows(sums))
+
+    def about(self, row: int) -> str:
+        """An agent, all, or two replicas."""
+        columns = len(self.agents) + self.together
+        if row < columns:
+            return f"common noise of the replicas of {agent_words(self.agent(row))}"
+        later, earlier = (self._pairs[row - columns] + 1).tolist()
+        return f"common noise of replicas {earlier} and {later}"
+
+    @classmethod
+    def explains_others(cls, found: Finding) -> bool:
+        """Replicas that are alike count several times in every other cause."""
+        return found.estimate is not None and found.estimate > ALIKE
+
+    @classmethod
+    def words(cls, found: Finding, names: Sequence[str]) -> str:
+        """A correlation."""
+        del names
+        which = f"replicas {' and '.join(str(one + 1) for one in found.replicas)}" if found.replicas else "all replicas"
+        whose = f"the noise of {which}" if found.agent is None else f"agent {found.agent + 1}'s noise in {which}"
+        return f"{whose} has correlation {found.numbers}, not 0: the replicas are not independent"
+
+
+ALIKE = 0.9  # correlation
+
 ROUNDINGS = 4.0  # of the largest state, in the computation of a state, at most
 EPSILON = float(np.finfo(np.float64).eps)
 
@@ -299,9 +376,9 @@ class ConstantState(Diagnostic):
         return f"{agent_words(found.agent)} did not move {found.place.words}, although it has noise"
 
     @classmethod
-    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
+    def cause(cls, found: Finding, names: Sequence[str], log_p: float) -> Cause:
         """Without the length, which is that of the steps."""
-        return replace(super().cause(found, names, p), estimate=None)
+        return replace(super().cause(found, names, log_p), estimate=None)
 
     @classmethod
     def causes(cls, search: Search) -> list[Cause]:

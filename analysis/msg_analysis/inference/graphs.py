@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Questions about the graphs: transitions, holding times, and their names."""
+"""Questions about the graphs: transitions, holding times, and the graph before."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from operator import attrgetter
-from typing import Self
 
 import numpy as np
 from scipy.special import xlogy
@@ -17,27 +16,22 @@ from scipy.special import xlogy
 from msg_analysis.common.arrays import AnyArray, FloatArray, IntArray
 from msg_analysis.experiment.markov_chain import MarkovChain, stationary_law
 from msg_analysis.inference.candidates import Cause, Rate, find_rates, numbers_text
+from msg_analysis.inference.counts import likelihood_ratio
 from msg_analysis.inference.e_values import (
-    WindowEvidence,
-    Windows,
-    log_mean,
     proportion_constant,
     proportion_evidence,
     row_evidence,
 )
 from msg_analysis.inference.question import (
     Block,
-    Diagnostic,
     Finding,
-    Largest,
     Law,
-    Place,
     Question,
     RunningSums,
     Search,
     SummedDiagnostic,
 )
-from msg_analysis.inference.statistics import log_chi2_tail
+from msg_analysis.inference.statistics import binomial_interval, log_chi2_tail
 
 
 class Switching(Question):
@@ -46,6 +40,7 @@ class Switching(Question):
     name = "switching"
     meaning = "the graphs do not switch with the rates or probabilities of the file"
     main = True
+    about_chain = True
     p_value = attrgetter("p_switching")
 
     def number_of_tests(self) -> int:
@@ -78,7 +73,12 @@ class Switching(Question):
     def causes(cls, search: Search) -> list[Cause]:
         """Jumps that the law excludes; else rates, or in discrete time probabilities, that explain the transitions."""
         names, counts, experiment = search.names, search.transitions.counts, search.experiment
-        excluded = (counts > 0) & (experiment.chain.transition(experiment.step_length) == 0.0)
+        transition = experiment.chain.transition(experiment.step_length)
+        if search.renamed:  # the log's names may be wrong, or those of the steps: the chain says which
+            meant = np.zeros_like(counts)
+            meant[np.ix_(search.renamed, search.renamed)] = counts
+            counts = min((counts, meant), key=lambda each: _unlikely(each, transition))
+        excluded = (counts > 0) & (transition == 0.0)
         found = []
         for g, h in np.argwhere(excluded).tolist():
             number, pair = float(counts[g, h]), [names[g], names[h]]
@@ -88,6 +88,10 @@ class Switching(Question):
             return found
         rates = find_rates(counts, experiment.chain, experiment.step_length, search.families, search.level)
         return [_rate_cause(rate, experiment.chain, names) for rate in rates]
+
+
+def _unlikely(counts: IntArray, transition: FloatArray) -> float:
+    return math.inf if counts[transition == 0.0].any() else float(likelihood_ratio(counts, transition))
 
 
 def _rate_cause(rate: Rate, chain: MarkovChain, names: Sequence[str]) -> Cause:
@@ -106,7 +110,8 @@ def _rate_cause(rate: Rate, chain: MarkovChain, names: Sequence[str]) -> Cause:
         words = f"the {several} of switching away from {where[0]} are {numbers} times what the file says"
     else:
         words = f"the {one} of switching from {where[0]} to {where[1]} is {numbers}, not {expected:.3g}"
-    return Cause("switching", words, None, None, where, estimate, interval, expected, math.exp(rate.log_p))
+    p = math.exp(rate.log_p)
+    return Cause("switching", words, None, None, where, estimate, interval, expected, p, log_p=rate.log_p)
 
 
 PARTS = 8  # of the ages of a holding time, with as nearly as steps allow the same share of the ends of holding times
@@ -178,6 +183,7 @@ class HoldingTimes(SummedDiagnostic):
                     estimate=share,
                     standard_error=math.sqrt(share * (1.0 - share) / max(steps[part], 1.0)),
                     expected=p,
+                    ends=binomial_interval(int(left[part]), int(steps[part])),
                 )
         return replace(found, log_p=log_chi2_tail(statistic, dof)) if dof else None
 
@@ -246,76 +252,139 @@ def _log_likelihood(left: FloatArray, steps: FloatArray) -> float:
 MOST_GRAPHS = 20  # of a law for which this is tested
 
 
-class SwappedGraphs(Diagnostic):
-    """Likelihood ratios of two graphs whose names are swapped, in windows of 1, 2, 4, ... steps, for every pair."""
+class SecondOrder(SummedDiagnostic):
+    """Steps counted by graph, the graph that came before it, whether they are the first in it, and the next graph.
 
-    name = "residuals: swapped graphs"
-    meaning = "two graphs have each other's name in the log"
-    kind = "graph"
+    Likelihood ratio of the probabilities of the next graph after each graph against common ones, whatever these are.
+    """
+
+    name = "graph before"
+    meaning = "the next graph depends on the graph that came before: the chain is not Markov"
+    kind = "second order"
+    about_chain = True
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)
-        self._step = step = law.step
-        tested = law.plain and law.apart and law.noisy.all() and step.modes <= MOST_GRAPHS
-        self._pairs: IntArray = np.column_stack(np.triu_indices(step.modes if tested else 0, 1))  # (P, 2)
-        self._deviation = np.sqrt(np.einsum("gik,gik->gi", step.noise_gain, step.noise_gain))  # (n, m)
-        self._windows = Windows(law.planned, len(self._pairs))
-        self._evidence = WindowEvidence(self._windows, len(self._pairs))
-        self._best = Largest(-np.inf, (0, 0))
+        n = law.step.modes
+        self._transition = law.step.transition
+        # With two graphs, the one before is known; what is left is the question of the holding times.
+        self._asked = 2 < n <= MOST_GRAPHS
+        self.sums = [np.zeros((n, 2, n, n) if self._asked else (0,), np.int64)]  # before, first or later, graph, next
+        self._last = self._before = -1  # graph of the step before the next block, and the graph before that one
 
-    def add(self, block: Block) -> FloatArray:
-        """The windows that end in the block."""
-        if not len(self._pairs):
-            return np.empty((block.analyses.count, 0, 1))
-        # The product over the steps of a window is evidence, so is the mean over windows and pairs; 1 / it is the p.
-        logged, modes = _log_density(block.white, block.scale), block.reception.modes
-        density = np.empty((len(logged), self._step.modes))
-        for graph, deviation in enumerate(self._deviation):
-            mean = self._step.weights[graph] @ block.reception.states + self._step.offsets[graph][:, None]
-            density[:, graph] = _log_density((block.after - mean) / deviation[:, None], deviation)
-        first, second = self._pairs.T
-        swapped = np.where(modes[:, None] == first, density[:, second], logged[:, None])
-        swapped = np.where(modes[:, None] == second, density[:, first], swapped)
-        ended = self._windows.add(swapped - logged[:, None])
-        level = ended.level
-        evidence = self._evidence.add(ended, ended.sums, block.analyses)
-        values = ended.sums - np.log(self._windows.planned[level])[:, None]
-        at, pair = np.unravel_index(int(np.argmax(values)), values.shape)
-        start = int(ended.first[at]) + 1
-        place = Place(start, start + (1 << int(level[at])) - 1)
-        self._best.take(float(values[at, pair]), tuple(self._pairs[pair].tolist()), place)
-        return evidence[:, :, None]
-
-    def merge(self, other: Self) -> None:
-        """The window with more evidence."""
-        self._evidence.merge(other._evidence)
-        self._best.merge(other._best)
+    def between(self, block: Block) -> list[AnyArray]:
+        """Counts (T, n, 2, n, n)."""
+        graphs, analyses = block.graphs, block.analyses
+        now, shape = graphs[:-1], (analyses.count, *self.sums[0].shape)
+        if not self._asked or not len(now):
+            return [np.zeros(shape, np.int64)]
+        prior = np.append(self._last, now[:-1])
+        entered = (now != prior) & (prior >= 0)
+        begin = np.maximum.accumulate(np.where(entered, np.arange(len(now)), -1))
+        before = np.where(begin >= 0, prior[begin], self._before)
+        self._last, self._before = int(now[-1]), int(before[-1])
+        known = before >= 0
+        rows = analyses.after(np.arange(len(now))), before, (~entered).astype(np.int64), now, graphs[1:]
+        place = np.ravel_multi_index([each[known] for each in rows], shape)
+        return [np.bincount(place, minlength=math.prod(shape)).reshape(shape)]
 
     def finding(self) -> Finding | None:
-        """The window and the pair with the most evidence."""
-        if not len(self._pairs) or not self._windows.steps:
+        """The graph, the one before it and the one after it whose share is furthest from the usual one."""
+        if not self._asked:
             return None
-        graph, other = map(int, self._best.of)
-        log_p = -float(log_mean(self._evidence.logarithms()))
-        return Finding(min(0.0, log_p), graph=graph, other=other, place=self._best.place)
+        counts, n = self.sums[0], len(self._transition)
+        # Steps that the law gives, of all that were made: what is pooled must not depend on what was seen.
+        entries = counts.sum() * stationary_law(self._transition)[:, None] * self._transition
+        np.fill_diagonal(entries, 0.0)
+        statistic, dof, clearest, found = 0.0, 0, -1.0, Finding(0.0)
+        for graph in range(n):
+            stay = min(self._transition[graph, graph], 1.0 - 1e-12)
+            expected = np.stack([entries[:, graph], entries[:, graph] * stay / (1.0 - stay)], axis=1)
+            table, labels, targets = _pooled(counts[:, :, graph], expected, self._transition[graph])
+            total, columns = table.sum(axis=1, keepdims=True), table.sum(axis=0)
+            if min(table.shape) < 2 or not (total > 0).all() or not (columns > 0).all():
+                continue
+            share = columns / columns.sum()
+            statistic += 2.0 * float(xlogy(table, table / (total * share)).sum())
+            dof += (len(table) - 1) * (len(columns) - 1)
+            z = np.abs(table - total * share) / np.sqrt(total * share * (1.0 - share))
+            z[[row for row, label in enumerate(labels) if label is None]] = 0.0
+            row, column = np.unravel_index(int(np.argmax(z)), z.shape)
+            if z[row, column] > clearest and labels[row] is not None:
+                clearest, part, whole = float(z[row, column]), int(table[row, column]), int(total[row, 0])
+                before, first = labels[row] or (0, False)
+                found = Finding(
+                    0.0,
+                    before=before,
+                    graph=graph,
+                    other=targets[column],
+                    span=(1, 1) if first else None,
+                    estimate=part / whole,
+                    expected=float(share[column]),
+                    ends=binomial_interval(part, whole),
+                )
+        return replace(found, log_p=log_chi2_tail(statistic, dof)) if dof else None
 
-    def logarithms(self) -> FloatArray:
-        """(pairs, 1)."""
-        return self._evidence.logarithms()[:, None]
+    def of_sums(self, sums: Sequence[AnyArray]) -> FloatArray:
+        """(..., n + 1, K): of each graph, and of all."""
+        if not self._asked:
+            return np.empty((*sums[0].shape[:-1], 0, 1))
+        # Given the past, every step is a question of its own, so the product over what came before is evidence.
+        each = row_evidence(sums[0], self._transition).sum(axis=(-4, -3))
+        return np.concatenate([each, each.sum(axis=-2, keepdims=True)], axis=-2)
 
     def about(self, row: int) -> str:
-        """Two graphs."""
-        first, second = (self.law.graphs[graph] for graph in self._pairs[row].tolist())
-        return f"names of the graphs {first} and {second} swapped"
+        """A graph, or all."""
+        of = f" of {self.law.graphs[row]}" if row < len(self.law.graphs) else ""
+        return f"the next graph{of}, by the graph before"
 
     @classmethod
     def words(cls, found: Finding, names: Sequence[str]) -> str:
-        """Two names."""
-        pair = " and ".join(names[graph] for graph in (found.graph, found.other) if graph is not None)
-        words = f"the log has the names of the graphs {pair} swapped"
-        return f"{words} {found.place.words}" if found.place else words
+        """A probability that depends on the graph before."""
+        words = "the next graph depends on the graph before"
+        if found.graph is None or found.before is None:
+            return words
+        after, graph = names[found.before], names[found.graph]
+        where = (
+            f"after {after}, in the first step of graph {graph}," if found.span else f"in graph {graph} after {after}"
+        )
+        follows = "that another graph follows" if found.other is None else f"that {names[found.other]} follows"
+        if found.other == found.graph:
+            follows = "that it stays"
+        return f"{words}: {where} the probability {follows} is {found.numbers}, not {found.expected:.3g}"
 
 
-def _log_density(white: FloatArray, deviation: FloatArray) -> FloatArray:
-    """(b,) log density of all residuals of a step but for a constant; standardised ones (b, m, R)."""
-    return np.asarray(-0.5 * (white**2).sum(axis=(1, 2)) - white.shape[2] * np.log(deviation).sum(axis=-1))
+def _pooled(
+    counts: IntArray, expected: FloatArray, law: FloatArray
+) -> tuple[IntArray, list[tuple[int, bool] | None], list[int | None]]:
+    """A table of the counts (before, first or later, next) of one graph, in which no cell is too rare for chi-square.
+
+    With it of each row the graph before and whether these are first steps only, None: several; of each column the next
+    graph, None: several. ``expected`` (before, 2): steps; ``law``: probabilities of the next graph.
+    """
+    most = float(expected.sum(axis=1).max(initial=0.0))
+    targets: list[int | None] = [int(h) for h in np.flatnonzero(law * most >= MIN_EXPECTED)]
+    rare = [int(h) for h in np.flatnonzero((law > 0.0) & (law * most < MIN_EXPECTED))]
+    columns, shares = [counts[:, :, h] for h in targets], [float(law[h]) for h in targets if h is not None]
+    if law[rare].sum() * most >= MIN_EXPECTED:
+        columns, shares, targets = (
+            [*columns, counts[:, :, rare].sum(axis=2)],
+            [*shares, float(law[rare].sum())],
+            [*targets, None],
+        )
+    if len(columns) < 2:
+        return np.zeros((0, 0), np.int64), [], []
+    seen, enough = np.stack(columns, axis=-1), MIN_EXPECTED / min(shares)
+    rows: list[IntArray] = []
+    labels: list[tuple[int, bool] | None] = []
+    others, steps = np.zeros(len(columns), np.int64), 0.0
+    for before, (first, later) in enumerate(expected.tolist()):
+        if first >= enough and later >= enough:
+            rows, labels = [*rows, *seen[before]], [*labels, (before, True), (before, False)]
+        elif first + later >= enough:
+            rows, labels = [*rows, seen[before].sum(axis=0)], [*labels, (before, False)]
+        else:
+            others, steps = others + seen[before].sum(axis=0), steps + first + later
+    if steps >= enough:
+        rows, labels = [*rows, others], [*labels, None]
+    return np.array(rows).reshape(len(rows), len(columns)), labels, targets

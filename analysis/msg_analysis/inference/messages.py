@@ -153,19 +153,29 @@ class StaleValues(SummedDiagnostic):
         score, information = (each[self._links[:, 0], self._links[:, 1]] for each in self.sums[:2])
         if self.sums[2] < MIN_SAMPLES or not (information > 0.0).any():
             return None
+        # Only positive ones are shares of stale values: one-sided.
         z = score / np.sqrt(np.where(information > 0.0, information, np.inf))
-        row = int(np.argmax(np.abs(z)))
+        row = int(np.argmax(z))
         groups = 2.0 if self.together else 1.0
-        log_p = math.log(2.0 * len(z) * groups) + float(log_normal_tail(abs(z[row])))
+        log_p = math.log(len(z) * groups) + float(log_normal_tail(z[row]))
         receiver, sender = self._links[row].tolist()
         s, j = float(score[row]), float(information[row])
         if self.together:
             all_s, all_j = float(score.sum()), float(information.sum())
-            p_of_all = math.log(2.0 * groups) + float(log_normal_tail(abs(all_s) / math.sqrt(all_j)))
+            p_of_all = math.log(groups) + float(log_normal_tail(all_s / math.sqrt(all_j)))
             if p_of_all < log_p:
                 log_p, receiver, sender, s, j = p_of_all, None, None, all_s, all_j
         error = 1.0 / math.sqrt(j)
-        return Finding(min(0.0, log_p), receiver, sender, estimate=s / j, standard_error=error, expected=0.0)
+        share = min(max(s / j, 0.0), 1.0)
+        return Finding(
+            min(0.0, log_p),
+            receiver,
+            sender,
+            estimate=share,
+            standard_error=error,
+            expected=0.0,
+            possible=(0.0, 1.0),
+        )
 
     def of_sums(self, sums: Sequence[AnyArray]) -> FloatArray:
         """(..., links + 1, K): of each link, and of all together."""
@@ -217,15 +227,16 @@ class Gains(Question):
         if part == "reference":
             at = experiment.reference
             value, interval = at + one.estimate, (at + low, at + high)
-            words = f"the leaders are pulled to {numbers_text(value, interval)}, not to the reference {at:g}"
-            return Cause("reference", words, None, None, None, value, interval, at, p)
+            agent, which = (None, "the leaders are") if what is None else (what + 1, f"agent {what + 1} is")
+            words = f"{which} pulled to {numbers_text(value, interval)}, not to the reference {at:g}"
+            return Cause("reference", words, agent, None, None, value, interval, at, p)
         if part == "offset":
             dt = experiment.step_length
             value, interval = one.estimate / dt, (low / dt, high / dt)
             words = f"agent {what + 1} has an additional drift of {numbers_text(value, interval)} per unit of time"
             return Cause("offset", words, what + 1, None, None, value, interval, 0.0, p)
         if part in ("all", "sender") and -1.2 < one.estimate < 0.0:
-            value, interval = -one.estimate, (max(-high, 0.0), -low)
+            value, interval = min(-one.estimate, 1.0), (max(-high, 0.0), min(-low, 1.0))
             agent = None if part == "all" else what + 1
             whose = "all messages" if agent is None else f"the messages of agent {agent}"
             words = (

@@ -38,7 +38,13 @@ from msg_analysis.inference.question import (
     SummedDiagnostic,
     agent_words,
 )
-from msg_analysis.inference.statistics import log_chi2_below, log_chi2_tail, log_normal_tail, normal_score
+from msg_analysis.inference.statistics import (
+    chi2_quantile,
+    log_chi2_below,
+    log_chi2_tail,
+    log_normal_tail,
+    normal_score,
+)
 
 
 class Noise(Question):
@@ -139,9 +145,10 @@ class NoiseByGraph(SummedDiagnostic):
 
 
 def _variance_finding(log_p: float, ratio: float, numbers: float, agent: int | None, **place: Any) -> Finding:
-    """A sum of squares over its expectation, of so many numbers."""
-    error = ratio * math.sqrt(2.0 / numbers)
-    return Finding(log_p, agent, estimate=ratio, standard_error=error, expected=1.0, **place)
+    """A sum of squares over its expectation, of so many numbers, which are normal: the interval is exact."""
+    error, squares = ratio * math.sqrt(2.0 / numbers), ratio * numbers
+    ends = squares / float(chi2_quantile(0.025, numbers)), squares / float(chi2_quantile(0.975, numbers))
+    return Finding(log_p, agent, estimate=ratio, standard_error=error, expected=1.0, ends=ends, **place)
 
 
 SHARE = 0.1  # of the logarithm of the p-value

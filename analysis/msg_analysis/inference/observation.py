@@ -130,6 +130,7 @@ class Observation:
     lost: BoolArray | None = None  # (N, m, D) see ``Run.lost``
     timers: Timers | None = None  # None in lockstep
     used: IntArray | None = None  # (N, m, D) in lockstep, see ``Run.used``
+    wrong_stamp: tuple[int, int, int] | None = None  # see ``Run.wrong_stamp``
     block_numbers: int = BLOCK_NUMBERS  # of temporary arrays of a block of steps, at most
 
     @classmethod
@@ -155,6 +156,7 @@ class Observation:
             None if lost is None else lost[:steps],
             timers,
             None if used is None or real_time else used[:steps],
+            trajectory.wrong_stamp,
             block_numbers,
         )
 

@@ -18,7 +18,7 @@ import numpy as np
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference import candidates
-from msg_analysis.inference.candidates import Cause, ParameterGroup, Selected, numbers_text, select
+from msg_analysis.inference.candidates import Cause, Correlated, ParameterGroup, Selected, numbers_text, select
 from msg_analysis.inference.e_values import Analyses
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.received_values import ReceivedValues
@@ -98,18 +98,27 @@ class Finding:
     agent: int | None = None  # None: all
     sender: int | None = None  # of a link to the agent
     graph: int | None = None
-    other: int | None = None  # graph that is swapped with it
+    other: int | None = None  # graph that is swapped with it, or that comes next
+    before: int | None = None  # graph that came before
+    renamed: tuple[int, ...] = ()  # (n,) the graph that the log means by each name, where that is so in the whole run
+    replicas: tuple[int, ...] = ()  # whose noise is not independent; empty: all
+    held: bool = False  # whether the agent is a leader of infinite gain
     place: Place | None = None
     span: tuple[int, int | None] | None = None  # lag, or first and last step of a holding time (None: its end)
     estimate: float | None = None
     standard_error: float | None = None
     expected: float | None = None
+    ends: tuple[float, float] | None = None  # of the interval, where that is not normal
+    possible: tuple[float, float] = (-math.inf, math.inf)  # values: no interval goes beyond
 
     @property
     def interval(self) -> tuple[float, float] | None:
         """95 %; None without a standard error."""
-        low, high = Estimate(self.estimate, standard_error=self.standard_error).interval
-        return None if low is None or high is None else (low, high)
+        low, high = self.ends or Estimate(self.estimate, standard_error=self.standard_error).interval
+        if low is None or high is None:
+            return None
+        least, most = self.possible
+        return min(max(low, least), most), min(max(high, least), most)
 
     @property
     def numbers(self) -> str:
@@ -143,6 +152,7 @@ class Search:
         self.residuals, self.transitions, self.loss = evidence.residuals, evidence.transitions, evidence.loss
         self.findings, self.level = findings, level
         self.families = 0  # classes of candidates, all questions together
+        self.renamed: tuple[int, ...] = ()  # of the finding that the names of the graphs are others, once it is a cause
         residuals, loss, broadcast = evidence.residuals, evidence.loss, evidence.broadcast
         self.frozen = candidates.frozen(residuals)
         # Agents whose states are constant are no evidence on gains and noise.
@@ -172,8 +182,25 @@ class Search:
     @cached_property
     def selected_gains(self) -> tuple[list[Selected], FloatArray]:
         """What is found in the regression, and the total change of its coefficients."""
-        group = self.parameters["gains"]
-        return self._select(group) if group else ([], np.zeros(len(self.residuals.terms)))
+        nothing: tuple[list[Selected], FloatArray] = [], np.zeros(len(self.residuals.terms))
+        found = self._select(group) if (group := self.parameters["gains"]) else nothing
+        # In real time correlated noise is in what others receive, and looks like a wrong gain.
+        return nothing if self.experiment.run.pace == "realtime" and self._clearer(found[0]) else found
+
+    def _clearer(self, gains: Sequence[Selected]) -> bool:
+        pairs = min((one.log_p for one in self._correlated), default=1.0)
+        return pairs < min((one.log_p for one in gains), default=0.0)
+
+    @cached_property
+    def _correlated(self) -> list[Correlated]:
+        if self.parameters["noise"] is None:
+            return []
+        return candidates.correlations(self.residuals, self.excluded, self.families, self.level)
+
+    @property
+    def correlated(self) -> list[Correlated]:
+        """Pairs of agents whose noise is; none where wrong gains, which correlate residuals too, are clearer."""
+        return self._correlated if self._clearer(self.selected_gains[0]) else []
 
     @cached_property
     def noise(self) -> ParameterGroup | None:
@@ -293,7 +320,7 @@ class Question:
     @classmethod
     def causes(cls, search: Search) -> list[Cause]:
         """What is wrong."""
-        return [cls.cause_of(one, search) for one in search.selected(cls.parameters)]
+        return [replace(cls.cause_of(one, search), log_p=one.log_p) for one in search.selected(cls.parameters)]
 
     @classmethod
     def cause_of(cls, one: Selected, search: Search) -> Cause:
@@ -356,11 +383,18 @@ class Diagnostic(Question, ABC):
         """The finding, with the names of the graphs."""
 
     @classmethod
-    def cause(cls, found: Finding, names: Sequence[str], p: float) -> Cause:
-        """The finding, with the names of the graphs and its adjusted p."""
+    def explains_others(cls, found: Finding) -> bool:
+        """Whether all other causes were computed from what this finding says is wrong."""
+        del found
+        return False
+
+    @classmethod
+    def cause(cls, found: Finding, names: Sequence[str], log_p: float) -> Cause:
+        """The finding, with the names of the graphs and the logarithm of its adjusted p."""
         agent = None if found.agent is None else found.agent + 1
         link = None if found.sender is None or agent is None else (found.sender + 1, agent)
-        graphs = [names[graph] for graph in (found.graph, found.other) if graph is not None]
+        graphs = [names[graph] for graph in (found.before, found.graph, found.other) if graph is not None]
+        graphs += [names[graph] for graph, meant in enumerate(found.renamed) if meant != graph]
         return Cause(
             kind=cls.kind,
             words=cls.words(found, names),
@@ -370,7 +404,8 @@ class Diagnostic(Question, ABC):
             estimate=found.estimate,
             interval=found.interval,
             expected=found.expected,
-            p=p,
+            p=math.exp(log_p),
+            log_p=None if log_p == -math.inf else log_p,
             steps=(found.place.first, found.place.last) if found.place else None,
         )
 

@@ -12,8 +12,10 @@ import numpy as np
 
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.inference.candidates import Cause
-from msg_analysis.inference.dependence import ConstantState, LongLags, Whiteness
-from msg_analysis.inference.graphs import HoldingTimes, SwappedGraphs, Switching
+from msg_analysis.inference.dependence import ConstantState, LongLags, Replicas, Whiteness
+from msg_analysis.inference.exact_values import Stamps, Start, WithoutNoise
+from msg_analysis.inference.graph_names import SwappedGraphs
+from msg_analysis.inference.graphs import HoldingTimes, SecondOrder, Switching
 from msg_analysis.inference.messages import Broadcast, CommonGain, Gains, MessageLosses, StaleValues
 from msg_analysis.inference.noise import LargestResidual, Noise, NoiseByGraph, NoiseOverTime
 from msg_analysis.inference.question import Diagnostic, Question, Search, Statistics, Test
@@ -30,15 +32,20 @@ QUESTIONS: tuple[type[Question], ...] = (
     CommonGain,
     Switching,
     HoldingTimes,
+    SecondOrder,
     NoiseByGraph,
     NoiseOverTime,
     ConstantState,
     LargestResidual,
     LongLags,
+    Replicas,
     StaleValues,
     SwappedGraphs,
     MessageLosses,
     Broadcast,
+    WithoutNoise,
+    Start,
+    Stamps,
     RunsAlike,
 )
 
@@ -76,42 +83,39 @@ def causes_of(search: Search, rejected: Sequence[str]) -> list[Cause]:
     """What is wrong with runs that disagree: agents with a constant state first, then by p-value; never empty."""
     # The classes of all questions count before anything is selected.
     search.families = sum(question.classes(search) for question in QUESTIONS)
-    found = [cause for question in QUESTIONS for cause in question.causes(search)]
-    found += [cause for chain in (True, False) for cause in _clearest(search, found, about_chain=chain)]
+    # The steps decide what the names of the graphs mean, and so how often which graph came after which.
+    found = [cause for chain in (False, True) for cause in _causes(search, about_chain=chain)]
     if not found:
         return [_unknown(rejected)]
-    return sorted(found, key=lambda cause: (cause.kind != "frozen", cause.p or 0.0))
+    return sorted(found, key=lambda cause: (cause.kind != "frozen", cause.order))
 
 
-ABOUT_THE_CHAIN = ("switching", "holding times")  # kinds of causes
-
-
-def _clearest(search: Search, others: Sequence[Cause], *, about_chain: bool) -> list[Cause]:
-    """The clearest finding of the diagnostics, where it is clearer than all ``others``, which concern the whole run."""
+def _causes(search: Search, *, about_chain: bool) -> list[Cause]:
+    """What concerns the whole run, and the clearest finding of the diagnostics, where that is clearer."""
     # One fault has many effects, so only one finding about the steps is a cause, and one about the graphs.
-    findings = [
-        (search.findings[question.name], question)
-        for question in QUESTIONS
-        if issubclass(question, Diagnostic) and question.about_chain == about_chain and question.name in search.findings
-    ]
-    if not findings:
-        return []
-    best, question = min(findings, key=lambda one: one[0].log_p)
+    asked = [question for question in QUESTIONS if question.about_chain == about_chain]
+    whole = [cause for question in asked for cause in question.causes(search)]
+    findings = [(search.findings[each.name], each) for each in asked if each.name in search.findings]
+    certain = [(found, each) for found, each in findings if issubclass(each, Diagnostic) and found.log_p == -math.inf]
+    others = [(found, each) for found, each in findings if issubclass(each, Diagnostic) and found.log_p > -math.inf]
+    exact = [question.cause(found, search.names, -math.inf) for found, question in certain]
+    if not others:
+        return exact + whole
+    best, question = min(others, key=lambda one: one[0].log_p)
     log_p = best.log_p + math.log(search.families)
-    rivals = [cause.p or 0.0 for cause in others if (cause.kind in ABOUT_THE_CHAIN) == about_chain]
-    if log_p < math.log(search.level) and math.exp(log_p) < min(rivals, default=1.0):
-        return [question.cause(best, search.names, math.exp(log_p))]
-    return []
+    if log_p >= min([math.log(search.level), *(cause.order for cause in whole)]):
+        return exact + whole
+    if question.explains_others(best):
+        search.renamed, whole = best.renamed, []
+    return [*exact, question.cause(best, search.names, log_p), *whole]
 
 
 def _unknown(rejected: Sequence[str]) -> Cause:
     names = ", ".join(rejected)
     if list(rejected) == [Whiteness.name]:
         words = "the noise of successive steps or of replicas is correlated: random numbers are used twice"
-    elif all(name.startswith((SystemMeanError.name, Covariance.name)) for name in rejected) or all(
-        name.startswith(AgentMeanErrors.name) for name in rejected
-    ):
-        words = f"the steps follow the law, but the errors differ: chance, or another start than in the file ({names})"
+    elif all(name.startswith((SystemMeanError.name, AgentMeanErrors.name, Covariance.name)) for name in rejected):
+        words = f"start and steps follow the law, but the errors differ: probably by chance ({names})"
     else:
         words = f"no single cause that is searched for explains the rejected tests ({names})"
     return Cause("unknown", words)

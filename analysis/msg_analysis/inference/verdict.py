@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,9 +21,10 @@ from msg_analysis.inference.estimates import CovarianceTest, Estimate, covarianc
 from msg_analysis.inference.event_order import order_events
 from msg_analysis.inference.evidence_sums import AnyTimeEvidence, WatchedEvidence, any_time_evidence
 from msg_analysis.inference.fault_power import run_power
+from msg_analysis.inference.exact_values import exact_findings, of_runs
 from msg_analysis.inference.given_path import GivenPath, means_given_path
 from msg_analysis.inference.observation import Measurement, Observation, spaced_steps
-from msg_analysis.inference.question import Search, Statistics
+from msg_analysis.inference.question import Finding, Search, Statistics
 from msg_analysis.inference.questions import causes_of, decide
 from msg_analysis.inference.realtime_laws import Laws, means_in_lockstep, measure_laws
 from msg_analysis.inference.residuals import BroadcastSums, ResidualSums
@@ -51,6 +53,7 @@ class Evidence:
     loss: LossTally | None  # None without loss
     broadcast: BroadcastSums | None  # None without broadcast noise
     watched: WatchedEvidence  # what holds at any time
+    exact: tuple[Mapping[str, Finding], ...]  # of each run, see ``exact_findings``
     timing: Timing | None = None  # of one run in real time
     laws: Laws | None = None  # of one run in real time
 
@@ -89,6 +92,9 @@ class Evidence:
             loss=LossTally.of(observation),
             broadcast=BroadcastSums.of(observation),
             watched=watched,
+            exact=(
+                exact_findings(observation.states[0], observation.start, observation.wrong_stamp, observation.step.dt),
+            ),
             timing=timing,
             laws=laws,
         )
@@ -111,6 +117,7 @@ class Evidence:
             decisive=self.decisive and other.decisive,
             given=given,
             transitions=self.transitions.merged(other.transitions),
+            exact=self.exact + other.exact,
             timing=None,
             laws=None,
         )
@@ -196,7 +203,7 @@ def evaluate(
         p_switching=switching.p,
         p_loss=loss.p if loss else None,
         p_broadcast=evidence.broadcast.p_value() if evidence.broadcast else None,
-        findings=evidence.watched.sums.findings(),
+        findings=evidence.watched.sums.findings() | of_runs(evidence.exact),
         p_alike=p_alike,
     )
     families = evidence.watched.sums.families()
@@ -263,6 +270,7 @@ def _measured(trajectory: Run, level: float, unpredicted: str, block_numbers: in
             unpredicted=unpredicted,
         )
     switching, loss = Transitions.of(measurement.modes, step.modes).test(step.transition), loss_test(measurement)
+    exact = exact_findings(trajectory.states[0], trajectory.record.start, trajectory.wrong_stamp, step.dt)
     return Comparison(
         trajectory=trajectory,
         level=level,
@@ -272,7 +280,7 @@ def _measured(trajectory: Run, level: float, unpredicted: str, block_numbers: in
         covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
         switching=switching,
         batch=batch_interval(series),
-        tests=decide(Statistics(p_switching=switching.p, p_loss=loss.p if loss else None), level),
+        tests=decide(Statistics(p_switching=switching.p, p_loss=loss.p if loss else None, findings=exact), level),
         running=_running(series, None, step.dt, measurement.first),
         loss=loss,
         unpredicted=unpredicted,

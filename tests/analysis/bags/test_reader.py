@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from experiments import Run, check, compare, read_bag, write_trajectory
+from experiments import Run, check, compare, line_ring, read_bag, simulate, write_trajectory
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.messages.acceptance import Refusal
@@ -95,6 +95,20 @@ def test_what_is_missing(tmp_path: Path, make_run: MakeRun) -> None:
     assert np.isnan(found.states[[5, 40], [1, 2]]).all()
     assert found.prefix == 4
     assert np.array_equal(found.states[found.present], run.states[found.present])
+
+
+def test_stamps_in_lockstep(tmp_path: Path) -> None:
+    """Of two wrong ones, the first step is named by both commands."""
+    run = simulate(line_ring(3, 1e-9, run={"duration": 10}))
+    wrong = {_state(run, k, i).encode(): _state(run, k, i, stamp=k * STEP + 1).encode() for k, i in ((30, 0), (7, 1))}
+    messages = [(topic, kind, wrong.get(data, data), time) for topic, kind, data, time in _messages(run)]
+    found = read_bag(_mcap(tmp_path / "x.mcap", messages))
+    words = "agent 2 at step 7: stamped 0.350000001 s of simulated time, expected 0.35 s"
+    assert (found.wrong_stamp, check(found).difference) == ((7, 1, 7 * STEP + 1), words)
+    result = compare(found)
+    assert (result.verdict, [test.name for test in result.tests if test.rejected]) == ("disagrees", ["stamps"])
+    (cause,) = result.causes
+    assert (cause.kind, cause.agent, cause.steps, cause.expected) == ("stamps", 2, (7, 7), 0.35)
 
 
 def test_gaps_and_overlaps_of_sojourns(tmp_path: Path, make_run: MakeRun) -> None:

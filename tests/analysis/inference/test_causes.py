@@ -9,6 +9,7 @@ from scipy import optimize, stats
 from experiments import Experiment, RunRecord, compare, new_record, simulate
 from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.inference.candidates import Candidate, find_rates, select
+from msg_analysis.twin.simulate import states_of_all
 
 PAIRS = {"line": [(1, 2), (2, 3), (3, 4)], "ring": [(1, 2), (2, 3), (3, 4), (4, 1)]}
 
@@ -126,13 +127,114 @@ def test_two_faults_are_both_found():
     assert {(cause.kind, cause.agent, cause.link) for cause in causes} == {("noise", 2, None), ("gain", None, (2, 3))}
 
 
-def test_copied_noise_is_named():
-    trajectory = misrecorded(BASE)
-    trajectory.states[:] = trajectory.states[:, :, :1]
-    trajectory.record.start[:] = trajectory.record.start[:, :1]
-    result = compare(trajectory)
-    assert result.verdict == "disagrees"
-    assert any("is correlated" in cause.words or cause.kind != "unknown" for cause in result.causes)
+THREE = BASE | {
+    "graphs": graphs() | {"star": {"star": {"center": 1}}},
+    "switching": {"generator": [[-1.0, 0.5, 0.5], [0.2, -0.4, 0.2], [1.0, 1.0, -2.0]]},
+}
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_correlated_noise_in_real_time(sign, seed):
+    """It is in what is received, but it is no gain, and no share of stale values below 0."""
+    claimed = BASE | {"run": BASE["run"] | {"pace": "realtime", "seed": seed}}
+    both = noise(process=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0.3 * sign, 0.91**0.5, 0], [0, 0, 0, 1]])
+    causes = compare(misrecorded(claimed | both, claimed)).causes
+    assert [(cause.kind, cause.link) for cause in causes] == [("correlation", (2, 3))]
+
+
+@pytest.mark.parametrize(
+    ("claimed", "means", "names"),
+    [
+        (BASE, [1, 0], ["line", "ring"]),
+        (TRACKING, [1, 0], ["line", "ring"]),
+        (THREE, [2, 1, 0], ["line", "star"]),
+        (THREE, [1, 2, 0], ["line", "ring", "star"]),
+    ],
+)
+def test_names_of_the_graphs_in_the_whole_run(claimed, means, names):
+    """All other causes, as gains and rates, follow from it; whichever law of the chain, names or rates, is right."""
+    run = simulate(Experiment.parse(claimed | {"run": claimed["run"] | {"replicas": 2}}))
+    (cause,) = compare(dataclasses.replace(run, modes=np.argsort(means)[run.modes])).causes
+    assert (cause.kind, cause.graph, cause.p) == ("graph", names, pytest.approx(0.0, abs=1e-9))
+    assert cause.words.startswith("the log has the names of the graphs ")
+    assert "in the whole run" in cause.words
+
+
+@pytest.mark.parametrize("alike", [range(32), [2, 5]])
+def test_replicas_that_are_alike(alike):
+    run = misrecorded(BASE)
+    for values in (run.states, run.record.start):
+        values[..., alike] = values[..., [alike[0]]]
+    result = compare(run)
+    (cause,) = result.causes
+    which = "all replicas" if len(alike) > 2 else "replicas 3 and 6"
+    assert (cause.kind, cause.agent, cause.estimate) == ("replicas", None, pytest.approx(1.0))
+    assert cause.interval[1] <= 1.0
+    assert cause.words.startswith(f"the noise of {which} has correlation 1.00 (1.00 to 1.00), not 0")
+    assert result.any_time.exceeded
+    assert "replicas" in result.any_time.questions[0][0]
+
+
+CHAIN = [[0.5, 0.25, 0.25], [0.3, 0.5, 0.2], [0.2, 0.2, 0.6]]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_chain_of_second_order(seed):
+    """After a jump the graph seldom goes back to where it came from; each graph comes as often as before."""
+    truth = BASE | {
+        "graphs": THREE["graphs"],
+        "time": "discrete",
+        "switching": {"transition": CHAIN},
+        "run": {"duration": 3000, "replicas": 1, "seed": seed},
+    }
+    record = new_record(Experiment.parse(truth))
+    random, path = np.random.default_rng(seed), [0, 1]
+    while len(path) < 3000:
+        before, now = path[-2:]
+        law = np.array(CHAIN[now])
+        if before != now:
+            law[[before, 3 - before - now]] += [-0.12, 0.12]
+        path.append(int(random.choice(3, p=law)))
+    modes, model = np.array(path), record.model
+    states = np.concatenate([record.start[None], *states_of_all(record.experiment, model, modes, record.start)])
+    run = dataclasses.replace(simulate(record.experiment, record=record), states=states, modes=modes)
+    result = compare(run)
+    first = result.causes[0]
+    assert (first.kind, len(first.graph)) == ("second order", 3)
+    low, high = first.interval
+    assert 0.0 <= low < first.estimate < high <= 1.0
+    assert not low < first.expected < high
+    assert [test.name for test in result.tests if test.rejected] == ["graph before"]
+
+
+def test_another_start_than_in_the_record():
+    run = simulate(Experiment.parse(BASE | {"run": BASE["run"] | {"start": [0.0, 1.0, 2.0, 3.0]}}))
+    run.record.start[2, 1] = 2.5
+    result = compare(run)
+    assert [test.name for test in result.tests if test.rejected and "error" not in test.name] == ["start"]
+    first = result.causes[0]
+    assert (first.kind, first.agent, first.estimate, first.expected) == ("start", 3, 2.0, 2.5)
+    assert first.words == "agent 3, replica 2, starts at 2.0, not at 2.5 as in the record of the run"
+
+
+@pytest.mark.parametrize("time", ["continuous", "discrete"])
+def test_a_held_leader_off_its_reference(time):
+    """In discrete time it has noise; the other leader is right."""
+    chain = {"discrete": {"time": "discrete", "switching": {"transition": [[0.5, 0.5], [0.5, 0.5]]}}}.get(time, {})
+    document = TRACKING | chain | {"leaders": {"agents": [1, 3], "gain": "inf", "reference": 2.0}}
+    experiment = Experiment.parse(document | {"run": {"duration": 400 if chain else 40, "replicas": 4}})
+    run = simulate(experiment)
+    offsets = np.repeat(run.record.model.offsets, 1, axis=0)
+    offsets[:, 2] += 0.3
+    changed = dataclasses.replace(run.record.model, offsets=offsets)
+    blocks = states_of_all(experiment, changed, run.modes, run.record.start)
+    causes = compare(dataclasses.replace(run, states=np.concatenate([run.states[:1], *blocks]))).causes
+    first = causes[0]
+    assert (first.kind, first.agent, first.expected) == ("reference", 3, 2.0)
+    assert first.estimate == pytest.approx(2.3, abs=0.1)
+    assert "not " in first.words
+    assert "the reference 2" in first.words
 
 
 def test_a_forbidden_jump():

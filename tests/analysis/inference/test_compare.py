@@ -135,7 +135,7 @@ def test_document(short_run):
     assert document["continuous"]["system_error"] == pytest.approx(1.3594132029339856, rel=1e-8)
     assert len(document["batch_means"]["interval"]) == 2
     # Too few holding periods for a test of these.
-    assert [test["rejected"] for test in document["tests"]] == [False] * 19
+    assert [test["rejected"] for test in document["tests"]] == [False] * 20
     running = result.running
     assert len(running["time"]) == len(running["system_error"]) == len(running["standard_error"]) <= 400
     last = [running[key][-1] for key in ("time", "system_error", "standard_error")]

@@ -14,9 +14,10 @@ from scipy import stats
 from tests.support.watched_run import sums_of
 
 from experiments import Observation, chain_path, compare, five, observed, simulate
-from msg_analysis.inference.dependence import ConstantState, LongLags
+from msg_analysis.inference.dependence import ConstantState, LongLags, Replicas
 from msg_analysis.inference.e_values import Analyses, WindowEvidence, Windows, variance_evidence
-from msg_analysis.inference.graphs import PARTS, HoldingTimes, SwappedGraphs
+from msg_analysis.inference.graph_names import SwappedGraphs
+from msg_analysis.inference.graphs import PARTS, HoldingTimes, SecondOrder
 from msg_analysis.inference.messages import StaleValues
 from msg_analysis.inference.noise import LargestResidual, NoiseByGraph, NoiseOverTime
 from msg_analysis.inference.question import Diagnostic
@@ -278,8 +279,8 @@ def test_stale_values(changes: dict[str, Any]) -> None:
     assert sums.sums[0] == pytest.approx(score, abs=1e-9)
     assert sums.sums[1] == pytest.approx(information)
     links = information > 0.0
-    p = 2 * stats.norm.sf(np.abs(score[links] / np.sqrt(information[links]))) * 2 * links.sum()
-    common = 2 * stats.norm.sf(abs(score.sum()) / np.sqrt(information.sum())) * 2
+    p = stats.norm.sf(score[links] / np.sqrt(information[links])) * 2 * links.sum()
+    common = stats.norm.sf(score.sum() / np.sqrt(information.sum())) * 2
     assert np.exp(sums.finding().log_p) == pytest.approx(min(1.0, common, *p))
 
 
@@ -295,9 +296,79 @@ def test_swapped_graphs() -> None:
     counts = Counter(level for level, _ in windows_of(100))
     mean = sum(np.exp(ratios[f : f + 2**level].sum()) / (7 * counts[level]) for level, f in windows_of(100))
     assert np.exp(sums.logarithms()[0, 0]) == pytest.approx(mean)
-    assert np.exp(sums.finding().log_p) == pytest.approx(min(1.0, 1.0 / mean))
+    assert np.exp(sums.logarithms()[1, 0]) == pytest.approx(whole := np.exp(ratios.sum()))
+    assert np.exp(sums.finding().log_p) == pytest.approx(min(1.0, 2.0 / (mean + whole)))
     with_losses = summed(seen(noise=AIR), SwappedGraphs)
     assert (with_losses.finding(), with_losses.logarithms().size) == (None, 0)
+
+
+def second_order(path: np.ndarray, size: int = 10**6) -> SecondOrder:
+    """Of a path of graphs with the law ``FAST``, counted in blocks of so many steps."""
+    step = SimpleNamespace(transition=np.array(FAST), modes=3, agents=1)
+    sums = SecondOrder(SimpleNamespace(step=step, noisy=np.ones(1, dtype=bool), apart=True, graphs="abc"))  # type: ignore[arg-type]
+    for first in range(0, len(path), size):
+        graphs = path[first : first + size + 1]
+        sums.add(SimpleNamespace(graphs=graphs, analyses=Analyses(np.array([len(graphs)]))))  # type: ignore[arg-type]
+    return sums
+
+
+FAST = [[0.1, 0.6, 0.3], [0.3, 0.2, 0.5], [0.5, 0.3, 0.2]]
+
+
+def test_second_order_by_a_loop_and_its_statistic_by_tables() -> None:
+    path = chain_path(FAST, 30_000, 3)
+    sums, tables, before = second_order(path, 50), np.zeros((3, 2, 3, 3)), None
+    for k in range(1, len(path) - 1):
+        entered = path[k] != path[k - 1]
+        before = path[k - 1] if entered else before
+        tables[before, int(not entered), path[k], path[k + 1]] += before is not None
+    assert (sums.sums[0] == tables).all()
+    total = dof = 0.0
+    for g in range(3):  # of each graph a table of the next one, by the graph before, first and later steps apart
+        rows = tables[[f for f in range(3) if f != g], :, g].reshape(4, 3)
+        chi2, _, degrees, _ = stats.chi2_contingency(rows, lambda_="log-likelihood")
+        total, dof = total + chi2, dof + degrees
+    assert sums.finding().log_p == pytest.approx(stats.chi2.logsf(total, dof))
+
+
+def test_second_order_of_right_chains() -> None:
+    """200 paths; Kolmogorov-Smirnov at 1e-4, and the evidence passes 20 in 5 % at most (binomial at 1e-4)."""
+    found = [second_order(chain_path(FAST, 600, seed)) for seed in range(200)]
+    assert stats.kstest([np.exp(each.finding().log_p) for each in found], "uniform").pvalue > 1e-4
+    passed = sum(np.exp(each.logarithms()).mean() >= 20.0 for each in found)
+    assert passed <= stats.binom.isf(1e-4, 200, 0.05)
+
+
+def test_replicas_by_a_loop() -> None:
+    """Each residual on the sum of those of earlier replicas, by agent, and two replicas on each other."""
+    observation = seen(duration=5.0, run={"replicas": 4})
+    sums, white = summed(observation, Replicas), whitened(observation)
+    score, information, pairs = np.zeros(5), np.zeros(5), np.zeros((4, 4))
+    for step in white:
+        for r in range(4):
+            earlier = step[:, :r].sum(axis=1)
+            score, information = score + step[:, r] * earlier, information + earlier**2
+            pairs[r] += step[:, r] @ step
+    assert sums.sums[0] == pytest.approx(score)
+    assert sums.sums[1] == pytest.approx(information)
+    assert sums.sums[3] == pytest.approx(pairs)
+    z = [score / np.sqrt(information), score.sum() / np.sqrt(information.sum())]
+    z.append([pairs[r, s] / np.sqrt(pairs[s, s]) for r in range(4) for s in range(r)])
+    p = min(2.0 * stats.norm.sf(np.max(np.abs(each))) * np.size(each) * 3 for each in z)
+    assert np.exp(sums.finding().log_p) == pytest.approx(min(1.0, p))
+
+
+def test_intervals_are_possible_values() -> None:
+    """Of a variance by the chi-square law, of shares within 0 and 1."""
+    observation = seen(duration=0.5)
+    found, white = summed(observation, NoiseByGraph).finding(), whitened(observation)
+    at = observation.modes == found.graph
+    squares = white[at] ** 2 if found.agent is None else white[at][:, found.agent] ** 2
+    ends = squares.sum() / stats.chi2.ppf([0.975, 0.025], squares.size)
+    assert found.interval == pytest.approx(tuple(ends))
+    stale = summed(observation, StaleValues)
+    stale.sums[2] = np.array(1000)
+    assert 0.0 <= stale.finding().interval[0] <= stale.finding().interval[1] <= 1.0
 
 
 def test_runs_are_merged() -> None:

@@ -103,8 +103,8 @@ def powers(experiment: Experiment, *faults: Fault) -> list[FaultPower]:
 def test_noise_is_the_divergence_of_normal_laws() -> None:
     (found,) = powers(line_ring(replicas=3), Fault("noise", 1.1))
     assert found.tests == [StepInformation("residuals: covariance", 15, pytest.approx(3 * (0.1 - math.log(1.1))))]
-    x = scipy.stats.chi2.isf(0.01 / 20, 15)
-    assert found.level == pytest.approx(0.01 / 20)
+    x = scipy.stats.chi2.isf(0.01 / 21, 15)
+    assert found.level == pytest.approx(0.01 / 21)
     assert found.power(5000) == pytest.approx(scipy.stats.ncx2.sf(x, 15, 15000 * (0.1 - math.log(1.1))), rel=1e-6)
     assert found.power(found.steps()) == pytest.approx(0.99, abs=1e-6)
     assert found.power(found.steps(0.5)) == pytest.approx(0.5, abs=1e-6)

@@ -114,7 +114,15 @@ def test_regression_frees_innovations_of_those_made_before():
 
 IN_DETAIL = [
     f"residuals: {what}"
-    for what in ("noise by graph", "noise over time", "constant state", "largest", "lags to 100", "stale values")
+    for what in (
+        "noise by graph",
+        "noise over time",
+        "constant state",
+        "largest",
+        "lags to 100",
+        "replicas",
+        "stale values",
+    )
 ]
 
 
