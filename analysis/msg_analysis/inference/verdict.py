@@ -20,8 +20,8 @@ from msg_analysis.inference.e_values import log_mean
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates, rank_agents
 from msg_analysis.inference.event_order import order_events
 from msg_analysis.inference.evidence_sums import AnyTimeEvidence, WatchedEvidence, any_time_evidence
-from msg_analysis.inference.fault_power import run_power
 from msg_analysis.inference.exact_values import exact_findings, of_runs
+from msg_analysis.inference.fault_power import run_power
 from msg_analysis.inference.given_path import GivenPath, means_given_path
 from msg_analysis.inference.observation import Measurement, Observation, spaced_steps
 from msg_analysis.inference.question import Finding, Search, Statistics
