@@ -17,13 +17,14 @@ import numpy as np
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
 from msg_analysis.theory import packed_symmetric
-from msg_analysis.theory.coupled_equations import MAX_RELATIVE_ERROR, SolverReport
+from msg_analysis.theory.coupled_equations import MAX_RELATIVE_ERROR, SolverReport, singular_message
 from msg_analysis.theory.first_steps import Start
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.solvers import MAX_ITERATIONS, DenseSolver, IterativeSolver
 
 MARGIN = 8.0  # of the estimated effect of rounding, see docs/accuracy.md
 MAX_KEPT = 1_000_000  # numbers of adjoint solutions that a solver keeps, at most
+MAX_BOUNDED = 5_000  # numbers of second moments whose error is bounded: it takes a second solve
 MAX_FALLBACK = 1000  # unknowns up to which equations that do not converge are solved densely
 
 
@@ -44,6 +45,7 @@ class MomentSolver:
         *,
         guess: FloatArray | None = None,
         most_dense: int = MAX_FALLBACK,
+        most_bounded: int = MAX_BOUNDED,
         most_kept: int = MAX_KEPT,
         most_iterations: int = MAX_ITERATIONS,
     ) -> None:
@@ -54,6 +56,7 @@ class MomentSolver:
             )
         self.system = system
         self.report: SolverReport | None = None  # how the steady state was found
+        self._most_bounded = most_bounded
         self._most_kept, self._duals = most_kept, dict[bytes, FloatArray]()
         unknowns = system.modes * packed_symmetric.size(system.dimension)
         self._dense_too = unknowns <= most_dense
@@ -75,8 +78,30 @@ class MomentSolver:
             )
         report = self._solver.report
         assert report is not None
-        self.report = replace(report, error=max(report.error, _rounding(self.system, moments)))
+        self.report = report = replace(report, error=max(report.error, self._rounding(moments)))
+        # Not ">": NaN must be refused, too.
+        if not report.error <= MAX_RELATIVE_ERROR:
+            raise InputError(singular_message(f" (rounding may leave a relative error of {report.error:.1e})"))
         return moments
+
+    def _rounding(self, moments: FloatArray) -> float:
+        """Relative error that rounding of Z_i or W_i may leave, whatever the method, in the worst graph.
+
+        The rounding of a term of the equations is at most r_i I, and the solution is monotone in the noise: so what it
+        changes is at most the solution for the noise r_i I. Where this takes long, the ratio of the noises is taken.
+        """
+        system, law = self.system, self.system.stationary
+        if not system.noise.any():
+            return 0.0
+        sizes = np.linalg.norm(moments, 2, axis=(1, 2))
+        terms = 2.0 * np.linalg.norm(system.matrices, 2, axis=(1, 2)) * sizes / law
+        if system.lossy:
+            terms += np.linalg.norm(system.lost(moments), 2, axis=(1, 2)) / law
+        rounded = MARGIN * float(np.finfo(float).eps) * terms
+        if moments.size > self._most_bounded:
+            return float(law @ rounded / (law @ np.linalg.norm(system.noise, axis=(1, 2))))
+        left = self._solved(lambda solver: solver.steady(rounded[:, None, None] * np.eye(system.dimension)))
+        return float((np.linalg.norm(left, 2, axis=(1, 2)) / sizes).max())
 
     def dual(self, forms: FloatArray) -> FloatArray:
         """(q, n, d, d): the adjoint solutions Y of the symmetric forms H (q, d, d); read-only where they are kept.
@@ -102,15 +127,6 @@ class MomentSolver:
                 raise
         self._solver = DenseSolver(self.system)
         return solve(self._solver)
-
-
-def _rounding(system: JumpSystem, moments: FloatArray) -> float:
-    """Relative error that rounding of Z_i or W_i may leave, whatever the method: terms of the equations over noise."""
-    law = system.stationary
-    size = float((np.linalg.norm(moments, axis=(1, 2)) / law).max(initial=0.0))
-    terms = 2.0 * float(law @ np.linalg.norm(system.matrices, np.inf, axis=(1, 2))) * size
-    noise = float(law @ np.linalg.norm(system.noise, axis=(1, 2)))
-    return MARGIN * float(np.finfo(float).eps) * terms / noise if noise > 0.0 else 0.0
 
 
 def mode_potential(system: JumpSystem, dual: FloatArray) -> tuple[FloatArray, FloatArray]:

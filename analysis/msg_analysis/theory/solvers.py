@@ -123,10 +123,11 @@ class DenseSolver:
         self.report: SolverReport | None = None
         self._check(float(np.finfo(float).eps))
 
-    def steady(self) -> FloatArray:
-        """See ``MomentSolver.steady``."""
+    def steady(self, noise: FloatArray | None = None) -> FloatArray:
+        """See ``IterativeSolver.steady``."""
         system = self._system
-        weighted = packed_symmetric.pack(system.stationary[:, None, None] * system.noise)
+        noise = system.noise if noise is None else noise
+        weighted = packed_symmetric.pack(system.stationary[:, None, None] * noise)
         right = weighted.copy() if system.time == "continuous" else system.chain.T @ weighted
         right[-1] = weighted.sum(axis=0)
         solution, self.report = self._solve(right.reshape(-1, 1) * self._scale[:, None], trans=0)

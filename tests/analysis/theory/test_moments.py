@@ -104,9 +104,10 @@ def test_the_claimed_error_is_what_rounding_of_the_matrices_may_leave(noise):
     solver = MomentSolver(JumpSystem("continuous", *stacks, gamma, law, np.eye(2)))
     assert solver.report is None
     np.testing.assert_allclose(solver.steady(), moments, rtol=1e-9, atol=1e-15 * noise)
-    terms = 2.0 * (0.75 * 1.0 + 0.25 * 3.0) * max(np.linalg.norm(c) / p for c, p in zip(moments, law, strict=True))
-    sizes = np.linalg.norm(q, axis=1)
-    expected = 8.0 * 2.0**-52 * terms / (0.75 * sizes[0] + 0.25 * sizes[1]) if noise else 0.0
+    sizes = np.abs(moments).max(axis=(1, 2))
+    rounded = 8.0 * 2.0**-52 * 2.0 * np.array([1.0, 3.0]) * sizes / law
+    left = np.array([np.linalg.solve(2.0 * np.diag(z) - gamma.T, law * rounded) for z in drift.T])
+    expected = (left.max(axis=0) / sizes).max() if noise else 0.0
     assert solver.report.error == pytest.approx(expected, rel=1e-6, abs=0.0)
 
 

@@ -10,6 +10,7 @@ import pytest
 import scipy.linalg
 from digits import DIGITS, exactly, solve
 
+from experiments import TRACKING, line_ring, predict
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.markov_chain import stationary_law
 from msg_analysis.theory.jump_system import JumpSystem
@@ -142,6 +143,57 @@ def test_the_claimed_error_covers_the_true_one(claimed_error, steps, decades, mo
             true, claimed = claimed_error.errors(experiment, steps=steps)
         except InputError:  # the graphs do not connect the agents, or the solver refuses the equations
             continue
-        assert true <= 10.0 * claimed <= most, seed
+        assert true <= claimed <= most, seed
         solved += 1
-    assert solved >= 12
+    assert solved >= 8  # with 12 decades, twelve are refused
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "noise", [{"loss": 0.9}, {"loss": 0.5, "on_loss": "hold", "broadcast": 0.1}, {"loss": 0.5, "link": 0.5, "delay": 1}]
+)
+def test_the_claimed_error_is_no_smaller_than_the_true_one(noise, seed):
+    """Little noise in the slow direction: the same equations in 28 digits."""
+    random = np.random.default_rng(seed)
+    weak, weight = (10.0 ** random.uniform(-5.0, -1.0, 2)).tolist()
+    noise = {**noise, "process": [1.0, weak]}
+    graphs = {"a": {"path": [1, 2]}, "b": {"arcs": [[1, 2, weight]]}}
+    found = predict(line_ring(2, 10.0 ** random.uniform(-5.0, 0.0), graphs=graphs, noise=noise, **TRACKING))
+    system, steady = found.system, found.steady
+    matrices, chain, covariances, law = (
+        exactly(part) for part in (system.matrices, system.chain, system.noise, system.stationary)
+    )
+    size = steady.size
+
+    def after(moments):
+        moved = matrices @ moments @ matrices.swapaxes(1, 2)
+        if system.losses is not None:
+            into, seen = exactly(system.losses.into), exactly(system.losses.differences)
+            sizes = ((seen @ moments) * seen).sum(axis=-1)[..., None]
+            if system.losses.chain is not None:
+                sizes = exactly(system.losses.chain) @ sizes
+            moved = moved + into.swapaxes(1, 2) @ (sizes * into)
+        elif system.loss_variance is not None:
+            lift = exactly(system.lift)
+            full = lift @ moments @ lift.T
+            own = np.diagonal(full, axis1=1, axis2=2)
+            squares = own[:, :, None] + own[:, None, :] - 2 * full
+            spread = (exactly(system.loss_variance) * squares).sum(axis=-1)
+            moved = moved + lift.T @ (spread[..., None] * lift)
+        return np.tensordot(chain.T, moved, axes=1)
+
+    basis = exactly(np.eye(size)).reshape(size, *steady.shape)
+    equations = np.array([(one - after(one)).ravel() for one in basis], dtype=object).T
+    right = np.tensordot(chain.T, law[:, None, None] * covariances, axes=1).ravel()
+    true = solve(equations, right).reshape(steady.shape).astype(float)
+    error = np.linalg.norm(steady - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
+    assert error.max() <= found.emulated.solver.error <= 1e-6
+
+
+@pytest.mark.parametrize("noise", [1.0, {"process": 1.0, "loss": 0.5, "on_loss": "hold"}, {"process": 1.0, "delay": 2}])
+def test_what_rounding_may_change_by_more_than_a_millionth_is_refused(noise):
+    graphs = {"a": {"edges": [[1, 2], [3, 4]]}, "b": {"edges": [[2, 3]]}}
+    noise = noise if isinstance(noise, dict) else {"process": noise}
+    assert predict(line_ring(4, 1e-5, graphs=graphs, noise=noise)).emulated.solver.error <= 1e-6
+    with pytest.raises(InputError, match=r"rounding may leave a relative error of [0-9.]+e-0"):
+        predict(line_ring(4, 1e-9, graphs=graphs, noise=noise))
