@@ -20,7 +20,6 @@ from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import HALF_WIDTH_95, percent
 from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.inference.counts import LossTally
-from msg_analysis.inference.received_values import NO_NOISE
 from msg_analysis.inference.regression import Term
 from msg_analysis.inference.residuals import ResidualSums
 from msg_analysis.inference.statistics import chi2_quantile, log_normal_tail, pseudo_inverse
@@ -258,7 +257,7 @@ def noise(sums: ResidualSums, excluded: Iterable[int], change: FloatArray) -> Pa
     out[list(excluded)] = True
     should = np.diagonal(sums.noises, axis1=1, axis2=2)
     squares = np.diagonal(sums.scatter, axis1=1, axis2=2) - _explained(sums, change)
-    usable: BoolArray = (should > NO_NOISE * should.max(initial=0.0)) & (sums.samples >= MIN_SAMPLES)[:, None] & ~out
+    usable: BoolArray = (should > sums.floor) & (sums.samples >= MIN_SAMPLES)[:, None] & ~out
     usable &= squares > 0.0
     cells = np.argwhere(usable)
     if not 0 < len(cells) <= MAX_PARAMETERS:

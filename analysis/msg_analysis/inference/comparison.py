@@ -18,6 +18,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.text import (
     agent_text,
     half_width_text,
+    listed,
     markdown_table,
     measured_text,
     number_text,
@@ -34,6 +35,7 @@ from msg_analysis.inference.fault_power import RunPower
 from msg_analysis.inference.given_path import GivenPath
 from msg_analysis.inference.question import Test
 from msg_analysis.inference.realtime_laws import Laws
+from msg_analysis.inference.received_values import errors_have_digits, state_rounding, without_digits
 from msg_analysis.inference.residuals import ResidualTests
 from msg_analysis.inference.time_means import TimeMeans, few_switches
 from msg_analysis.inference.timing import Timing
@@ -86,7 +88,7 @@ def flat(document: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-Reason = Literal["heavy_tails", "kept_values", "short_run", "few_switches"]
+Reason = Literal["few_digits", "heavy_tails", "kept_values", "short_run", "few_switches"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +98,22 @@ class Trust:
     errors: Literal["all_paths", "given_path"] | None
     reason: Reason | None = None
     words: str | None = None
+
+
+def few_digits(prediction: Prediction) -> Trust | None:
+    """What cannot be tested because the digits of the states end above the noise; None where nothing is left out."""
+    agents = (without_digits(prediction) + 1).tolist()
+    if not agents:
+        return None
+    known = errors_have_digits(prediction)
+    who = "all agents" if len(agents) == prediction.step.agents else f"agent {listed(agents)}"
+    return Trust(
+        "all_paths" if known else None,
+        "few_digits",
+        f"The states are so large that their last digit is worth {number_text(2.0 * state_rounding(prediction), 2)}, "
+        f"not small against the noise of {who} in a step. This noise {'is' if known else 'and the errors are'} not "
+        "tested. Subtract a common number from x(0) and the reference.",
+    )
 
 
 def trusted(prediction: Prediction, means: TimeMeans, *, given: bool) -> Trust:

@@ -18,8 +18,17 @@ from msg_analysis.inference.e_values import Analyses, log_mean, log_means, log_s
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.question import Block, Diagnostic, Finding, Law, RunningSums
 from msg_analysis.inference.questions import QUESTIONS, evidence_weights
-from msg_analysis.inference.received_values import NO_NOISE, ReceivedValues, RepeatedNoise, process_noise
-from msg_analysis.inference.residuals import QUIET_ROUNDING, residuals
+from msg_analysis.inference.received_values import (
+    DIGITS,
+    HIDDEN,
+    QUIET_ROUNDING,
+    ReceivedValues,
+    RepeatedNoise,
+    errors_have_digits,
+    process_noise,
+    state_rounding,
+)
+from msg_analysis.inference.residuals import PULLED, residuals
 from msg_analysis.inference.statistics import simultaneous_half_width
 from msg_analysis.inference.system_error import ErrorMartingale
 from msg_analysis.inference.time_means import moments
@@ -47,25 +56,27 @@ class EvidenceSums:
         # With a delay, the message with x(0) is used in several steps.
         again = noise.link and step.delay and independent
         self.repeated = RepeatedNoise(step, replicas, realtime=False) if again else None
-        self._floor = NO_NOISE * float(variances.max(initial=0.0))
+        rounding = state_rounding(prediction)
+        self._floor = (DIGITS * rounding) ** 2  # variances up to this are rounding
         noisy = np.asarray((variances > self._floor).all(axis=0) & independent)
         correlated = bool((self._process * ~np.eye(m, dtype=bool)).any())
         # In real time a value that is used may contain a part of the noise of the same step.
         usable = noisy if not (real_time and correlated) else np.zeros(m, dtype=bool)
-        pull = np.abs(step.nominal.sum(axis=2) - 1.0).max(axis=0) > 1e-12
+        pull = np.abs(step.nominal.sum(axis=2) - 1.0).max(axis=0) > PULLED
         self._pulled = pull
         self._quadratic = self.plain and bool((variances > self._floor).all())
         first, second = np.triu_indices(m, 1)
         paired = usable[first] & usable[second] & (len(first) <= MOST_PAIRS) & (not correlated)
         independent_losses = step.burst is None and not real_time
         # Given its past and what was received, each sum is exact; the system error only where nothing is added or lost.
-        self.error = ErrorMartingale.of(prediction, replicas) if self.plain else None
+        self.error = ErrorMartingale.of(prediction, replicas) if self.plain and errors_have_digits(prediction) else None
         self._law = law = Law(
             step=step,
             graphs=[graph.name for graph in experiment.graph_list],
             planned=experiment.steps,
             replicas=replicas,
             noisy=noisy,
+            rounding=rounding / np.sqrt(np.where(noisy, variances.min(axis=0), np.inf)),
             apart=bool(usable.any()) and not correlated,
             links=np.argwhere(step.listens() & usable[:, None]),
             plain=self.plain,
@@ -146,15 +157,12 @@ class EvidenceSums:
             parts.broadcast_squares += analyses.sums((added**2).sum(axis=2)) / self._noise.broadcast**2
 
     def add_received(
-        self, reception: ReceivedValues, e: FloatArray, lost: BoolArray | None, decided: BoolArray, largest: float
+        self, reception: ReceivedValues, e: FloatArray, lost: BoolArray | None, decided: BoolArray
     ) -> None:
-        """Add steps, in any order: residuals (b, m, R), and lost messages (b, m, D), of the ``decided`` (b,) steps.
-
-        ``largest``: size of the largest state.
-        """
+        """Add steps, in any order: residuals (b, m, R), and lost messages (b, m, D), of the ``decided`` (b,) steps."""
         # Of a step with an infinite ``link_variance``, the agent is left out.
         analyses = Analyses(np.array([len(e)]))
-        scale = self._scales(self.total, analyses, reception, e, largest)
+        scale = self._scales(self.total, analyses, reception, e)
         self._add_received(self.total, analyses, reception, e / scale[:, :, None], scale, lost, decided)
 
     def _near(self, states: FloatArray) -> bool:
@@ -226,19 +234,18 @@ class EvidenceSums:
         e = received[1] if received else residuals(observation, first, last, reception)
         if self.repeated:
             e, reception = self.repeated.free(first, e, reception)
-        scale = self._scales(parts, analyses, reception, e, observation.largest)
+        scale = self._scales(parts, analyses, reception, e)
         graphs, after = observation.modes[first : last + 1], observation.states[first + 1 : last + 1]
         return Block(first, graphs, e / scale[:, :, None], scale, after, reception, analyses)
 
-    def _scales(
-        self, parts: RunningSums, analyses: Analyses, reception: ReceivedValues, e: FloatArray, largest: float
-    ) -> FloatArray:
+    def _scales(self, parts: RunningSums, analyses: Analyses, reception: ReceivedValues, e: FloatArray) -> FloatArray:
         """(b, m): standard deviations of residuals; infinite without noise, where nothing may move."""
         agents = np.arange(self._step.agents)
         variances = np.diagonal(self._process, axis1=1, axis2=2)[reception.graphs, agents] + reception.link_variance
         still = variances <= self._floor
         if self._independent and still.any():
-            moved = (np.abs(e) > QUIET_ROUNDING * largest).any(axis=2) & still
+            allowed = QUIET_ROUNDING * reception.size() + HIDDEN * np.sqrt(np.where(still, variances, 0.0))
+            moved = (np.abs(e).max(axis=2) > allowed) & still
             parts.impossible += analyses.counts(np.asarray(moved.any(axis=1)))
         return np.asarray(np.sqrt(np.where(still, np.inf, variances)))
 

@@ -27,9 +27,8 @@ from msg_analysis.inference.graphs import Switching
 from msg_analysis.inference.messages import CommonGain, Gains
 from msg_analysis.inference.noise import Noise
 from msg_analysis.inference.question import Diagnostic
-from msg_analysis.inference.received_values import NO_NOISE
+from msg_analysis.inference.received_values import Correlations
 from msg_analysis.inference.regression import MAX_REGRESSORS, regressors
-from msg_analysis.inference.residuals import noise_directions
 from msg_analysis.inference.statistics import chi2_quantile
 from msg_analysis.model.step_model import StepModel
 from msg_analysis.theory.prediction import Prediction
@@ -182,7 +181,7 @@ def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
     """Per agent with noise: the likelihood ratio of the covariance of the residuals."""
     same = bool((step.noise == step.noise[0]).all())
     found: _Informations = {}
-    bases = [noise_directions(noise)[0] for noise in step.noise]
+    bases = [Correlations(noise, 0.0).whitener() for noise in step.noise]
     dof = sum(rank * (rank + 1) // 2 for rank in (len(base) for base in (bases[:1] if same else bases)))
     larger = math.sqrt(factor) - 1.0
     for agent in range(step.agents):
@@ -211,7 +210,7 @@ def _gain(prediction: Prediction, factor: float, replicas: int) -> _Informations
         law = float(step.stationary[mode])
         for i in range(step.agents):
             variance = float(step.noise[mode, i, i])
-            if not variance > NO_NOISE * float(step.noise[mode].max()):
+            if not variance > 0.0:
                 continue
             row = step.nominal[mode, i].copy()
             row[i] = step.nominal[mode, i, i] - 1.0  # the whole pull on the agent, leaders included

@@ -170,6 +170,10 @@ class NoiseOverTime(Diagnostic):
         self._evidence = WindowEvidence(self._windows, columns)
         self._lags = LagSums(columns, 1)
         self._sizes = self._numbers << np.arange(self._windows.levels)[:, None]  # (levels, columns) numbers in a window
+        # Rounding makes a small sum of squares smaller than it is, or 0.
+        self._rounding = law.rounding[self.agents]
+        if self.together:
+            self._rounding = np.append(self._rounding, self._rounding.max())
         self._known = variance_constant(self._sizes)  # (K, levels, columns)
         self._counts = np.zeros(LEVELS, np.int64)  # windows of runs that were merged
         self._runs = 1
@@ -244,7 +248,8 @@ class NoiseOverTime(Diagnostic):
             share = math.log(2.0 * len(lengths) * float(counts[level]) * self._columns)
             for column, numbers in enumerate((self._numbers << level).tolist()):
                 largest, smallest = self._extreme[:, level, column].tolist()
-                tails = log_chi2_tail(largest, numbers), log_chi2_below(-smallest, numbers)
+                least = (math.sqrt(-smallest) + float(self._rounding[column]) * math.sqrt(numbers)) ** 2
+                tails = log_chi2_tail(largest, numbers), log_chi2_below(least, numbers)
                 candidates += [(tail + share, level, column, side) for side, tail in enumerate(tails)]
         log_p, level, column, side = min(candidates)
         first, numbers = int(self._first[side, level, column]) + 1, int(self._numbers[column] << level)

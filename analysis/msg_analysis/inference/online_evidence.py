@@ -193,7 +193,6 @@ class ReceivedEvidence(EvidenceWatch):
         self._graphs = np.zeros((kept, m), dtype=np.int64)
         self._used = np.zeros((kept, m, step.most_neighbours), dtype=np.int64)
         self._newest = -1
-        self._largest = 0.0
         self._length = max(1, BLOCK_NUMBERS // self.sums.numbers_per_step)
         self._path = NetworkPath()
         self._repeated = self.sums.repeated
@@ -222,8 +221,7 @@ class ReceivedEvidence(EvidenceWatch):
         new = (part.steps > self._newest - self._kept) & (self._label[place] < part.steps)
         part, place = part[new], place[new]
         self._label[place], self._done[place] = part.steps, False
-        self._states[place] = states = bounded(part.states)
-        self._largest = max(self._largest, float(np.abs(states).max(initial=0.0)))
+        self._states[place] = bounded(part.states)
         if part.published is not None:
             self._published[place] = bounded(part.published)
         self._graphs[place], self._used[place] = part.graphs, part.used
@@ -271,7 +269,7 @@ class ReceivedEvidence(EvidenceWatch):
         e = received_residuals(step, reception, self._states[after])
         if steps[0] < self._again:
             e, reception = self._freed(steps, known, e, reception)
-        self.sums.add_received(reception, e, lost, steps >= self._sure_messages, self._largest)
+        self.sums.add_received(reception, e, lost, steps >= self._sure_messages)
         self.sums.add_broadcast(self._published[place] - now)
         self._done[place] = True
         self.count += len(steps)

@@ -267,6 +267,7 @@ class Law:
     planned: int  # steps of a complete run
     replicas: int  # R
     noisy: BoolArray  # (m,) agents whose residuals are known to be independent normal numbers over time
+    rounding: FloatArray  # (m,) largest rounding of these residuals, over their standard deviation
     apart: bool  # whether those of different agents are independent of each other, given what they received
     links: IntArray  # (L, 2) receiver and sender, where residuals are independent of all that the receiver received
     plain: bool  # whether all agents receive the states themselves, in lockstep

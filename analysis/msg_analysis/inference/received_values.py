@@ -9,6 +9,7 @@ each agent used, plus the link noise of the received messages. The rest is part 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -20,8 +21,12 @@ from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.statistics import add_sums
 from msg_analysis.model.reception import neighbour_tables
 from msg_analysis.model.step_model import StepModel, Wiring
+from msg_analysis.theory.prediction import Prediction
 
-NO_NOISE = 1e-13  # directions with less variance than this, relative to the noisiest one, count as without noise
+NO_NOISE = 1e-13  # directions with a smaller eigenvalue of the correlations, relative to the largest: without noise
+DIGITS = 100.0  # of the rounding of a state; an agent with less noise in a step cannot be told from one without
+QUIET_ROUNDING = 1e-12  # of the terms of a step of an agent: what counts as rounding where there is no noise
+HIDDEN = 10.0  # standard deviations of a noise that counts as none
 
 
 @lru_cache(maxsize=4)
@@ -98,13 +103,23 @@ class ReceivedValues:
         index = at[:, None], agents, which
         return np.asarray(self.published[self.used[index], self.senders[index]])
 
-    def mean(self) -> FloatArray:
-        """(b, m, R): the next states without noise and without the term of the reference."""
-        total = self.own[:, :, None] * self.states
+    def mean(self, centre: FloatArray | float) -> FloatArray:
+        """(b, m, R): the next states without noise and without the term of the reference, as if ``centre`` were 0."""
+        total = self.own[:, :, None] * (self.states - centre)
         every, agents = np.arange(len(self.modes)), np.arange(self.states.shape[1])
         for d in range(self.weights.shape[2]):
-            total += self.weights[:, :, d, None] * self.received(every, agents, np.full(len(agents), d))
+            received = self.received(every, agents, np.full(len(agents), d))
+            total += self.weights[:, :, d, None] * (received - centre)
         return np.asarray(total)
+
+    def size(self) -> FloatArray:
+        """(b, m): largest sum, of all replicas, of the sizes of the terms of ``mean``."""
+        total = np.abs(self.own)[:, :, None] * np.abs(self.states)
+        every, agents = np.arange(len(self.modes)), np.arange(self.states.shape[1])
+        for d in range(self.weights.shape[2]):
+            received = self.received(every, agents, np.full(len(agents), d))
+            total += np.abs(self.weights[:, :, d, None] * received)
+        return np.asarray(total.max(axis=2))
 
     def patterns(self, order: IntArray | None = None) -> Iterator[tuple[IntArray, IntArray | None, IntArray]]:
         """Groups of like steps: graphs (m,) and order (m,) of the agents, by ``order`` (b, m), and steps (a,)."""
@@ -131,10 +146,9 @@ def mode_links(step: Wiring, mode: int) -> tuple[IntArray, IntArray, IntArray]:
     return receiver, tables.senders[mode, receiver, which], which
 
 
-def full_reception_noise(observation: Observation) -> FloatArray:
+def full_reception_noise(step: StepModel) -> FloatArray:
     """(n, m, m): covariance of the residuals of a step in which nothing is lost."""
-    step = observation.step
-    link = observation.prediction.experiment.noise.link**2 * (neighbour_weights(step) ** 2).sum(axis=2)
+    link = step.link**2 * (neighbour_weights(step) ** 2).sum(axis=2)
     process = step.noise_gain @ step.noise_gain.transpose(0, 2, 1)
     return np.asarray(process + link[:, :, None] * np.eye(step.agents))
 
@@ -145,17 +159,89 @@ def process_noise(step: StepModel, graphs: IntArray) -> FloatArray:
     return np.asarray(gain @ gain.T)
 
 
+def state_rounding(prediction: Prediction) -> float:
+    """Half a unit in the last digit of the states: of the start, the reference, or what noise may have added."""
+    experiment, step = prediction.experiment, prediction.step
+    start = experiment.run.start
+    given = 0.0 if isinstance(start, str) else float(np.abs(np.array(start, dtype=float)).max(initial=0.0))
+    variance = float(np.diagonal(full_reception_noise(step), axis1=1, axis2=2).max(initial=0.0))
+    return float(np.finfo(float).eps) * max(given, abs(step.reference), math.sqrt(experiment.steps * variance))
+
+
+def without_digits(prediction: Prediction) -> IntArray:
+    """Agents, from 0, with noise that is not large against the rounding of the states, in some graph."""
+    variances = np.diagonal(full_reception_noise(prediction.step), axis1=1, axis2=2)
+    floor = (DIGITS * state_rounding(prediction)) ** 2
+    return np.flatnonzero(((variances > 0.0) & (variances <= floor)).any(axis=0))
+
+
+def errors_have_digits(prediction: Prediction) -> bool:
+    """Whether the noise of all agents together is large against the rounding of the states."""
+    step, noise = prediction.step, full_reception_noise(prediction.step)
+    heard = step.broadcast**2 * (neighbour_weights(step) ** 2).sum(axis=(1, 2))
+    total = float(step.stationary @ (np.trace(noise, axis1=1, axis2=2) + heard))
+    return not total or total > step.agents * (DIGITS * state_rounding(prediction)) ** 2
+
+
+class Correlations:
+    """A covariance (m, m) of residuals as its correlations: every agent has a scale of its own.
+
+    Agents with a variance of ``floor`` or less count as without noise.
+    """
+
+    def __init__(self, covariance: FloatArray, floor: float) -> None:
+        variances = np.diag(covariance)
+        noisy = variances > floor
+        # (m,) scale of every agent
+        self.scale: FloatArray = np.sqrt(np.where(noisy, variances, floor or 1.0))
+        matrix = np.where(np.outer(noisy, noisy), covariance, 0.0) / np.outer(self.scale, self.scale)
+        if np.count_nonzero(matrix) == np.count_nonzero(noisy):
+            self._values, self._vectors = np.ones(int(noisy.sum())), np.eye(len(noisy))[:, noisy]
+        else:
+            values, vectors = np.linalg.eigh(matrix)
+            kept = (values > NO_NOISE * values[-1])[::-1]
+            self._values, self._vectors = values[::-1][kept], vectors[:, ::-1][:, kept]
+        self.rank = len(self._values)  # r
+        # (m,) what noise that counts as none may do
+        self._hidden = HIDDEN * np.where(noisy, NO_NOISE**0.5 * self.scale, np.sqrt(variances))
+
+    def root(self) -> FloatArray:
+        """(m, m): R with R R^T = the covariance."""
+        return np.asarray(self.scale[:, None] * (self._vectors * self._values**0.5) @ self._vectors.T)
+
+    def inverse(self) -> FloatArray:
+        """(m, m): the pseudo-inverse of ``root``."""
+        return np.asarray((self._vectors * self._values**-0.5) @ self._vectors.T / self.scale)
+
+    def whitener(self) -> FloatArray:
+        """(r, m): to independent N(0, 1), the directions with the most noise first."""
+        return np.asarray((self._vectors / np.sqrt(self._values)).T / self.scale)
+
+    def excess(self, residuals: FloatArray, sizes: FloatArray) -> float:
+        """Largest part of residuals (b, m, R) without noise, over what rounding and hidden noise may leave.
+
+        ``sizes``: (b, m) of the terms of the steps.
+        """
+        if self.rank == len(self.scale) or not len(residuals):
+            return 0.0
+        quiet = self.scale[:, None] * (np.eye(len(self.scale)) - self._vectors @ self._vectors.T) / self.scale
+        allowed = QUIET_ROUNDING * sizes @ np.abs(quiet).T + self._hidden
+        moved = np.abs(quiet @ residuals).max(axis=2)
+        return float(np.divide(moved, allowed, out=np.where(moved > 0.0, np.inf, 0.0), where=allowed > 0.0).max())
+
+
 class Equalizer:
     """Transforms residuals of steps with covariance N to that of a regular step, M (``full``): M^1/2 N^-1/2 e."""
 
-    def __init__(self, step: StepModel, full: FloatArray) -> None:
-        self._step = step
-        self._roots = [_root(matrix, 0.5) for matrix in full]
+    def __init__(self, step: StepModel, full: FloatArray, floor: float) -> None:
+        self._step, self._floor = step, floor
+        regular = [Correlations(matrix, floor) for matrix in full]
+        self._roots = [(each.root(), each.rank) for each in regular]
         self._ranks = [rank for _, rank in self._roots]
         # False after a step whose N and M differ in rank (an agent without process noise received nothing): then only
         # the total size of all residuals can be tested.
         self.possible = True
-        # Sum of e^T N^+ e, its degrees of freedom, and the largest residual in directions without noise.
+        # Sum of e^T N^+ e, its degrees of freedom, and the largest of ``Correlations.excess``.
         self.chi2, self.dof, self.quiet = 0.0, 0, 0.0
 
     def equalize(self, residuals: FloatArray, reception: ReceivedValues) -> FloatArray:
@@ -164,20 +250,18 @@ class Equalizer:
         keys = np.column_stack([reception.modes, reception.graphs, reception.link_variance])
         patterns, owner = np.unique(keys, axis=0, return_inverse=True)
         owner = owner.reshape(-1)
-        equal = np.empty_like(residuals)
+        equal, sizes = np.empty_like(residuals), reception.size()
         order = np.argsort(owner, kind="stable")
         ends = np.searchsorted(owner[order], np.arange(len(patterns) + 1))
         for number, pattern in enumerate(patterns):
             at = order[ends[number] : ends[number + 1]]
             mode, graphs, e = int(pattern[0]), pattern[1 : m + 1].astype(np.int64), residuals[at]
-            inverse, rank = _root(process_noise(self._step, graphs) + np.diag(pattern[m + 1 :]), -0.5)
-            white = inverse @ e
+            noise = Correlations(process_noise(self._step, graphs) + np.diag(pattern[m + 1 :]), self._floor)
+            white, rank = noise.inverse() @ e, noise.rank
             self.possible &= rank == self._ranks[mode]
             self.chi2 += float((white**2).sum())
             self.dof += rank * e.shape[0] * e.shape[2]
-            if rank < len(inverse):
-                projector = inverse @ np.linalg.pinv(inverse, hermitian=True)
-                self.quiet = max(self.quiet, float(np.abs(e - projector @ e).max()))
+            self.quiet = max(self.quiet, noise.excess(e, sizes[at]))
             equal[at] = self._roots[mode][0] @ white
         return equal
 
@@ -185,17 +269,6 @@ class Equalizer:
         """Add the sums of another run of the same experiment, with another seed."""
         add_sums(self, other, "chi2", "dof")
         self.possible, self.quiet = self.possible and other.possible, max(self.quiet, other.quiet)
-
-
-def _root(matrix: FloatArray, power: float) -> tuple[FloatArray, int]:
-    """Symmetric power of a covariance on its noisy directions, and their number."""
-    if not (matrix - np.diag(np.diag(matrix))).any():
-        variances = np.diag(matrix)
-        noisy = variances > NO_NOISE * variances.max()
-        return np.diag(np.where(noisy, variances, 1.0) ** power * noisy), int(noisy.sum())
-    values, vectors = np.linalg.eigh(matrix)
-    noisy = values > NO_NOISE * values[-1]
-    return (vectors[:, noisy] * values[noisy] ** power) @ vectors[:, noisy].T, int(noisy.sum())
 
 
 NEVER = -2

@@ -19,11 +19,13 @@ import numpy as np
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.received_values import (
-    NO_NOISE,
+    DIGITS,
+    Correlations,
     Equalizer,
     ReceivedValues,
     RepeatedNoise,
     full_reception_noise,
+    state_rounding,
 )
 from msg_analysis.inference.regression import MAX_REGRESSORS, ReceivedRegression, StateRegression
 from msg_analysis.inference.statistics import (
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
     from msg_analysis.inference.evidence_sums import WatchedEvidence
 
 LAGS = 10
-QUIET_ROUNDING = 1e-9  # relative size of what counts as rounding in directions without noise
+PULLED = 1e-12  # difference of the sum of an agent's weights from 1, above which it is not rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,22 +71,24 @@ class ResidualSums:
         step, noise = observation.step, observation.prediction.experiment.noise
         n, m = step.modes, step.agents
         # (n, m, m) nominal covariances
-        self.noises: FloatArray = full_reception_noise(observation) if noise.on_air else step.noise
+        self.noises: FloatArray = full_reception_noise(step) if noise.on_air else step.noise
+        self.floor = (DIGITS * state_rounding(observation.prediction)) ** 2  # variances up to this are rounding
         self.replicas = observation.replicas
         # Number of residuals, replicas counted, and sum of e e^T, by graph.
         self.samples, self.scatter = np.zeros(n, np.int64), np.zeros((n, m, m))
         self.still = np.zeros((n, m), np.int64)  # steps in which no replica of an agent changed
-        self.quiet = self.largest = 0.0  # largest |e| in directions without noise; largest |x|
-        self._directions = [noise_directions(matrix) for matrix in self.noises]
+        self.quiet = self.largest = 0.0  # largest of ``Correlations.excess``; largest |x|
+        self._directions = [Correlations(matrix, self.floor) for matrix in self.noises]
+        self._whiteners = [each.whitener() for each in self._directions]
         # Graphs may differ in the number of noisy directions; the strongest ones that all graphs have are iid N(0, I).
-        self._whiteness = WhitenessSums(min(len(whitener) for whitener, _ in self._directions))
+        self._whiteness = WhitenessSums(min(len(whitener) for whitener in self._whiteners))
         self._repeated = RepeatedNoise.of(observation)
         # False where residuals depend on each other in a way that is not followed here.
         self.independent = self._repeated is None or not _correlated(step)
         varies = self._repeated is not None or (step.loss > 0.0 and noise.link > 0.0)
         if observation.timers and not varies:
             varies = bool((step.noise_gain != step.noise_gain[0]).any())
-        self._equalizer = Equalizer(step, self.noises) if varies else None
+        self._equalizer = Equalizer(step, self.noises, self.floor) if varies else None
         regression: StateRegression | ReceivedRegression = (
             ReceivedRegression(observation, most_regressors, position if _correlated(step) else None)
             if noise.steps_only or observation.timers
@@ -96,7 +100,11 @@ class ResidualSums:
             for first, last in observation.blocks(follower.sums.numbers_per_step, "evidence"):
                 follower.add(observation, first, last)
         self.terms = regression.terms
-        self.score, self.covariance = regression.statistic()  # (K,), (K, K)
+        score, covariance = regression.statistic()
+        noises = np.diagonal(self.noises, axis1=1, axis2=2)
+        rounded = np.asarray(((noises > 0.0) & (noises <= self.floor)).any(axis=0))
+        told = ~rounded[[term.agent for term in self.terms]]  # not of agents whose noise is rounding
+        self.score, self.covariance = score * told, covariance * np.outer(told, told)  # (K,), (K, K)
         self.gram = regression.gram()  # (K, K), see ``StateRegression.gram``; None where it is not available
 
     @property
@@ -118,15 +126,13 @@ class ResidualSums:
         if not self.independent:
             return ResidualTests()
         ratios: tuple[float, ...] | None = None
-        # Variances below NO_NOISE are allowed for: ten standard deviations.
-        hidden = 10 * np.sqrt(NO_NOISE * max(np.linalg.norm(noise, 2) for noise in self.noises))
         p_whiteness = self._whiteness.p_value()
         if self._equalizer and not self._equalizer.possible:
             chi2, dof, p_whiteness = self._equalizer.chi2, self._equalizer.dof, None  # two-sided, of the total size
             p_covariance = min(1.0, 2.0 * float(min(chi2_tail(chi2, dof), chi2_below(chi2, dof)))) if dof else None
         else:
             p_covariance, ratios = self._covariance_p(), self._ratios()
-        if self.quiet > max(QUIET_ROUNDING * self.largest, hidden):
+        if self.quiet > 1.0:
             p_covariance = 0.0
         chi2, dof = quadratic_form(self.score, self.covariance)
         p_gain = float(chi2_tail(chi2, dof)) if dof else None
@@ -138,7 +144,7 @@ class ResidualSums:
         seen = self.samples > 0
         noise = np.diagonal(self.noises, axis1=1, axis2=2)[seen]
         scatter = np.diagonal(self.scatter, axis1=1, axis2=2)[seen]
-        noisy = noise > NO_NOISE * noise.max(initial=0.0)
+        noisy = noise > self.floor
         parts = np.divide(scatter, noise, out=np.full_like(scatter, np.nan), where=noisy)
         return tuple((parts.sum(axis=0) / max(int(self.samples.sum()), 1)).tolist())
 
@@ -147,7 +153,7 @@ class ResidualSums:
         agents = np.array([term.agent for term in self.terms])
         size = np.diagonal(self.noises, axis1=1, axis2=2).mean(axis=0)[agents]
         weights = np.array([term.weight if term.kind in ("link", "pull") else 0.0 for term in self.terms])
-        weights = np.divide(weights, size, out=np.zeros_like(weights), where=size > NO_NOISE * size.max(initial=0.0))
+        weights = np.divide(weights, size, out=np.zeros_like(weights), where=size > self.floor)
         return direction_p(weights, self.score, self.covariance)
 
     def _add(
@@ -183,7 +189,8 @@ class ResidualSums:
             self.largest = max(self.largest, float(np.abs(states[:-1]).max()))
             unmoved = (states[1:] == states[:-1]).all(axis=2)
             white = np.empty((last - first, self._whiteness.rank, observation.replicas))
-            for mode, (whitener, quiet) in enumerate(self._directions):
+            sizes = np.abs(observation.states[first:last]).max(axis=2)
+            for mode, whitener in enumerate(self._whiteners):
                 at = np.flatnonzero(modes == mode)
                 if not at.size:
                     continue
@@ -191,7 +198,9 @@ class ResidualSums:
                 self.samples[mode] += flat.shape[1]
                 self.scatter[mode] += flat @ flat.T
                 self.still[mode] += unmoved[at].sum(axis=0)
-                self.quiet = max(self.quiet, float(np.abs(quiet.T @ flat).max(initial=0.0)))
+                if not self._equalizer:
+                    terms = sizes[at] @ np.abs(observation.step.nominal[mode]).T
+                    self.quiet = max(self.quiet, self._directions[mode].excess(e[at], terms))
                 white[at] = whitener[: self._whiteness.rank] @ e[at]
             self._whiteness.add(white)
 
@@ -201,7 +210,7 @@ class ResidualSums:
         groups = [list(modes)] if (self.noises == self.noises[0]).all() else [[g] for g in modes]
         statistic, dof = 0.0, 0.0
         for group in groups:
-            whitener, _ = self._directions[group[0]]
+            whitener = self._whiteners[group[0]]
             samples = int(self.samples[group].sum())
             if len(whitener) and samples:
                 scatter = whitener @ self.scatter[group].sum(axis=0) @ whitener.T
@@ -213,33 +222,35 @@ class ResidualSums:
 def residuals(observation: Observation, first: int, last: int, reception: ReceivedValues | None = None) -> FloatArray:
     """(last - first, m, R): residuals e(k) of steps first..last-1; without ``reception``, states were received."""
     step, now = observation.step, observation.states[first:last]
-    after = observation.states[first + 1 : last + 1].copy()
     if reception is not None:
-        return received_residuals(step, reception, after)
+        return received_residuals(step, reception, observation.states[first + 1 : last + 1])
+    centre, offsets = _centred(step, now)
+    now, after = now - centre, observation.states[first + 1 : last + 1] - centre
     for mode in range(step.modes):
         at = np.flatnonzero(observation.modes[first:last] == mode)
-        after[at] -= step.weights[mode] @ now[at] + step.offsets[mode][:, None]
-    return after
+        after[at] -= step.weights[mode] @ now[at] + offsets[mode][:, None]
+    return np.asarray(after)
+
+
+def _centred(step: StepModel, now: FloatArray) -> tuple[FloatArray | float, FloatArray]:
+    """What is subtracted of states (b, m, R), and the offsets (n, m) then: large common numbers would cost digits."""
+    pull = step.nominal.sum(axis=2) - 1.0
+    if (np.abs(pull) > PULLED).any():
+        return step.reference, step.offsets + pull * step.reference
+    return now.mean(axis=1, keepdims=True), step.offsets
 
 
 def received_residuals(step: StepModel, reception: ReceivedValues, after: FloatArray) -> FloatArray:
     """(b, m, R): residuals of steps, given what was received in them, and the states after them (b, m, R)."""
-    offsets = step.offsets[reception.graphs, np.arange(step.agents)]
-    return np.asarray(after - reception.mean() - offsets[:, :, None])
+    centre, offsets = _centred(step, reception.states)
+    offsets = offsets[reception.graphs, np.arange(step.agents)]
+    return np.asarray(after - centre - reception.mean(centre) - offsets[:, :, None])
 
 
 def _correlated(step: StepModel) -> bool:
     """Whether the process noise of two agents can be correlated, under any graphs that they use."""
     together = np.einsum("gik,hjk->ij", np.abs(step.noise_gain), np.abs(step.noise_gain))
     return bool((together - np.diag(np.diag(together))).any())
-
-
-def noise_directions(noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Whitener (r, m) of the directions with noise, the largest first; orthonormal basis (m, m - r) of the others."""
-    values, vectors = np.linalg.eigh(noise)
-    values, vectors = values[::-1], vectors[:, ::-1]
-    rank = int((values > NO_NOISE * values[0]).sum()) if values[0] > 0.0 else 0
-    return (vectors[:, :rank] / np.sqrt(values[:rank])).T, vectors[:, rank:]
 
 
 class WhitenessSums:

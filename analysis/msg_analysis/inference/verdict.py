@@ -14,7 +14,7 @@ from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray
 from msg_analysis.common.resources import blas_threads
 from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.inference.candidates import Cause
-from msg_analysis.inference.comparison import MAX_MISSED, Comparison, trusted
+from msg_analysis.inference.comparison import MAX_MISSED, Comparison, few_digits, trusted
 from msg_analysis.inference.counts import LossTally, Transitions, loss_test
 from msg_analysis.inference.e_values import log_mean
 from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates, rank_agents
@@ -27,6 +27,7 @@ from msg_analysis.inference.observation import Measurement, Observation, spaced_
 from msg_analysis.inference.question import Finding, Search, Statistics
 from msg_analysis.inference.questions import causes_of, decide
 from msg_analysis.inference.realtime_laws import Laws, means_in_lockstep, measure_laws
+from msg_analysis.inference.received_values import errors_have_digits
 from msg_analysis.inference.residuals import BroadcastSums, ResidualSums
 from msg_analysis.inference.statistics import batch_interval, steps_to_half_width
 from msg_analysis.inference.time_means import TimeMeans, time_means
@@ -85,7 +86,8 @@ class Evidence:
         return cls(
             steps=observation.steps,
             means=means,
-            decisive=laws is None or laws.measured_against == "pattern",
+            decisive=(laws is None or laws.measured_against == "pattern")
+            and errors_have_digits(observation.prediction),
             given=given,
             residuals=residuals,
             transitions=Transitions.of(observation.modes, observation.step.modes),
@@ -236,7 +238,8 @@ def evaluate(
         order=rank_agents(means, level) if means.long_enough else None,
         causes=causes,
         any_time=_any_time(trajectory.record, prediction, evidence, level, families),
-        trust=trusted(prediction, means, given=evidence.given is not None) if lockstep else None,
+        trust=few_digits(prediction)
+        or (trusted(prediction, means, given=evidence.given is not None) if lockstep else None),
         power=run_power(prediction, evidence.watched.sums, evidence.steps, level, tested_error),
     )
 

@@ -322,9 +322,9 @@ def any_time_words(document: dict[str, Any]) -> list[str]:
 
 
 def trust_words(document: dict[str, Any]) -> list[str]:
-    """Which errors to trust, where that is not obvious: with heavy tails, and in runs with few holding times."""
+    """Which errors to trust, where that is not obvious: with heavy tails, few switches, or few digits."""
     trust = document.get("trust")
-    return [trust["words"]] if trust and trust["reason"] in ("heavy_tails", "few_switches") else []
+    return [trust["words"]] if trust and trust["reason"] in ("few_digits", "heavy_tails", "few_switches") else []
 
 
 def agent_order(document: dict[str, Any]) -> list[str]:

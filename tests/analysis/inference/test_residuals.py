@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiments import chain_path, observed, pieces
+from experiments import TRACKING, chain_path, claimed, compare, five, observed, pieces, simulate
 from msg_analysis.inference.counts import Transitions, simulate_counts
 from msg_analysis.inference.regression import regressors
 from msg_analysis.inference.residuals import ResidualSums
@@ -48,8 +48,9 @@ def test_covariance_is_the_corrected_likelihood_ratio(observation):
 
 def test_whiteness_is_the_portmanteau_sum(observation):
     e = all_innovations(observation)
-    values, vectors = np.linalg.eigh(observation.step.noise[0])
-    w = np.einsum("ai,kir->kar", (vectors / np.sqrt(values)).T, e)
+    deviation = np.sqrt(np.diag(observation.step.noise[0]))
+    values, vectors = np.linalg.eigh(observation.step.noise[0] / np.outer(deviation, deviation))
+    w = np.einsum("ai,kir->kar", (vectors / np.sqrt(values)).T / deviation, e)
     w /= np.sqrt((w**2).mean(axis=(0, 2)))[:, None]
     steps, rank, replicas = w.shape
     chi2 = 0.0
@@ -166,3 +167,34 @@ def test_a_wrong_rate_is_found_in_short_and_long_paths():
     assert switching_test(chain_path(twice, 1000, 4), RARE).p < 1e-3
     assert switching_test(chain_path(np.array([[0.8, 0.2], [0.3, 0.7]]), 1000, 5), P).p < 1e-6
     assert switching_test(np.zeros(1000, dtype=int), np.array([[0.98, 0.02], [0.02, 0.98]])).p < 1e-4
+
+
+@pytest.mark.parametrize("law", [{}, {"link": 0.1, "delay": 1}, {"loss": 0.2}], ids=str)
+@pytest.mark.parametrize("gain", [1e-3, 1e-7, 1e-8, 1e-9, 1e-12])
+def test_one_agent_has_much_less_noise_than_the_others(gain, law):
+    """Tests at 0.01, evidence at 100: seeds are fixed; and 1.5 times its noise is found."""
+    process = [gain, 1.0, 1.0, 1.0, 1.0]
+    correct = five(duration=20, noise={"process": process, **law})
+    result = compare(simulate(correct))
+    assert result.verdict == "agrees"
+    assert result.any_time.log_evidence < np.log(100.0)
+    louder = simulate(five(duration=20, noise={"process": [1.5 * gain, *process[1:]], **law}))
+    if "link" not in law:
+        assert compare(claimed(louder, correct)).verdict == "disagrees"
+
+
+@pytest.mark.parametrize(
+    ("at", "gain", "tested"),
+    [(5e6, 1e-3, True), (1e9, 1e-3, True), (1e12, 1.0, True), (1e12, 1e-3, False), (1e15, 1.0, False)],
+)
+@pytest.mark.parametrize("problem", [{}, TRACKING], ids=["consensus", "tracking"])
+def test_states_far_from_zero(problem, at, gain, tested):
+    """Tests at 0.01; seeds are fixed. What the digits of the states do not show is left out, and the result says so."""
+    if problem:
+        problem = {**problem, "leaders": {**problem["leaders"], "reference": at}}
+    for seed in range(3):
+        result = compare(simulate(five(seed, 50, noise={"process": gain}, run={"start": [at] * 5}, **problem)))
+        assert result.verdict == "agrees"
+        assert any(test.name.startswith("system error") for test in result.tests) == tested
+        assert (result.trust.reason == "few_digits") == (not tested)
+        assert ("their last digit is worth" in str(result.trust.words)) == (not tested)
