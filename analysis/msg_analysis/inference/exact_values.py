@@ -19,8 +19,8 @@ from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.question import Block, Diagnostic, Finding, Law, Place, Statistics, Test, agent_words
-from msg_analysis.inference.received_values import NO_NOISE
-from msg_analysis.inference.residuals import QUIET_ROUNDING, received_residuals
+from msg_analysis.inference.received_values import HIDDEN, QUIET_ROUNDING
+from msg_analysis.inference.residuals import received_residuals
 
 ROUNDING = 2.0**-40  # of the largest x(0): smaller differences are for ``check``
 
@@ -97,16 +97,16 @@ class WithoutNoise(Exact):
     def __init__(self, law: Law) -> None:
         super().__init__(law)
         self._found: Finding | None = None
-        variances = np.square(law.step.noise_gain).sum(axis=2)
-        self._hidden = 10.0 * math.sqrt(NO_NOISE * float(variances.max(initial=0.0)))  # noise that counts as none
+        self._hidden = HIDDEN * np.sqrt(np.square(law.step.noise_gain).sum(axis=2))  # (n, m) noise that counts as none
 
     def add(self, block: Block) -> FloatArray:
         """Nothing is computed where all agents have noise."""
         quiet = np.isinf(block.scale)
         if self._found is None and quiet.any():
             away = np.abs(received_residuals(self.law.step, block.reception, block.after)) * quiet[:, :, None]
-            largest = max(float(np.abs(each).max()) for each in (block.reception.states, block.after))
-            wrong = np.argwhere(away.max(axis=2) > max(QUIET_ROUNDING * largest, self._hidden))
+            agents = np.arange(away.shape[1])
+            allowed = QUIET_ROUNDING * block.reception.size() + self._hidden[block.reception.graphs, agents]
+            wrong = np.argwhere((away.max(axis=2) > allowed) & quiet)
             if len(wrong):
                 at, agent = wrong[0].tolist()
                 held = bool(self.law.step.grounded[agent])
