@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import msg_analysis
-from msg_analysis.sweeps.workers import Lost, Workers
+from msg_analysis.sweeps.workers import LocalWorkers, Lost
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ("model", "theory", "twin", "inference")
@@ -49,7 +49,7 @@ def run_all(one_run: Run, runs: Mapping[str, int], name: str, processes: int) ->
     jobs.sort(key=lambda job: job[1])  # all cases side by side, so that the time left can be told
     begin = time.monotonic()
     told = count = 0
-    with Workers(processes) as pool, store.open("a") as file:
+    with LocalWorkers(processes) as pool, store.open("a") as file:
         for batch in pool.outcomes(one_run, jobs):
             for (case, seed), kept in batch:
                 if isinstance(kept, Lost):

@@ -26,7 +26,7 @@ import numpy as np
 
 from msg_analysis.sweeps.grid import load_sweep
 from msg_analysis.sweeps.points import Outcome, evaluate
-from msg_analysis.sweeps.workers import Workers
+from msg_analysis.sweeps.workers import LocalWorkers
 
 AGENTS, GRAPHS = 50, 3
 
@@ -48,7 +48,7 @@ def sweep_file(directory: Path, points: int) -> Path:
 def points_seconds(path: Path, workers: int) -> float:
     """What the predictions take, once the workers are there."""
     jobs = [point.job for point in load_sweep(path).points]
-    with Workers(workers) as pool:
+    with LocalWorkers(workers) as pool:
         begin = time.perf_counter()
         with closing(pool.outcomes(evaluate, jobs)) as batches:
             done = [outcome for batch in batches for _, outcome in batch]

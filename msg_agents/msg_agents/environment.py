@@ -15,7 +15,6 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
 from msg_agents.discovery.relay import DiscoveryRelay
 from msg_agents.discovery.rtps import (
@@ -28,6 +27,7 @@ from msg_agents.discovery.rtps import (
     has_fast_dds_3,
     require_loopback,
 )
+from msg_analysis.common import programs
 from msg_analysis.common.resources import SINGLE_THREAD, ros_distribution
 from msg_analysis.errors import InputError
 
@@ -90,10 +90,8 @@ def require_middleware(environment: Mapping[str, str], forked: Callable[[], bool
     present = [name for name in FOREIGN_VARIABLES if environment.get(name)]
     if not present or forked():
         return
-    command = [sys.executable, "-P", "-c", PROBE]
-    pipes: dict[str, Any] = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True, "errors": "replace"}
     try:
-        probe = subprocess.run(command, env=dict(environment), timeout=PROBE_TIMEOUT, check=False, **pipes)
+        probe = programs.run([sys.executable, "-c", PROBE], environment, PROBE_TIMEOUT)
     except subprocess.TimeoutExpired:
         return  # a busy machine: the run will say what is wrong
     if probe.returncode == 0:
@@ -166,8 +164,7 @@ def profile_variables(profile: Path, distribution: str | None = None) -> dict[st
 
 def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str, str]:
     """Our environment with what the nodes need; another discovery range or profile of the user's is kept."""
-    # ``python -m`` would look for msg_agents in the working directory first, and find our source tree's folder.
-    own = {"PYTHONUNBUFFERED": "1", "PYTHONSAFEPATH": "1", "ROS_DOMAIN_ID": str(domain)}
+    own = {"PYTHONUNBUFFERED": "1", "ROS_DOMAIN_ID": str(domain)}
     environment = {**SINGLE_THREAD, **os.environ, **own}
     local = environment.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
     if local and not any(environment.get(name) for name in PROFILE_VARIABLES):

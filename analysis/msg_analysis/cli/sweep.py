@@ -78,19 +78,12 @@ def sweep(
     """
     if workers and scheduler:
         raise InputError("--workers: not together with --scheduler, which has workers of its own: give one of them")
-    require_libraries()
+    require_libraries(cluster=bool(scheduler))
     from msg_analysis.cli.console import SweepProgress
     from msg_analysis.sweeps.grid import load_sweep
-    from msg_analysis.sweeps.workers import warm_up
 
     with SweepProgress("checking the points") as checking:
-
-        def checked(done: int, total: int) -> None:
-            if done == 1 and not scheduler:
-                warm_up()  # the file can be read: the workers import while its points are checked
-            checking.done(done, total)
-
-        plan = load_sweep(sweep_file, checked)
+        plan = load_sweep(sweep_file, checking.done)
     print_notes(plan)
     from msg_analysis.common.files import write_whole
     from msg_analysis.common.text import finite

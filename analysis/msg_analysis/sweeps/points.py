@@ -14,7 +14,6 @@ import os
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,8 +22,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from subprocess import Popen
 from typing import Any, Literal, Self
 
+from msg_analysis.common import programs
 from msg_analysis.common.resources import SINGLE_THREAD, __version__
 from msg_analysis.errors import InputError
 
@@ -33,16 +34,14 @@ _SOURCES = (
     *("arithmetic", "common", "experiment", "model", "theory", "twin", "inference"),
     *("sweeps/points.py", "errors.py", "protocol.py"),
 )
-_LIBRARIES = ("distributed", "pyarrow")
 
 
-def require_libraries() -> None:
-    """InputError that names the libraries that only sweeps need and that are not installed."""
-    missing = [name for name in _LIBRARIES if importlib.util.find_spec(name) is None]
+def require_libraries(*, cluster: bool = False) -> None:
+    """InputError that names the libraries that only sweeps (on a cluster) need and that are not installed."""
+    needed = ("pyarrow", "distributed") if cluster else ("pyarrow",)
+    missing = [name for name in needed if importlib.util.find_spec(name) is None]
     if missing:
-        raise InputError(
-            f"{' and '.join(missing)}: not installed: sweeps need them: pip install dask {' '.join(missing)}"
-        )
+        raise InputError(f"{' and '.join(missing)}: not installed: sweeps need it: pip install {' '.join(missing)}")
 
 
 @functools.cache
@@ -144,7 +143,7 @@ def find_program() -> str:
     python = line[2:] if line.startswith("#!/") and "python" in line and " " not in line else None
     # Its command line starts without ROS, a run does not.
     check = "import importlib.util, sys; sys.exit(importlib.util.find_spec('rclpy') is None)"
-    if python and subprocess.run([python, "-c", check], capture_output=True, check=False).returncode:
+    if python and programs.run([python, "-c", check], os.environ).returncode:
         raise InputError(f"{found}: there is no rclpy for {python}: {remedy}")
     return found
 
@@ -187,12 +186,11 @@ def _run(command: Sequence[str], slot: int, stopping: Callable[[], bool]) -> tup
     with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
         # In a session of its own: Ctrl-C in the terminal ends the sweep, which then ends the network in order. The slot
         # is inherited: if this worker is killed, the next network waits until this one has ended.
-        process = subprocess.Popen(
+        process = programs.start(
             [sys.executable, str(_END_WITH_PARENT), str(os.getpid()), *command],
-            stdin=subprocess.DEVNULL,
+            {**os.environ, **SINGLE_THREAD},  # networks and workers share the cores
             stdout=stdout,
             stderr=stderr,
-            env={**os.environ, **SINGLE_THREAD},  # networks and workers share the cores
             start_new_session=True,
             pass_fds=[slot],
         )
@@ -211,7 +209,7 @@ def _run(command: Sequence[str], slot: int, stopping: Callable[[], bool]) -> tup
         return document, stderr.read().decode(errors="replace"), process.wait()
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+def _end(process: Popen[bytes]) -> None:
     for number, timeout in ESCALATION:
         process.send_signal(number)
         deadline = time.monotonic() + timeout

@@ -1,64 +1,63 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The jobs of a sweep on workers: processes of this machine, or a Dask cluster; a worker that dies is replaced."""
+"""The jobs of a sweep on workers, which are processes of this machine by default; one that dies is replaced."""
 
 from __future__ import annotations
 
-import asyncio
-import concurrent.futures
 import dataclasses
-import logging
 import math
-import multiprocessing
 import os
+import resource
 import signal
+import socket
+import subprocess
+import sys
 import threading
 import time
-import uuid
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
+from multiprocessing.connection import Connection, wait
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar, cast
 
+from msg_analysis.common import programs
 from msg_analysis.common.resources import SINGLE_THREAD, count_cores, one_blas_thread
 from msg_analysis.errors import InputError
+from msg_analysis.sweeps.end_with_parent import end_with_parent
 from msg_analysis.sweeps.points import FAILED, Job, JobResults, NetworkOptions, Outcome, evaluate, installed_software
 
 if TYPE_CHECKING:
-    from distributed import Future
-
     from msg_analysis.sweeps.results import ResultStore
 
 
 T = TypeVar("T")
 R = TypeVar("R")
 
-BATCH_SECONDS = 0.5  # s of work per task, next to which the few milliseconds that Dask needs for it do not matter
+BATCH_SECONDS = 0.5  # s of work per batch, next to which the few milliseconds that Dask needs for it do not matter
 MOST_IN_BATCH = 500
-QUEUED = 2  # tasks sent per thread of the workers: one that is worked on, one that is ready after it
-NOTICE = 0.5  # s between two checks of a worker whether the work is being ended
+SHARES = 2  # batches per thread that what is left is divided into, so that all workers end together
+ENDING_TIMEOUT = 1.0  # s that work has to end
 # Signals that end a sweep as Ctrl-C does: that of a cluster's queue, and that of a terminal that is closed.
 ENDING = (signal.SIGTERM, signal.SIGHUP)
-PATIENCE = 10.0  # s until a scheduler answers
 NETWORK_TIMEOUT = 60.0  # s that running networks have to end in order
-# Less of what Dask does besides the work, which costs time on two cores.
-_QUIET = {
-    "distributed.worker.profile.enabled": False,
-    "distributed.admin.system-monitor.interval": "10s",
-    "distributed.admin.tick.interval": "1s",
-}
-_NEEDED = ("msg_analysis.theory.prediction", "msg_analysis.inference.verdict", "msg_analysis.twin.simulate")
+MOST_FAILED_STARTS = 5  # workers in a row that end before they can do anything, until the work is given up
+LEAST_MEMORY = 1 << 30  # bytes of a worker, however many there are
+STDERR = 2  # for what protocols print: stdout has the results
+SERVE = "from msg_analysis.sweeps.workers import serve; serve({}, {}, {})"
+READY = "ready"
 
 # What is done with an item; the second argument says whether the work is being ended.
 Function = Callable[[T, Callable[[], bool]], R]
+Answer = tuple[list[Any], float]  # results of a batch, and the seconds that it took
 OtherSoftware = Literal["refuse", "redo", "keep"]
 SweepProgress = Callable[[int, int, int], None]  # outcomes available, total, how many of them failed
 
 
 class WorkersLostError(Exception):
-    """The cluster went away in the middle of the work."""
+    """The workers went away in the middle of the work."""
 
 
 class EndedError(Exception):
@@ -72,110 +71,64 @@ class Lost:
     reason: str  # for the user
 
 
-def warm_up() -> None:
-    """Begin to start the server that workers are forked from: it imports while this process does other things."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return
-    from multiprocessing import forkserver
+class Workers(ABC):
+    """What works on items, batch by batch; a context, at whose end the processes of this machine are gone."""
 
-    previous = {name: os.environ.get(name) for name in SINGLE_THREAD}
-    os.environ.update(SINGLE_THREAD)
-    with _ignoring(signal.SIGINT):  # and so do the workers: this process ends them
-        multiprocessing.get_context("forkserver").set_forkserver_preload(["distributed", *_NEEDED])
-        forkserver.ensure_running()
-    for name, value in previous.items():
-        del os.environ[name]
-        if value is not None:
-            os.environ[name] = value
-
-
-class Workers:
-    """Worker processes of this machine (None: one per CPU), or those of the Dask scheduler at an address."""
-
-    def __init__(self, count: int | None = None, scheduler: str | None = None, *, patience: float = PATIENCE) -> None:
-        self._count = count or count_cores()
-        self._scheduler, self._patience = scheduler, patience
-        self._client: Any = None  # of Dask, from ``__enter__`` on
-        self._cluster: Any = None
-        self._stop_name = f"msg-sweep-stop-{uuid.uuid4().hex}"
+    queued: ClassVar[int] = 1  # batches sent per thread
+    lost_if: ClassVar[tuple[type[BaseException], ...]] = ()  # errors that say that all workers have gone
 
     def __enter__(self) -> Self:
-        """Start or find the workers. InputError: no scheduler answers, or its workers have other software."""
-        import dask
-
-        if not self._scheduler:
-            warm_up()
-        import distributed
-
-        # Silence its logs: what matters to the user is raised as an error here.
-        for name in list(logging.root.manager.loggerDict):
-            if name.partition(".")[0] == "distributed":
-                logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-        if self._scheduler:
-            try:
-                self._client = distributed.Client(self._scheduler, timeout=self._patience, name="msg-analysis")
-            except (OSError, ValueError, TypeError) as error:
-                reason = str(error).partition(":")[0] if isinstance(error, ValueError) else "no answer"
-                wanted = "expected the address of a Dask scheduler: for example tcp://127.0.0.1:8786"
-                raise InputError(f"--scheduler {self._scheduler}: {reason}: {wanted}") from error
-            self._compare_software()
-            return self
-        method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
-        dask.config.set({"distributed.worker.multiprocessing-method": method, **_QUIET})
-        try:
-            with deferring_interrupts():
-                quiet = {"scheduler_kwargs": {"dashboard": False}, "silence_logs": logging.CRITICAL + 1}
-                place = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
-                size = {"n_workers": self._count, "threads_per_worker": 1, "processes": True}
-                self._cluster = distributed.LocalCluster(**size, **place, **quiet)
-                self._client = distributed.Client(self._cluster)
-        except KeyboardInterrupt:
-            self._close()
-            raise
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._close()
-
-    def _close(self) -> None:
-        # A second Ctrl-C must not interrupt the orderly end.
-        with _ignoring(signal.SIGINT, signal.SIGTERM), suppress(Exception):
-            if self._client is not None:
-                self._client.close(timeout=5)
-            if self._cluster is not None:
-                self._cluster.close(timeout=20)
+        with _ignoring(signal.SIGINT, signal.SIGTERM):  # a second Ctrl-C must not interrupt the orderly end
+            self.close()
 
     @property
+    @abstractmethod
     def threads(self) -> int:
         """Items that can be worked on at a time now; 0 where a cluster has no worker yet."""
-        return sum(self._client.nthreads().values()) if self._scheduler else self._count
+
+    @abstractmethod
+    def submit(self, function: Function[T, R], batch: list[T]) -> Any:
+        """Send a batch; a key for it."""
+
+    @abstractmethod
+    def next_answer(self, running: Collection[Any]) -> tuple[Any, Answer | None]:
+        """Wait for a batch, one of these keys; no answer: its workers died."""
+
+    @abstractmethod
+    def stop(self, running: Collection[Any], timeout: float) -> None:
+        """Tell the workers to stop, and wait up to ``timeout`` seconds for the running batches."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """End what was begun."""
 
     def outcomes(
-        self, function: Function[T, R], items: Sequence[T], *, timeout: float = 2 * NOTICE
+        self, function: Function[T, R], items: Sequence[T], *, timeout: float = ENDING_TIMEOUT
     ) -> Generator[list[tuple[T, R | Lost]], None, None]:
         """Results of ``function`` (at the top of a module), in batches; interrupted, work has ``timeout`` s to end.
 
-        WorkersLostError: the scheduler is gone; InputError: other software on a worker.
+        WorkersLostError: the workers are gone; InputError: other software on a worker.
         """
-        from distributed import as_completed
-
         pending = deque(items)
         suspected: deque[T] = deque()
-        running: dict[Future, list[T]] = {}
+        running: dict[Any, list[T]] = {}
         seconds = math.inf
-        done = as_completed()
         try:
             while pending or suspected or running:
-                while pending and len(running) < QUEUED * max(self.threads, 1):
-                    self._submit(function, _take(pending, seconds, self.threads), running, done)
+                while pending and len(running) < self.queued * max(self.threads, 1):
+                    batch = _take(pending, seconds, self.threads)
+                    running[self.submit(function, batch)] = batch
                 alone = not running
                 if alone:
-                    self._submit(function, [suspected.popleft()], running, done)
-                future = next(done)
-                batch = running.pop(future)
-                found = self._result(future)
-                if found is not None:
-                    results, took = found
+                    batch = [suspected.popleft()]
+                    running[self.submit(function, batch)] = batch
+                key, answer = self.next_answer(running)
+                batch = running.pop(key)
+                if answer is not None:
+                    results, took = answer
                     each = took / len(batch)
                     seconds = each if math.isinf(seconds) else 0.7 * seconds + 0.3 * each
                     yield list(zip(batch, results, strict=True))
@@ -184,69 +137,131 @@ class Workers:
                 else:  # an item of it killed them, or one that a worker had at the same time: each is tried alone
                     suspected += batch
         except BaseException as error:
-            self._stop(list(running), timeout)
-            if isinstance(error, OSError | asyncio.CancelledError | concurrent.futures.CancelledError):
+            with _ignoring(signal.SIGINT, signal.SIGTERM), suppress(Exception):
+                self.stop(list(running), timeout)
+            if isinstance(error, self.lost_if):
                 raise WorkersLostError("the scheduler has gone") from error
             raise
 
-    def _submit(self, function: Function[T, R], batch: list[T], running: dict[Future, list[T]], done: Any) -> None:
-        future = self._client.submit(_do, function, batch, self._stop_name, installed_software(), pure=False)
-        running[future] = batch
-        done.add(future)
 
-    def _result(self, future: Future) -> tuple[list[Any], float] | None:
-        """Results of a batch and the seconds that it took; None where workers died over and over."""
-        from distributed import KilledWorker
+class LocalWorkers(Workers):
+    """Processes of this machine (None: one per CPU), each with a pair of sockets that no other process can reach."""
 
-        if future.status == "finished":
-            found: tuple[list[Any], float] = future.result()
-            return found
-        if future.status == "error":
-            error = future.exception()
-            if isinstance(error, KilledWorker):
-                return None
-            if isinstance(error, ModuleNotFoundError | InputError):
-                raise InputError(f"a worker cannot do it: {error}: install the same software there") from error
-            assert error is not None
-            raise error
-        if self._client.status != "running":
-            raise WorkersLostError("the scheduler has gone")
-        return None  # the only worker that had the result died
+    def __init__(self, count: int | None = None) -> None:
+        self._count = count or count_cores()
+        self._processes: dict[Connection, subprocess.Popen[bytes]] = {}
+        self._idle: list[Connection] = []
+        self._failed_starts = 0  # in a row
 
-    def _stop(self, running: Sequence[Future], timeout: float) -> None:
-        """Tell the workers to stop, and wait up to ``timeout`` seconds for the running batches."""
-        from distributed import Event, wait
+    @property
+    def threads(self) -> int:
+        """See ``Workers``."""
+        return self._count
 
-        with _ignoring(signal.SIGINT, signal.SIGTERM), suppress(Exception):
-            Event(self._stop_name, client=self._client).set()
-            wait(running, timeout=timeout)
+    def submit(self, function: Function[T, R], batch: list[T]) -> Connection:
+        """See ``Workers``."""
+        connection = self._idle.pop() if self._idle else self._start()
+        with suppress(OSError):  # it has died: ``next_answer`` finds out
+            connection.send((function, batch))
+        return connection
 
-    def _compare_software(self) -> None:
-        """Refuse workers with other software; those that join later refuse themselves in ``_do``."""
-        where, own = f"--scheduler {self._scheduler}", installed_software()
+    def _start(self) -> Connection:
+        ours, theirs = socket.socketpair()
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // self._count
+        command = SERVE.format(theirs.fileno(), os.getpid(), max(memory, LEAST_MEMORY))
         try:
-            found = self._client.run(installed_software)
-        except ModuleNotFoundError as error:
-            raise InputError(f"{where}: {error}: install the same software on its workers") from error
-        for worker, other in found.items():
-            if other != own:
-                raise InputError(
-                    f"{where}: worker {worker} has {other}: expected {own}: install the same software there"
-                )
+            process = programs.start(
+                [sys.executable, "-c", command],
+                {**os.environ, **SINGLE_THREAD},
+                stdout=STDERR,
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,  # Ctrl-C in the terminal ends this process, which then ends the workers
+            )
+        except OSError as error:
+            number = len(self._processes) + 1
+            raise InputError(f"--workers: number {number} cannot be started ({error.strerror}): give fewer") from error
+        finally:
+            theirs.close()
+        connection = Connection(ours.detach())
+        self._processes[connection] = process
+        with suppress(OSError):
+            connection.send(sys.path)
+        return connection
+
+    def next_answer(self, running: Collection[Connection]) -> tuple[Connection, Answer | None]:
+        """See ``Workers``."""
+        while True:
+            connection = cast(Connection, wait(list(running))[0])
+            try:
+                answer = connection.recv()
+            except (EOFError, OSError):
+                self._remove(connection)
+                return connection, None
+            self._failed_starts = 0
+            if answer == READY:
+                continue
+            self._idle.append(connection)
+            if isinstance(answer, BaseException):
+                raise answer
+            return connection, answer
+
+    def _remove(self, connection: Connection) -> None:
+        process = self._processes.pop(connection)
+        connection.close()
+        process.kill()
+        code = process.wait()
+        self._failed_starts += 1
+        if self._failed_starts > MOST_FAILED_STARTS:
+            raise WorkersLostError(f"worker processes cannot be started: exit code {code}")
+
+    def stop(self, running: Collection[Connection], timeout: float) -> None:
+        """See ``Workers``."""
+        for connection in running:
+            with suppress(OSError):
+                connection.send(None)
+        deadline = time.monotonic() + timeout
+        for connection in running:
+            with suppress(subprocess.TimeoutExpired):
+                self._processes[connection].wait(max(0.0, deadline - time.monotonic()))
+
+    def close(self) -> None:
+        """See ``Workers``."""
+        for process in self._processes.values():
+            process.kill()
+        for connection, process in self._processes.items():
+            connection.close()
+            process.wait()
+        self._processes.clear()
+        self._idle.clear()
+
+
+def serve(descriptor: int, parent: int, memory: int) -> None:
+    """In a worker of this machine: do batches, with so many bytes of memory, until there are no more."""
+    end_with_parent(parent)
+    _, most = resource.getrlimit(resource.RLIMIT_DATA)
+    resource.setrlimit(resource.RLIMIT_DATA, (memory if most < 0 else min(memory, most), most))
+    connection = Connection(descriptor)
+    sys.path[:] = connection.recv()
+    connection.send(READY)
+    with suppress(EOFError):
+        while task := connection.recv():
+            function, batch = task
+            try:
+                answer: Answer | Exception = do(function, batch, connection.poll)  # what comes meanwhile is the end
+            except Exception as error:
+                answer = error
+            connection.send(answer)
 
 
 def _take(pending: deque[T], seconds: float, threads: int) -> list[T]:
     """As many items as make a batch; fewer towards the end, so that all workers end together."""
     most = 1 if math.isinf(seconds) else int(BATCH_SECONDS / max(seconds, 1e-9))
-    most = max(1, min(most, MOST_IN_BATCH, len(pending) // (QUEUED * max(threads, 1))))
+    most = max(1, min(most, MOST_IN_BATCH, len(pending) // (SHARES * max(threads, 1))))
     return [pending.popleft() for _ in range(most)]
 
 
-def _do(function: Function[T, R], batch: Sequence[T], stop_name: str, software: str) -> tuple[list[R], float]:
+def do(function: Function[T, R], batch: Sequence[T], stopping: Callable[[], bool]) -> tuple[list[R], float]:
     """On a worker: do a batch, and time it [s]; one thread of linear algebra, since there is a worker for every CPU."""
-    if installed_software() != software:
-        raise InputError(f"it has {installed_software()}: expected {software}")
-    stopping = _Stopping(stop_name)
     begin = time.perf_counter()
     results = []
     with one_blas_thread():
@@ -255,26 +270,6 @@ def _do(function: Function[T, R], batch: Sequence[T], stop_name: str, software: 
                 raise EndedError
             results.append(function(item, stopping))
     return results, time.perf_counter() - begin
-
-
-class _Stopping:
-    """Whether the work is to end; asks the scheduler every ``NOTICE`` seconds, and is true if that has gone."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._asked = time.monotonic()
-        self._answer = False
-
-    def __call__(self) -> bool:
-        from distributed import Event
-
-        if not self._answer and time.monotonic() >= self._asked + NOTICE:
-            self._asked = time.monotonic()
-            try:
-                self._answer = bool(Event(self._name).is_set())
-            except Exception:
-                self._answer = True
-        return self._answer
 
 
 @contextmanager
@@ -331,7 +326,7 @@ def run_jobs(
             workers = workers or 1
         items = [dataclasses.replace(job, network=network) for job in todo.values()]
         timeout = {"timeout": NETWORK_TIMEOUT} if runs_networks else {}
-        with Workers(workers, scheduler) as pool, closing(pool.outcomes(evaluate, items, **timeout)) as batches:
+        with _workers(workers, scheduler) as pool, closing(pool.outcomes(evaluate, items, **timeout)) as batches:
             for batch in batches:
                 found = [
                     Outcome(job.id, FAILED, result.reason, {}, 0.0, "", installed_software())
@@ -345,6 +340,14 @@ def run_jobs(
                 failed += sum(outcome.status == FAILED for outcome in found)
                 watch(done, total, failed)
     return JobResults(tuple(store.outcomes[job.id] for job in jobs), reused)
+
+
+def _workers(count: int | None, scheduler: str | None) -> Workers:
+    if scheduler is None:
+        return LocalWorkers(count)
+    from msg_analysis.sweeps.cluster import ClusterWorkers  # Dask
+
+    return ClusterWorkers(scheduler)
 
 
 def _todo(jobs: Sequence[Job], store: ResultStore, other_software: OtherSoftware, retry: bool) -> dict[str, Job]:

@@ -27,6 +27,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn, Self
 
+from msg_analysis.common import programs
+
 PROGRAM = [sys.executable, "-m", "msg_agents.cli.node_server"]  # calls ``serve``
 LONGEST_TITLE = 200  # bytes; ROS names a log file by the title, and a longer name than 255 cannot be written
 LONGEST = 1 << 16  # bytes of a message
@@ -140,12 +142,11 @@ class ForkServer:
         self._control, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.settimeout(ANSWER_TIMEOUT)
         with theirs, self._log.open("ab") as output:
-            self._process = subprocess.Popen(
+            self._process = programs.start(
                 [*PROGRAM, str(theirs.fileno()), " " * LONGEST_TITLE],  # room for the titles of forked processes
-                stdin=subprocess.DEVNULL,
+                self._environment,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env=dict(self._environment),
                 pass_fds=[theirs.fileno()],
                 start_new_session=True,
             )

@@ -22,6 +22,7 @@ from msg_agents.discovery.relay import DiscoveryRelay
 from msg_agents.process_layout import CHANNEL, RECORDER, SWITCHER, Process, ProcessSpec, pin_to_core
 from msg_agents.run.fork_server import SHOW_STACKS, ForkServer, NodeStart
 from msg_agents.run.result import StatusSummary, read_report, read_status_files, read_steps
+from msg_analysis.common import programs
 from msg_analysis.errors import ExitCode
 
 # Signals and the seconds that a process has to obey each; the second ones for one that has hung.
@@ -236,12 +237,11 @@ class Supervisor:
     def _spawn(self, node: NodeStart) -> Process:
         """Start a process that is not forked."""
         options = [word for option, number in node.descriptors.items() for word in (option, str(number))]
-        process = subprocess.Popen(
+        process = programs.start(
             [sys.executable, "-m", "msg_agents", *node.arguments, *options],
-            stdin=subprocess.DEVNULL,
+            self.environment,
             stdout=node.output,
             stderr=subprocess.STDOUT,
-            env=dict(self.environment),
             pass_fds=list(node.descriptors.values()),
             start_new_session=True,
         )

@@ -11,10 +11,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pyarrow.parquet
 import pytest
 import yaml
 from programs import run
+from waiting import wait_for
 
 from experiments import Experiment, compare, predict, simulate
 from msg_analysis.sweeps.workers import ENDING
@@ -125,6 +127,20 @@ def test_interrupted_and_resumed_it_is_as_if_it_never_was(tmp_path: Path, here: 
         run = experiment["run"] | {"seed": row["seed"]}
         measured = compare(simulate(Experiment.parse(experiment | {"switching": switching, "run": run})))
         assert row["system_error.measured"] == measured.system_error.measured
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="this machine: no signal at the end of the parent")
+def test_workers_of_a_killed_sweep_end(tmp_path: Path) -> None:
+    """In the middle of a long run."""
+    experiment = EXPERIMENT | {"run": {"dt": 0.05, "duration": 100_000}}
+    process = start(file(tmp_path, experiment=experiment, kind="simulate", over={"run.replicas": [1]}))
+    try:
+        wait_for(lambda: [each for each in psutil.Process(process.pid).children() if each.cpu_times().user > 0.5], 60)
+        (worker,) = psutil.Process(process.pid).children()
+    finally:
+        process.kill()
+        process.communicate()
+    worker.wait(20)
 
 
 def test_failures_are_told_and_the_exit_code_says_so(tmp_path: Path, here: Call) -> None:

@@ -3,22 +3,24 @@
 import dataclasses
 import os
 import signal
-from collections.abc import Iterator
+import sys
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import yaml
 
 import experiments
 from msg_analysis.errors import InputError
 from msg_analysis.sweeps import workers as conducting
+from msg_analysis.sweeps.cluster import ClusterWorkers
 from msg_analysis.sweeps.grid import load_sweep
 from msg_analysis.sweeps.points import DONE, FAILED, Job, Outcome, evaluate
 from msg_analysis.sweeps.results import JOURNAL, ResultStore, arrow_table, evaluate_sweep, picture, rows_of
-from msg_analysis.sweeps.workers import Lost, Workers, run_jobs
+from msg_analysis.sweeps.workers import LocalWorkers, Lost, WorkersLostError, run_jobs
 
 
 def document(rate: float = 1.0, **run: Any) -> dict[str, Any]:
@@ -34,7 +36,7 @@ FAILURE = Outcome("x", FAILED, "broke", {}, 1.0, "", "")
 
 
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
-    """Have jobs done here, without Dask; what was done."""
+    """Have jobs done here; what was done."""
     done: list[Job] = []
 
     class Here:
@@ -50,7 +52,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> list[Job]:
                 done.append(item)
                 yield [(item, function(item, lambda: False))]
 
-    monkeypatch.setattr(conducting, "Workers", Here)
+    monkeypatch.setattr(conducting, "LocalWorkers", Here)
     return done
 
 
@@ -151,19 +153,9 @@ def cubes(number: int, _stopping: Any) -> int:
     return number**3
 
 
-@pytest.fixture
-def environment() -> Iterator[None]:
-    """As it was: Dask sets variables of its workers in this process, and what later tests start would have them."""
-    before = dict(os.environ)
-    yield
-    os.environ.clear()
-    os.environ.update(before)
-
-
-@pytest.mark.usefixtures("environment")
 def test_what_kills_its_workers_is_given_up_and_the_others_are_done() -> None:
     """Real workers: each death is that of a process, and a new one takes its place."""
-    with Workers(2) as pool, closing(pool.outcomes(cubes, list(range(30)))) as batches:
+    with LocalWorkers(2) as pool, closing(pool.outcomes(cubes, list(range(30)))) as batches:
         found = dict(pair for batch in batches for pair in batch)
     lost = found.pop(13)
     assert isinstance(lost, Lost)
@@ -171,9 +163,45 @@ def test_what_kills_its_workers_is_given_up_and_the_others_are_done() -> None:
     assert found == {number: number**3 for number in range(30) if number != 13}
 
 
+def sockets(_item: int, _stopping: Any) -> list[Any]:
+    return [each.laddr for each in psutil.Process().net_connections("all")]
+
+
+def much_memory(size: int, _stopping: Any) -> int:
+    return len(bytearray(size))
+
+
+def test_nobody_else_can_reach_a_worker() -> None:
+    """It has one socket, without a name; there are no others than before in this process."""
+    before = psutil.Process().net_connections("inet")
+    with LocalWorkers(1) as pool, closing(pool.outcomes(sockets, [1])) as batches:
+        assert list(batches) == [[(1, [""])]]
+        assert psutil.Process().net_connections("inet") == before
+        (worker,) = pool._processes.values()
+    assert worker.poll() is not None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="this machine: no limit of data")
+def test_memory_of_a_worker_is_bounded() -> None:
+    """What needs more than there is fails, and only that."""
+    with LocalWorkers(1) as pool, closing(pool.outcomes(much_memory, [10])) as batches:
+        assert list(batches) == [[(10, 10)]]
+        with pytest.raises(MemoryError):
+            list(pool.outcomes(much_memory, [psutil.virtual_memory().total]))
+
+
+def test_workers_that_do_not_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/bin/false")
+    with LocalWorkers(2) as pool, pytest.raises(WorkersLostError, match="cannot be started: exit code 1"):
+        list(pool.outcomes(cubes, list(range(30))))
+    monkeypatch.setattr(sys, "executable", "/nowhere")
+    with LocalWorkers(2) as pool, pytest.raises(InputError, match="--workers: number 1 cannot be started"):
+        list(pool.outcomes(cubes, list(range(30))))
+
+
 def test_a_scheduler_that_does_not_answer() -> None:
     with pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: no answer: expected the address"):
-        Workers(scheduler="tcp://127.0.0.1:9", patience=0.2).__enter__()
+        ClusterWorkers("tcp://127.0.0.1:9", patience=0.2).__enter__()
 
 
 def test_columns_and_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
