@@ -29,6 +29,7 @@ from msg_agents.discovery.rtps import (
 )
 from msg_analysis.common import programs
 from msg_analysis.common.resources import SINGLE_THREAD, ros_distribution
+from msg_analysis.common.shared_folders import own_folder
 from msg_analysis.errors import InputError
 
 MEMORY = Path("/dev/shm")  # a page of a file on a disk costs twice as much to write, each time the system has saved it
@@ -139,9 +140,9 @@ def can_log() -> bool:
     return False
 
 
-def other_logs(directory: Path) -> dict[str, str]:
-    """Changes to our environment that let ROS log to a directory, if it cannot write to the usual one."""
-    return {} if can_log() else {LOGS_VARIABLE: str(directory)}
+def other_logs(directory: Path | None = None) -> dict[str, str]:
+    """Changes to our environment that let ROS log to a directory (None: ours) if it cannot write to the usual one."""
+    return {} if can_log() else {LOGS_VARIABLE: str(directory or own_folder() / ROS_LOGS)}
 
 
 def require_discovery(environment: Mapping[str, str]) -> None:

@@ -27,6 +27,7 @@ from typing import Any, Literal, Self
 
 from msg_analysis.common import programs
 from msg_analysis.common.resources import SINGLE_THREAD, __version__
+from msg_analysis.common.shared_folders import own_folder
 from msg_analysis.errors import InputError
 
 # What the result of a job depends on: the folders and modules that ``evaluate`` imports.
@@ -225,13 +226,14 @@ def _slot(at_once: int, stopping: Callable[[], bool]) -> Iterator[int]:
     # A place is a locked file, inherited by the network: it is free when all processes that hold it have ended.
     while True:
         for number in range(at_once):
-            path = Path(tempfile.gettempdir()) / f"msg_agents_sweep_{os.getuid()}_{number}.lock"
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            descriptor = os.open(own_folder() / f"sweep_{number}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 os.close(descriptor)
                 continue
+            except OSError:  # the file system has no locks: as if nobody had one
+                pass
             try:
                 yield descriptor
             finally:

@@ -6,12 +6,11 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
+import errno
 import os
 import random
 import socket
 import struct
-import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -134,14 +133,13 @@ def domains_with_ports_in_use() -> set[int]:
 @contextmanager
 def free_domain(count: int = 1, domains: Sequence[int] = DOMAINS) -> Iterator[int]:
     """Hold a ROS_DOMAIN_ID, the first of ``count`` that no other run holds and whose ports are unused."""
-    # They are held by locks on files, which the system releases when this process ends, however it ends.
     busy = domains_with_ports_in_use()
     free = [domain for domain in domains if domain not in busy]
     candidates = [first for first in free if set(range(first, first + count)) <= set(free)]
     random.shuffle(candidates)
     for first in candidates:
-        with ExitStack() as locks:
-            if all(_lock(domain, locks) for domain in range(first, first + count)):
+        with ExitStack() as holders:
+            if all(_hold(domain, holders) for domain in range(first, first + count)):
                 yield first
                 return
     raise InputError(f"no free ROS domain among {domains[0]}..{domains[-1]}: end some runs or give --domain")
@@ -149,33 +147,24 @@ def free_domain(count: int = 1, domains: Sequence[int] = DOMAINS) -> Iterator[in
 
 def held_domains(domains: Sequence[int] = DOMAINS) -> list[int]:
     """The domains that runs on this machine hold."""
-    names = (file.stem.rpartition("_")[2] for file in Path(tempfile.gettempdir()).glob(_lock_name("*")))
-    return sorted(domain for domain in map(int, filter(str.isdecimal, names)) if domain in domains and is_held(domain))
+    return list(filter(is_held, domains))
 
 
 def is_held(domain: int) -> bool:
     """Whether a run holds a domain."""
-    with ExitStack() as locks:
-        return not _lock(domain, locks)
+    with ExitStack() as holders:
+        return not _hold(domain, holders)
 
 
-def _lock_name(domain: str) -> str:
-    return f"msg_agents_domain_{domain}.lock"
-
-
-def _lock(domain: int, locks: ExitStack) -> bool:
-    """Lock a domain until the end of ``locks``; whether that was possible."""
-    path = Path(tempfile.gettempdir()) / _lock_name(str(domain))
+def _hold(domain: int, holders: ExitStack) -> bool:
+    """Hold a domain until the end of ``holders``; whether that was possible."""
+    # By a name of Linux for sockets that is no file. Users share these names as they share the ports, within a network
+    # namespace, and need no permission for them; the system takes one back when its process ends, however it ends.
+    holder = holders.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
     try:
-        # That of another user can be read and locked, but not written nor, in /tmp for example, opened with O_CREAT.
-        descriptor = os.open(path, os.O_RDONLY | (0 if path.exists() else os.O_CREAT), 0o644)
-    except OSError:
-        return False
-    locks.callback(os.close, descriptor)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
+        holder.bind(f"\0msg_agents_domain_{domain}")
+    except OSError as error:
+        return error.errno != errno.EADDRINUSE  # other systems: the ports alone tell who is there
     return True
 
 

@@ -212,7 +212,7 @@ def _places() -> Iterator[Path]:
 def check_middleware() -> CheckResult:
     """Whether that ROS 2 and its middleware can be loaded."""
     name, wanted, warning = "middleware", os.environ.get("RMW_IMPLEMENTATION"), None
-    environment = node_environment(0, RELAYED_PROFILE) | other_logs(Path(tempfile.gettempdir()))
+    environment = node_environment(0, RELAYED_PROFILE) | other_logs()
     if found := refusal(name, lambda: require_middleware(environment)):
         return found
     if wanted and not wanted.startswith("rmw_fastrtps"):

@@ -15,7 +15,6 @@ import itertools
 import os
 import re
 import sys
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -122,7 +121,7 @@ def _ros_value(option: click.Parameter, value: Any) -> Any:
 @contextlib.contextmanager
 def ros_arguments() -> Iterator[None]:
     """Around the start of rclpy: log files have a place, and wrong arguments for ROS 2 are an InputError."""
-    os.environ.update(other_logs(Path(tempfile.gettempdir()) / f"msg_agents_log_{os.getuid()}"))
+    os.environ.update(other_logs())
     from msg_agents.nodes.ros import RCLError
 
     try:

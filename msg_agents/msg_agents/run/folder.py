@@ -9,7 +9,6 @@ import fcntl
 import os
 import shutil
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -18,12 +17,13 @@ from typing import Any
 
 from msg_agents.environment import MEMORY, free_space
 from msg_analysis.common.files import require_utf8
+from msg_analysis.common.shared_folders import clear_unlocked, own_folder
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import read_yaml
 from msg_analysis.experiment.problems import ExperimentError
 
-PREFIX = "msg_agents_run_"
+PREFIX = "run_"
 SPARE = 4  # times the room that is needed must be free there, so that other programs have enough
 YOUTH = 60.0  # s; younger folders may belong to a run that has not locked its own yet
 
@@ -31,29 +31,23 @@ YOUTH = 60.0  # s; younger folders may belong to a run that has not locked its o
 @contextmanager
 def temporary_directory(room: int | None = None, memory: Path = MEMORY) -> Iterator[Path]:
     """A folder, in memory if there is ``room`` [bytes], that is removed at the end; first, those of killed runs are."""
-    _clear_abandoned(memory)
-    parent = memory if room is not None and free_space(memory) > SPARE * room else None
+    parent = own_folder()
+    places = [parent]
+    if os.access(memory, os.W_OK):
+        places.append(own_folder(memory))
+        if room is not None and free_space(memory) > SPARE * room:
+            parent = places[-1]
+    for place in places:
+        clear_unlocked(place, PREFIX, YOUTH)
     path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
     lock = os.open(path, os.O_RDONLY)  # marks folders in use; ends with its process
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX)
+        with suppress(OSError):  # the file system has no locks, and nobody clears there
+            fcntl.flock(lock, fcntl.LOCK_EX)
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)
         os.close(lock)
-
-
-def _clear_abandoned(memory: Path) -> None:
-    for path in [path for parent in (Path(tempfile.gettempdir()), memory) for path in parent.glob(f"{PREFIX}*")]:
-        with suppress(OSError):  # gone already, another user's, or locked
-            if time.time() - path.stat().st_mtime < YOUTH:
-                continue
-            lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(path)
-            finally:
-                os.close(lock)
 
 
 def make_bag_directory(experiment: Experiment, out: Path, *, option: str = "--out: ") -> Path:

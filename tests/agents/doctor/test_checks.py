@@ -4,12 +4,11 @@ import resource
 import socket
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import pytest
 
-from msg_agents.discovery.rtps import PORT_BASE, PORTS_PER_DOMAIN, free_domain
+from msg_agents.discovery.rtps import PORT_BASE, PORTS_PER_DOMAIN, domains_with_ports_in_use, free_domain
 from msg_agents.doctor import checks, network_checks
 from msg_agents.doctor.checks import CheckResult
 from msg_agents.environment import require_shared_memory
@@ -92,10 +91,10 @@ def test_a_domain_that_a_run_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found.value < 101
 
 
-def test_a_domain_with_a_bound_port(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    with free_domain() as domain, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
+def test_a_domain_with_a_bound_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    domain = max(set(range(102, 200)) - domains_with_ports_in_use())  # no run takes one of these
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as somebody:
         somebody.bind(("127.0.0.1", PORT_BASE + PORTS_PER_DOMAIN * domain + 11))
-        monkeypatch.setattr(tempfile, "gettempdir", lambda: str(tmp_path))  # no run holds it
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         found = network_checks.check_own_domain()
     assert (found.status, "other programs" in found.text) == ("warning", True)
