@@ -23,7 +23,7 @@ from rosgraph_msgs.msg import Clock
 from msg_agents.environment import discovery_scope
 from msg_agents.nodes.parameters import ros_arguments
 from msg_agents.nodes.process import leave
-from msg_agents.nodes.ros import LeanNode, RCLError, message_class, ros_profile
+from msg_agents.nodes.ros import LeanNode, RCLError, foreign_message_class, ros_profile
 from msg_agents.replay import BagClock, parse_remaps, select_topics
 from msg_agents.terminal import Interruption, JobControl, Keyboard
 from msg_analysis.arithmetic.reproducible import SECOND
@@ -89,9 +89,9 @@ def message_classes(topics: Iterable[BagTopic], *, all_wanted: bool, on_note: Ca
             unplayable.append(f"{topic.name} (the encoding of its messages is {topic.encoding or 'unknown'}, not cdr)")
             continue
         try:
-            found[topic.name] = message_class(topic.type_name)
-        except (ImportError, AttributeError, ValueError):
-            unplayable.append(f"{topic.name} (the type {topic.type_name or '?'} is not installed here)")
+            found[topic.name] = foreign_message_class(topic.type_name)
+        except InputError as error:
+            unplayable.append(f"{topic.name} ({error})")
     if unplayable and (all_wanted or not found):
         raise InputError(
             f"cannot be played: {', '.join(unplayable)}: install the type, or leave the topic out with --exclude"

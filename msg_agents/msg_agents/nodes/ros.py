@@ -6,10 +6,14 @@
 from __future__ import annotations
 
 import copy
-import importlib
+import importlib.util
+import os
+import re
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, cast
 
 import rclpy
@@ -27,6 +31,7 @@ from rclpy.type_support import check_for_type_support
 
 from msg_agents.nodes.parameters import PROCESS
 from msg_analysis.errors import InputError
+from msg_analysis.experiment.problems import show
 from msg_analysis.messages.topics import Qos, Topic
 
 
@@ -114,9 +119,39 @@ def after(node: Node, seconds: float, callback: Callable[[], None]) -> None:
 
 
 def message_class(type_name: str) -> Any:
-    """Class of a type such as std_msgs/msg/String; ImportError, AttributeError or ValueError without one."""
+    """Class of a type of our own code, such as std_msgs/msg/String."""
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
+
+
+def foreign_message_class(type_name: str) -> Any:
+    """Class of a type that a file names; InputError where no installed package of interfaces has such a message."""
+    # Nothing is imported but what the index of ROS registers as interfaces, from where it is registered.
+    package, _, name = type_name.partition("/msg/")
+    prefixes = [*filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)), sys.prefix]
+    if re.fullmatch("[a-z][a-z0-9_]*", package) and any(_is_registered(Path(each), package, name) for each in prefixes):
+        try:
+            kind = message_class(type_name)
+            check_for_type_support(kind)
+            return kind
+        except Exception as error:  # of code that we know nothing about
+            raise InputError(f"the type {show(type_name)} cannot be loaded: {error}") from error
+    raise InputError(f"the type {show(type_name)} is not installed here")
+
+
+def _is_registered(prefix: Path, package: str, name: str) -> bool:
+    """Whether an installation lists a message, and an import would find its package there."""
+    try:
+        listed = (prefix / "share/ament_index/resource_index/rosidl_interfaces" / package).read_text(encoding="utf-8")
+        spec = importlib.util.find_spec(package)  # imports nothing
+    except (OSError, ValueError):
+        return False
+    if not {f"msg/{name}.idl", f"msg/{name}.msg"} & set(listed.split()) or spec is None:
+        return False
+    places = [Path(each) for each in spec.submodule_search_locations or ()]
+    return bool(places) and all(
+        each.is_relative_to(prefix) or each.resolve().is_relative_to(prefix.resolve()) for each in places
+    )
 
 
 def load_type_support(topics: Iterable[Topic]) -> None:
