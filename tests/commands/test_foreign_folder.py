@@ -7,34 +7,18 @@ import subprocess
 import sys
 from pathlib import Path
 
-from programs import COMMANDS
+from programs import COMMANDS, FOREIGN_NAMES, put_foreign_files
 
 from experiments import document
 from msg_analysis.experiment.experiment import Experiment
 
 ROOT = Path(__file__).parents[2]
-NAMES = (  # of Python, libraries and our own, which commands and their workers import; most of them late
-    *("signal", "random", "queue", "select", "platform", "selectors", "tempfile", "socket", "struct", "logging"),
-    *(
-        "subprocess",
-        "multiprocessing",
-        "pickle",
-        "ctypes",
-        "yaml",
-        "numpy",
-        "scipy",
-        "pyarrow",
-        "rclpy",
-        "setproctitle",
-    ),
-    *("msg_analysis", "msg_agents", "sitecustomize"),
-)
 NOTHING = ("missing",)  # a command that starts no process then imports as much as if it was there
 LINES: dict[tuple[str, str], tuple[str, ...]] = {
     **dict.fromkeys(COMMANDS, NOTHING),
     ("msg-analysis", "predict"): ("net.yaml",),
     ("msg-analysis", "compare"): ("bag",),
-    ("msg-analysis", "sweep"): ("sweep.yaml", "--out", "out"),  # starts workers, which start `msg-agents run`
+    ("msg-analysis", "sweep"): ("sweep.yaml", "--out", "out"),  # networks: tests/integration/test_sweep.py
     ("msg-agents", "doctor"): (),
 }
 # In one process, since each would import the same again. It is started as an executable is: its folder is on the path.
@@ -48,16 +32,15 @@ print(json.dumps([run(*words).exit_code for words in lines]))
 
 
 def test_every_command(tmp_path: Path) -> None:
-    assert len(NAMES) == 23
+    assert len(FOREIGN_NAMES) == 23
     folder, bin_folder, executed = tmp_path / "folder", tmp_path / "bin", tmp_path / "executed"
     folder.mkdir()
     bin_folder.mkdir()
     net = document(3, run={"duration": 2, "seed": 1})
     Experiment.parse(net).simulate().save(folder / "bag")
     (folder / "net.yaml").write_text(json.dumps(net))
-    (folder / "sweep.yaml").write_text("{experiment: net.yaml, kind: network, over: {run.dt: [0.1]}}")
-    for name in NAMES:
-        (folder / f"{name}.py").write_text(f"open({str(executed)!r}, 'a').write('{name} ')")
+    (folder / "sweep.yaml").write_text("{experiment: net.yaml, kind: simulate, over: {run.dt: [0.1]}}")
+    put_foreign_files(folder, executed)
     (bin_folder / "all.py").write_text(ALL)
     lines = json.dumps([[*command, *words] for command, words in LINES.items()])
     command = [sys.executable, bin_folder / "all.py"]

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
+from programs import put_foreign_files
 
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.pool import compare
@@ -135,7 +136,8 @@ def test_networks_interrupted_killed_and_resumed(network: Any) -> None:
 
 @pytest.mark.timeout(300)
 def test_points_on_the_curves_of_the_paper(network: Any) -> None:
-    """Short form: two networks. Level of the family of all points: 1 %, with fixed seeds: no alarm."""
+    """Short form: two networks, started among files that none of their processes may execute."""
+    # Level of the family of all points: 1 %, with fixed seeds: no alarm.
     runs = [
         emulation.PlannedRun(1, "line_ring", 0.5, 1.0, 1.0, duration=20.0),
         emulation.PlannedRun(3, "smallest", 5.0, 1.0, 1.0, leader=2, duration=20.0),
@@ -158,8 +160,12 @@ def test_points_on_the_curves_of_the_paper(network: Any) -> None:
         "        print('ended', end.code, points.count('\\n'))",
     ]
     command = [sys.executable, "-P", "-c", "\n".join(code)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=280)
+    folder, executed = network.directory / "folder", network.directory / "executed"
+    folder.mkdir()
+    put_foreign_files(folder, executed)
+    result = subprocess.run(command, capture_output=True, text=True, timeout=280, cwd=folder)
     assert result.returncode == 0, result.stderr
+    assert not executed.exists(), executed.read_text()
     first, second, rest = result.stdout.split("ended 0 2\n")
     for text, counts in ((first, "7 points of 2 networks"), (second, "6 points of 1 networks")):
         assert f"{counts}: all agree with theory (Holm over all points, level 0.01" in text

@@ -133,7 +133,7 @@ def sweep(
     level
         probability of a false "disagrees", all runs together; above 0, at most 0.5
     workers
-        processes of Dask; None: in this process
+        worker processes; None: in this process
 
     Returns
     -------

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 R = TypeVar("R")
 
-BATCH_SECONDS = 0.5  # s of work per batch, next to which the few milliseconds that Dask needs for it do not matter
+BATCH_SECONDS = 0.5  # s of work per batch, next to which the few milliseconds that it takes to send it do not matter
 MOST_IN_BATCH = 500
 SHARES = 2  # batches per thread that what is left is divided into, so that all workers end together
 ENDING_TIMEOUT = 1.0  # s that work has to end
@@ -241,6 +241,7 @@ def serve(descriptor: int, parent: int, memory: int) -> None:
     _, most = resource.getrlimit(resource.RLIMIT_DATA)
     resource.setrlimit(resource.RLIMIT_DATA, (memory if most < 0 else min(memory, most), most))
     connection = Connection(descriptor)
+    os.set_inheritable(descriptor, False)  # if a program that it starts had it, our end would not be noticed
     sys.path[:] = connection.recv()
     connection.send(READY)
     with suppress(EOFError):

@@ -133,7 +133,8 @@ def test_interrupted_and_resumed_it_is_as_if_it_never_was(tmp_path: Path, here: 
 def test_workers_of_a_killed_sweep_end(tmp_path: Path) -> None:
     """In the middle of a long run."""
     experiment = EXPERIMENT | {"run": {"dt": 0.05, "duration": 100_000}}
-    process = start(file(tmp_path, experiment=experiment, kind="simulate", over={"run.replicas": [1]}))
+    sweep = file(tmp_path, experiment=experiment, kind="simulate", over={"run.replicas": [1]})
+    process = start(sweep, "--out", tmp_path)
     try:
         wait_for(lambda: [each for each in psutil.Process(process.pid).children() if each.cpu_times().user > 0.5], 60)
         (worker,) = psutil.Process(process.pid).children()
