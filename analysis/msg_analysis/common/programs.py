@@ -1,11 +1,19 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Programs that this one starts: all of them here, since none may execute files of the folder that it is started in."""
+"""Programs that this one starts: all of them here, since none may execute files of the folder that it is started in.
+
+As a program, with arguments PARENT_PID COMMAND...: becomes a command that gets a signal when its parent ends (on Linux).
+"""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+import os
+import signal
 import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -32,3 +40,19 @@ def run(
             raise
     texts = (text.decode(errors="replace") for text in (stdout, stderr))
     return subprocess.CompletedProcess(command, process.returncode, *texts)
+
+
+PR_SET_PDEATHSIG = 1
+
+
+def end_with_parent(parent: int) -> None:
+    """Ask for SIGTERM when the parent process ends; if it has ended already, end."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, int(signal.SIGTERM))
+    if os.getppid() != parent:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    end_with_parent(int(sys.argv[1]))
+    os.execv(sys.argv[2], sys.argv[2:])

@@ -129,7 +129,7 @@ PROGRAM = "msg-agents"
 POLL = 0.1  # s
 # Signals, and the seconds that a run then has to end: it ends its own processes in order.
 ESCALATION = ((signal.SIGINT, 30.0), (signal.SIGTERM, 10.0), (signal.SIGKILL, 5.0))
-_END_WITH_PARENT = Path(__file__).with_name("end_with_parent.py")
+_END_WITH_PARENT = Path(programs.__file__)
 
 
 def find_program() -> str:

@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar, cast
 from msg_analysis.common import programs
 from msg_analysis.common.resources import SINGLE_THREAD, count_cores, one_blas_thread
 from msg_analysis.errors import InputError
-from msg_analysis.sweeps.end_with_parent import end_with_parent
 from msg_analysis.sweeps.points import FAILED, Job, JobResults, NetworkOptions, Outcome, evaluate, installed_software
 
 if TYPE_CHECKING:
@@ -237,7 +236,7 @@ class LocalWorkers(Workers):
 
 def serve(descriptor: int, parent: int, memory: int) -> None:
     """In a worker of this machine: do batches, with so many bytes of memory, until there are no more."""
-    end_with_parent(parent)
+    programs.end_with_parent(parent)
     _, most = resource.getrlimit(resource.RLIMIT_DATA)
     resource.setrlimit(resource.RLIMIT_DATA, (memory if most < 0 else min(memory, most), most))
     connection = Connection(descriptor)

@@ -179,8 +179,8 @@ def test_one_agent_has_much_less_noise_than_the_others(gain, law):
     assert result.verdict == "agrees"
     assert result.any_time.log_evidence < np.log(100.0)
     louder = simulate(five(duration=20, noise={"process": [1.5 * gain, *process[1:]], **law}))
-    if "link" not in law:
-        assert compare(claimed(louder, correct)).verdict == "disagrees"
+    found = {"disagrees"} if "link" not in law else {"agrees", "disagrees"}  # with noise of links, a run is too short
+    assert compare(claimed(louder, correct)).verdict in found
 
 
 @pytest.mark.parametrize(
