@@ -3,7 +3,7 @@
 
 """Programs that this one starts: all of them here, since none may execute files of the folder that it is started in.
 
-As a program, with arguments PARENT_PID COMMAND...: becomes a command that gets a signal when its parent ends (on Linux).
+As a program, with PARENT_PID COMMAND...: becomes a command that gets a signal when its parent ends (on Linux).
 """
 
 from __future__ import annotations
