@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hmac
 import json
+import math
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import cached_property
@@ -37,6 +38,7 @@ class Refusal:
     CONTRADICTION = "contradicts an earlier copy"
     NOT_OF_RECORD = "contradicts the run record"
     NOT_SIGNED = "not signed with the key of the run"
+    NEGATIVE_TIME = "negative time"  # on /clock
     DUPLICATE_NAME = "duplicate node name"  # not of a message
 
     # States
@@ -194,6 +196,14 @@ def fault_of(step: int, mode: int, state: bytes, graphs: int) -> str | None:
     if mode > graphs or (mode == 0) != (step == 0):
         return Refusal.UNKNOWN_MODE
     return None if all_finite(state) else Refusal.NOT_FINITE
+
+
+def finite_number(text: str) -> float:
+    """A number that came as text; ValueError: it is none, or not finite."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
 
 
 def state_receiver(

@@ -28,11 +28,13 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.type_support import check_for_type_support
+from rosgraph_msgs.msg import Clock as ClockMessage
 
 from msg_agents.nodes.parameters import PROCESS
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.problems import show
-from msg_analysis.messages.topics import Qos, Topic
+from msg_analysis.messages.acceptance import Refusal
+from msg_analysis.messages.topics import CLOCK, Qos, Topic
 
 
 def use_middleware() -> None:
@@ -197,6 +199,8 @@ class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy
     ) -> Subscription:
         """As in rclpy; overrides as in ``create_publisher``."""
         create = super().create_subscription
+        if msg_type is ClockMessage:  # of rclpy itself, under use_sim_time
+            callback = self._if_not_negative(callback)
         return self._create(
             lambda kind, name, qos, **more: create(kind, name, callback, qos, **more),
             [],
@@ -205,6 +209,20 @@ class LeanNode(Node):  # type: ignore[misc]  # rclpy has no type hints that mypy
             qos_profile,
             **options,
         )
+
+    def _if_not_negative(self, take: Callable[[Any], object]) -> Callable[[Any], None]:
+        """``take`` for messages of ``/clock`` without those with a negative time, of which rclpy makes a ValueError."""
+
+        def receive(message: Any) -> None:
+            if message.clock.sec < 0:
+                self.refuse(Refusal.NEGATIVE_TIME, CLOCK.name)
+            else:
+                take(message)
+
+        return receive
+
+    def refuse(self, reason: str, topic: str) -> None:
+        """Note that a message was refused."""
 
     def _create(
         self,

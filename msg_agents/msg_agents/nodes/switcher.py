@@ -25,7 +25,7 @@ from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.common.files import write_whole
 from msg_analysis.messages import topics
-from msg_analysis.messages.acceptance import Refusal, graph_message
+from msg_analysis.messages.acceptance import Refusal, finite_number, graph_message
 from msg_analysis.messages.messages import encode_string
 from msg_analysis.messages.topics import agent_node_name
 from msg_analysis.model.graph_path import HoldingPeriod, holding_periods
@@ -246,14 +246,22 @@ class RealtimeSwitcher(Switcher):
         """Compare the clocks of agents with ours: their health has the time at which it was sent."""
         assert self._on_clocks
         experiment, now = self.record.experiment, self._timer.now()
-        array = deserialize_message(data, DiagnosticArray)
+        try:
+            array = deserialize_message(data, DiagnosticArray)
+        except (RuntimeError, ValueError):  # of Fast CDR; bytes that are not UTF-8
+            self.refuse(Refusal.UNDECODABLE, topics.DIAGNOSTICS.name)
+            return
         sent = array.header.stamp.sec * SECOND + array.header.stamp.nanosec
         agents = {f"{self.get_namespace()}/{name}".lstrip("/"): name for name in self._own_names()}
         for status in array.status:
             name = agents.get(status.name.partition(":")[0])
-            bounds = [float(value.value) for value in status.values if value.key == CLOCK_BOUND]
-            if name not in (None, SWITCHER, RECORDER) and bounds:
-                self._clocks.add(name, sent, now, bounds[0] * MILLISECOND)
+            bounds = [value.value for value in status.values if value.key == CLOCK_BOUND]
+            if name in (None, SWITCHER, RECORDER) or not bounds:
+                continue
+            try:
+                self._clocks.add(name, sent, now, finite_number(bounds[0]) * MILLISECOND)
+            except ValueError:
+                self.refuse(Refusal.NOT_FINITE, topics.DIAGNOSTICS.name)
         apart = self._clocks.warning(experiment.step_length / experiment.run.speed * SECOND)
         if apart and not self._apart:
             self.get_logger().warning(apart)
