@@ -11,11 +11,13 @@ from __future__ import annotations
 import difflib
 import os
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import numpy as np
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
 
 
 Result = TypeVar("Result")
+PACKAGE = Path(__file__).parents[1]
 
 
 class ProtocolError(InputError):
@@ -147,9 +150,20 @@ class ChosenProtocol:
             with np.errstate(all="ignore"), _KeptAlive():  # results are checked: numpy need not warn of an overflow
                 return call()
         except (Exception, SystemExit) as error:  # of code that we know nothing about
-            text = str(error) if isinstance(error, ValueError) and str(error) else f"{type(error).__name__}: {error}"
+            said = isinstance(error, ValueError) and bool(str(error))
+            text = str(error) if said else f"{type(error).__name__}: {error}"
             place = f", {where}" if where else ""
-            raise ProtocolError(f"{self.info}{place}: {text}") from error
+            # Before the first step, what it says is of the user's parameters.
+            line = "" if said and "step" not in where else _line_of(error)
+            raise ProtocolError(f"{self.info}{place}: {text}{line}") from error
+
+
+def _line_of(error: BaseException) -> str:
+    """The line of the protocol's file at which it raised, in brackets; empty where its result was refused."""
+    frames = traceback.extract_tb(error.__traceback__)
+    files = [frame.filename for frame in frames if not Path(frame.filename).is_relative_to(PACKAGE)]
+    lines = [frame.lineno for frame in frames if files and frame.filename == files[0]]
+    return f" ({files[0]}, line {lines[-1]})" if files else ""
 
 
 class _KeptAlive:

@@ -141,8 +141,10 @@ class Agent(NetworkNode):
         return [name for name in self._peer_names if name not in reached] if reached else self._peer_names
 
     def finish(self, *, complete: bool, deadline: float) -> None:
-        """See NetworkNode. Waits only for readers outside the run: at the end, those of the run have everything."""
+        """See NetworkNode. After a complete part, it waits only for readers outside the run: the others have all."""
         self._group.send_batches()
+        if not complete and self.context.ok():  # it has failed: its last states show how
+            self._group.wait_for_recorder(deadline)
         for writer in (self._states, self._exact) if complete else ():
             if writer is None:
                 continue

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
+from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
@@ -19,6 +20,7 @@ from msg_agents.nodes.base import NOT_AN_AGENT, NetworkNode
 from msg_agents.nodes.paced_agents import LockstepAgent, RealtimeAgent
 from msg_agents.nodes.ros import every
 from msg_agents.process_layout import RECORDER
+from msg_agents.run.supervisor import SEND_PERIOD
 from msg_agents.stepping.synchronizer import TurnQueue
 from msg_analysis.messages import topics
 from msg_analysis.messages.acceptance import Refusal, fault_of, state_frame, why_refused
@@ -32,7 +34,6 @@ from msg_analysis.model.step_model import Wiring
 # batches for it by our profiles for one machine, and 5,000 by others: 40 MB in either case. One fits into a datagram.
 BATCH_SIZE, SMALL_BATCH_SIZE = 60_000, 2**13
 BATCH_TIME = 0.1  # s of wall time after which a batch is sent with the next state, however small it is
-SEND_PERIOD = 0.5  # s of wall time after which it is sent in any case
 ONLY_TOPICS = "MSG_AGENTS_ONLY_TOPICS"  # variable that turns this off where it is set, for comparison
 FEWEST = 16  # agents elsewhere that a process must need to read batches: fewer topics cost little, and ROS shows them
 FRESH = 0.02  # s for which what was found out about other processes is not looked up again
@@ -258,6 +259,11 @@ class AgentGroup:
         """Send to the recorder at once what has been collected for it."""
         for batches in self._batches:
             batches.send()
+
+    def wait_for_recorder(self, deadline: float) -> None:
+        """Wait until the recorder has all that was sent to it, or until ``deadline`` [s, monotonic]."""
+        for batches in self._batches:
+            batches.publisher.wait_for_all_acked(Duration(seconds=max(0.0, deadline - time.monotonic())))
 
     def missing_recorder(self) -> list[str]:
         """The recorder, if it is awaited and has not been discovered."""

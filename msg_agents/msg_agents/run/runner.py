@@ -203,6 +203,8 @@ def run_network(
                     result.until = ending.to_json() if ending else None
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
                     _collect_failures(supervisor, result, signals, restarts)
+                    if result.failures and not result.interrupted:
+                        supervisor.drain()
             result.rejected_messages = supervisor.status().rejected_messages()
             result.clocks, _ = supervisor.clocks()
             if linked:
@@ -323,6 +325,8 @@ def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: I
     for child in supervisor.failures:
         words = child.last_line()
         line = f"{child.spec.name}: {child.failure}" + (f": {words}" if words else "")
+        if result.bag and child.has_traceback():
+            line += f"; traceback in log/{child.log.name}"
         if child.resumes and result.restarts:
             counts = {c.spec.name: c.number - 1 for c in supervisor.children if c.number > 1}
             listed = ", ".join(

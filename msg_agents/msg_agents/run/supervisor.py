@@ -33,6 +33,8 @@ POLL = 0.02  # s
 CHECK_PERIOD = 1.0  # s between two checks whether processes have hung
 SILENCE = 3.0  # s; status files are written once a second
 CHANNEL_SILENCE = 10.0  # s after which a channel that reports nothing is given up
+SEND_PERIOD = 0.5  # s of wall time after which agents send the recorder what they have for it in any case
+DRAIN_TIME = 3.0  # s
 EARLY = 3.0  # s after which an agent that has ended without its last step is not waited for any more
 LATE = 10.0  # s after the end of the run after which a process that has not left is not waited for any more
 CRASHED = 1  # exit code of Python after an uncaught exception
@@ -139,6 +141,12 @@ class Child:
         if not self.spec.resumes or code is None:
             return False
         return code < 0 or (code == CRASHED and self.number == 1)  # a crash of its own will probably repeat: one try
+
+    def has_traceback(self) -> bool:
+        """Whether it has printed one."""
+        with contextlib.suppress(OSError):
+            return "Traceback (most recent call last)" in self.log.read_text(encoding="utf-8", errors="replace")
+        return False
 
     def last_line(self) -> str:
         """The last line that it printed; none of one that was ended, since it did not say why."""
@@ -340,6 +348,16 @@ class Supervisor:
         if failed and self.over:
             return [child for child in failed if child.spec.name == RECORDER]
         return failed
+
+    def drain(self) -> None:
+        """Wait, for a few seconds at most, until the agents have sent the recorder what they have collected for it."""
+        # They do so every half second, and write their status every second.
+        until = time.monotonic() + DRAIN_TIME
+        begun = time.monotonic() + SEND_PERIOD
+        while time.monotonic() < until and any(
+            child.spec.agents and child.status_age > time.monotonic() - begun for child in self.running
+        ):
+            time.sleep(POLL)
 
     def stop(self) -> None:
         """End all: first the agents and the switcher, so that the recorder gets all that they sent."""
