@@ -5,7 +5,7 @@
 
 Every state is written to the checkpoint before it is published. A process that takes over resumes from there, and
 publishes again what may have been lost on the way. It also removes its predecessor from the network at once: the
-middleware would drop that only after 20 s of silence (its lease), and until then writers keep what it never
+middleware would drop that only after an hour of silence (its lease), and until then writers keep what it never
 acknowledged, and block after 5,000 messages.
 """
 

@@ -1,10 +1,13 @@
 """A process that is killed or stopped, a full disk, a user who ends the run: what is there can be read."""
 
+import contextlib
+import itertools
 import json
 import os
 import random
 import re
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Iterator
@@ -16,6 +19,7 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from msg_agents.discovery.rtps import LOOPBACK, discovery_ports, disposal_message
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.runs import read_result
 from msg_analysis.twin.check import check
@@ -169,17 +173,60 @@ def test_a_killed_runner_takes_everybody_along(network: Any) -> None:
 
 
 @pytest.mark.timeout(150)
-def test_stopped_recorder(network: Any, repetition: int, rng: random.Random) -> None:
-    """At full speed everybody waits for it in the end, and nothing is lost."""
+def test_stopped_recorder(network: Any) -> None:
+    """Everybody waits for it in the end, for longer than the 20 s after which DDS drops who is silent by default."""
     file = network.file(run={"duration": 400, "processes": 2})
     run = network.record(file, "--json")
     network.wait_for_steps()
-    time.sleep(rng.uniform(0.0, 1.0))
     (recorder,) = network.processes("recorder")
     recorder.kill(signal.SIGSTOP)
-    time.sleep(10.0)
+    time.sleep(22.0)
     recorder.kill(signal.SIGCONT)
+    result = network.completed(run)
+    assert result["restarts"] == []
+    assert any(f": stopped, and waited for: recorder (PID {recorder.pid})" in note for note in result["notes"])
+
+
+LONGEST_STOP = 120.0 if "STRESS" in os.environ else 2.0  # s
+
+
+@pytest.mark.timeout(600)
+def test_stopped_processes(network: Any, repetition: int, rng: random.Random) -> None:
+    """Any of the run, up to all, for any time: the others wait for them, and nothing is lost."""
+    file = network.file(run={"duration": 300, "processes": rng.choice([1, 2, 5])})
+    run = network.record(file, "--json")
+    network.wait_for_steps()
+    time.sleep(rng.uniform(0.0, 1.0))
+    there = sorted(network.processes(), key=lambda process: process.pid)
+    victims = rng.sample(there, rng.choice([1, len(there), rng.randint(1, len(there))]))
+    for process in victims:
+        process.kill(signal.SIGSTOP)
+    time.sleep(rng.uniform(1.0, LONGEST_STOP))
+    for process in rng.sample(victims, len(victims)):
+        process.kill(signal.SIGCONT)
     assert network.completed(run)["restarts"] == []
+
+
+def test_messages_that_do_not_arrive_any_more(network: Any, domain: int) -> None:
+    """All processes run, but the others take one of them for gone: who waits for whom is said, and the run ends."""
+    what = network.experiment(run=LONG | {"processes": 5})
+
+    numbers, prefixes = itertools.count(1 << 30), []
+
+    def part(step: int) -> None:
+        """As soon as agents make steps, say again and again in the name of agent 1 that it has left."""
+        if step > 0 and not prefixes:
+            (agent,) = [each for each in network.processes("agent") if each.agent == 1]
+            checkpoints = Path(agent.command[agent.command.index("--checkpoint") + 1])
+            prefixes.append((checkpoints / "agent_1.participant").read_bytes())
+        for prefix, port in itertools.product(prefixes, discovery_ports(domain)):
+            with contextlib.suppress(OSError):
+                sender.sendto(disposal_message(prefix, next(numbers)), (LOOPBACK, port))
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        result = network.run(what, domain=domain, on_progress=part, stuck_timeout=4.0, fails=True)
+    assert re.match(r"no step for 4 s at step \d+, though all processes run: .*agent_\d: at step", result.failures[0])
+    assert check(result.trajectory).difference is None
 
 
 @pytest.fixture

@@ -39,7 +39,6 @@ NUMBERS_OF_DOMAIN = 119  # of participants whose ports are those of their domain
 UDP_PROFILE = Path(__file__).with_name("udp.xml")
 
 LEASE = 60.0  # s of silence after which a participant on another host, and what is on its way to it, counts as lost
-ANNOUNCEMENT = 3.0  # s between two announcements of a participant to other hosts
 _NAMESPACE = "http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"
 DOMAINS = range(1, 102)  # 0 is the default of every ROS program; above 101 are the ephemeral ports of Linux
 PORT_BASE, PORTS_PER_DOMAIN = 7400, 250  # the RTPS rule for well-known ports
@@ -99,10 +98,7 @@ def profile_for_hosts(
     for each in find("profiles").findall("./*"):
         if each.get("profile_name", "").startswith("/"):  # batches stay small: a link that loses parts loses the whole
             find("profiles").remove(each)
-    discovery = ET.Element(_tag("discovery_config"))
-    find("builtin").insert(0, discovery)
-    for key, seconds in (("leaseDuration", lease), ("leaseAnnouncement", ANNOUNCEMENT)):
-        ET.SubElement(ET.SubElement(discovery, _tag(key)), _tag("sec")).text = f"{seconds:.0f}"
+    find("leaseDuration/sec").text = f"{lease:.0f}"
     peers = find("initialPeersList")
     peers.clear()
     for address in addresses:

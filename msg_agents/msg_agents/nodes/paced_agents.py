@@ -14,6 +14,7 @@ from msg_agents.nodes.agent import Agent
 from msg_agents.nodes.base import CLOCK_BOUND, Health
 from msg_agents.nodes.ros import DueTimer, after
 from msg_agents.nodes.switcher import EPOCH_DELAY
+from msg_agents.stepping.monitoring import STALL_TIME
 from msg_agents.stepping.newest_values import CLOCK_MARGIN, NewestReceived, NewestValues, Schedule
 from msg_agents.stepping.synchronizer import LOCKSTEP_WINDOW, NOTHING, Synchronizer
 from msg_analysis.arithmetic.reproducible import SECOND
@@ -34,6 +35,7 @@ class LockstepAgent(Agent):
         super().__init__(**options)
         self._turns = self._group.turns
         self._will_report = False  # whether ``_report_later`` will be called
+        self._next_request = 0.0  # when to ask for missing states again [s of the monotonic clock]
         reception, options = self._law.air, self._options
         if reception and reception.looks_back:
             self._require_stored_values(reception)
@@ -61,7 +63,7 @@ class LockstepAgent(Agent):
         return reception.oldest_needed(first, self._peers) if reception else first
 
     def health(self) -> Health:
-        """See NetworkNode. A stalled agent says what it waits for, and asks for it again from time to time."""
+        """See NetworkNode. A stalled agent says what it waits for, and asks for it again every few seconds."""
         step, stall = self._law.step, self._stall
         overdue = stall.update(step)
         if step > self._reported or stall.stalled:
@@ -76,6 +78,8 @@ class LockstepAgent(Agent):
             self._group.fail(self.duplicate_name_error([self.get_name()], stall.stalled))  # others have started
         elif overdue:
             self.get_logger().warning(f"no step for {stall.stalled:.0f} s at step {step}: waiting for {waiting}")
+        if stall.stalled >= STALL_TIME and time.monotonic() >= self._next_request:
+            self._next_request = time.monotonic() + STALL_TIME
             self._request_states(self.values.lacking())
         return Health(f"at step {step}, waiting for {waiting}", waiting=True, values=values | {"waiting for": waiting})
 

@@ -32,7 +32,14 @@ from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.result import EventLog, RunResult
 from msg_agents.run.run_channel import RunChannel
 from msg_agents.run.supervisor import CLOCKS, CRASHED, HUNG, LATE, STATUS_FOLDER, STEPS, Supervisor
-from msg_agents.stepping.monitoring import ClockDetector, LagDetector, StallDetector, silence_text
+from msg_agents.stepping.monitoring import (
+    STUCK,
+    ClockDetector,
+    LagDetector,
+    StallDetector,
+    StuckDetector,
+    silence_text,
+)
 from msg_agents.terminal import Interruption
 from msg_agents.watch.observer import EarlyEnd
 from msg_agents.watch.panel import View
@@ -71,6 +78,7 @@ def run_network(
     interruption: Interruption | None = None,
     until: Until | None = None,
     hung_timeout: float = HUNG,
+    stuck_timeout: float = STUCK,
 ) -> RunResult:
     """Run an experiment as a network of ROS 2 processes.
 
@@ -121,6 +129,8 @@ def run_network(
         keeps signals from the start of the processes on, beyond the end of this call; None: one for this call only
     hung_timeout
         s without running after which a process whose main thread waits is ended and started again
+    stuck_timeout
+        s without a step after which the run ends, on one machine, although all of its processes run
 
     Returns
     -------
@@ -198,7 +208,10 @@ def run_network(
                         view.begin(record, kept_here, ending.observer if ending else None)
                         view.started(supervisor.by_node)
                         parts = supervisor, result, restarts, signals, view, ending, linked
-                        _watch(*parts, follow_clock=not use_sim_time)
+                        # Across hosts, and over links that are cut, others know better whether somebody is waited for.
+                        alone = assignment is None and linked is None
+                        stuck = StuckDetector(stuck_timeout) if alone else None
+                        _watch(*parts, follow_clock=not use_sim_time, stuck=stuck)
                         view.end()
                     result.until = ending.to_json() if ending else None
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
@@ -238,6 +251,7 @@ def _watch(
     linked: RunChannel | None,
     *,
     follow_clock: bool,  # whether the nodes' clock is that of this machine
+    stuck: StuckDetector | None,
 ) -> None:
     """Watch until all have done their part, one has failed for good, or a signal has ended the run."""
     began: float | None = None
@@ -264,8 +278,17 @@ def _watch(
         if clock and (words := clock.update()):
             view.note(words)
             lag = LagDetector(due)
-        if stall.update(sum(supervisor.steps)) and 0 <= reached < steps:
-            view.note(f"no step for {stall.stalled:.0f} s: {_stall_causes(supervisor, result.experiment.names)}")
+        if stall.update(sum(supervisor.steps)) and reached >= 0:
+            what = "no step" if reached < steps else "all steps are made, but no end"
+            view.note(f"{what} for {stall.stalled:.0f} s: {_stall_causes(supervisor, result.experiment.names)}")
+        excused = run.pace == "realtime" and 0 <= reached < steps  # its clock may stand still
+        excused |= stall.stalled > 1.0 and bool(supervisor.silent)
+        if stuck and stuck.update(sum(supervisor.steps), excused=excused):
+            result.failures.append(
+                f"no step for {stuck.limit:g} s at step {reached}, though all processes run: messages do not arrive "
+                f"any more: {_stall_causes(supervisor, result.experiment.names)}"
+            )
+            return
         if reached < 0:
             continue
         if lag and reached < steps and (late := lag.update(supervisor.steps)):
@@ -290,7 +313,9 @@ def _watch(
 def _stall_causes(supervisor: Supervisor, names: Sequence[str] | None) -> str:
     """Causes of a stall, as far as they are known; a silent process is stopped, or waits for one that is."""
     words = [f"{node}: {message}" for node, message in sorted(supervisor.status().waiting.items())]
-    silent = [child.spec.name for child in supervisor.silent]
+    if stopped := [f"{child.spec.name} (PID {child.process.pid})" for child in supervisor.running if child.stopped]:
+        words.append(f"stopped, and waited for: {', '.join(stopped)}")
+    silent = [child.spec.name for child in supervisor.silent if not child.stopped]
     if silent:
         words.append("no report from " + ", ".join(silent))
     if not words and supervisor.steps:  # the processes that know are on another host

@@ -22,6 +22,7 @@ from msg_agents.discovery.relay import DiscoveryRelay
 from msg_agents.process_layout import CHANNEL, RECORDER, SWITCHER, Process, ProcessSpec, pin_to_core
 from msg_agents.run.fork_server import SHOW_STACKS, ForkServer, NodeStart
 from msg_agents.run.result import StatusSummary, read_report, read_status_files, read_steps
+from msg_agents.stepping.monitoring import LONGEST_LOOK
 from msg_analysis.common import programs
 from msg_analysis.errors import ExitCode
 
@@ -41,7 +42,6 @@ CRASHED = 1  # exit code of Python after an uncaught exception
 STATUS_FOLDER, STEPS, CLOCKS = "status", "steps.json", "clocks.json"
 
 HUNG = 60.0  # s
-LONGEST_LOOK = 2.0  # s that count at most between two looks: this process may have been stopped with the other
 WAITS = "S"  # of the states of proc(5): neither running, nor waiting for a disk, stopped or traced
 
 
@@ -71,11 +71,17 @@ class HungDetector:
 
 def _run_time(pid: int) -> str | None:
     """For how long the main thread of a process has run [ns], if it waits now and the system counts that (Linux)."""
-    thread = Path(f"/proc/{pid}/task/{pid}")
     with contextlib.suppress(OSError, IndexError):
-        state = (thread / "stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()[0]
-        ran = (thread / "schedstat").read_text(encoding="ascii").split()[0]
-        return ran if state == WAITS and ran != "0" else None
+        ran = Path(f"/proc/{pid}/task/{pid}/schedstat").read_text(encoding="ascii").split()[0]
+        return ran if _state(pid) == WAITS and ran != "0" else None
+    return None
+
+
+def _state(pid: int) -> str | None:
+    """State of the main thread of a process, a letter of proc(5); None: not known."""
+    with contextlib.suppress(OSError, IndexError):
+        text = Path(f"/proc/{pid}/task/{pid}/stat").read_text(encoding="ascii", errors="replace")
+        return text.rpartition(")")[2].split()[0]
     return None
 
 
@@ -107,6 +113,11 @@ class Child:
     def running(self) -> bool:
         """Whether it has not ended."""
         return self.process.poll() is None
+
+    @property
+    def stopped(self) -> bool:
+        """Whether somebody has stopped it (SIGSTOP, a debugger); Linux."""
+        return _state(self.process.pid) in ("T", "t")
 
     @property
     def status_age(self) -> float:

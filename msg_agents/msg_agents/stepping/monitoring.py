@@ -43,6 +43,26 @@ class StallDetector:
         return True
 
 
+STUCK = 120.0  # s
+LONGEST_LOOK = 2.0  # s that count at most between two looks: this process may have been stopped with the others
+
+
+class StuckDetector:
+    """Notices that no step is made though nothing excuses it: a process that is stopped may be waited for for ever."""
+
+    def __init__(self, limit: float = STUCK, clock: Callable[[], float] = time.monotonic) -> None:
+        self.limit, self._clock = limit, clock
+        self._step, self._looked, self._still = -1, clock(), 0.0
+
+    def update(self, step: int, *, excused: bool) -> bool:
+        """Whether, for ``limit`` s, the counter has stood still without an excuse; to be called about once a second."""
+        now = self._clock()
+        elapsed, self._looked = min(now - self._looked, LONGEST_LOOK), now
+        self._still = 0.0 if excused or step != self._step else self._still + elapsed
+        self._step = step
+        return self._still > self.limit
+
+
 def silence_text(
     agents: Sequence[int], seconds: float, others: int, pids: Mapping[int, int], names: Sequence[str] | None
 ) -> str:

@@ -48,6 +48,12 @@ def test_profiles_for_fast_dds_3_differ_in_what_it_has_renamed(name: str) -> Non
 
 
 @pytest.mark.parametrize("path", [LOOPBACK_PROFILE, RELAYED_PROFILE], ids=lambda path: path.stem)
+def test_who_is_stopped_for_minutes_is_not_dropped(path: Path) -> None:
+    (lease,) = ET.parse(path).findall(".//{*}discovery_config/{*}leaseDuration/{*}sec")
+    assert int(lease.text or "") >= 30 * 60
+
+
+@pytest.mark.parametrize("path", [LOOPBACK_PROFILE, RELAYED_PROFILE], ids=lambda path: path.stem)
 def test_profiles_of_topics_have_the_times_of_the_others(path: Path) -> None:
     """The profile of a topic is read instead of the default one."""
     for kind in ("data_writer", "data_reader"):

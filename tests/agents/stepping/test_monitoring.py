@@ -4,7 +4,15 @@ import random
 
 import pytest
 
-from msg_agents.stepping.monitoring import ClockDetector, ClockOffsets, Lag, LagDetector, StallDetector, silence_text
+from msg_agents.stepping.monitoring import (
+    ClockDetector,
+    ClockOffsets,
+    Lag,
+    LagDetector,
+    StallDetector,
+    StuckDetector,
+    silence_text,
+)
 
 
 class Clock:
@@ -28,6 +36,23 @@ def test_a_stall_is_told_when_it_has_doubled(clock: Clock) -> None:
         if detector.update(7):
             told.append(second)
     assert told == [6, 11, 21, 41]  # the seven steps were made in the first second
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [("stands still", 131), ("moves once", 181), ("somebody is stopped", 281), ("all are paused", 130)],
+)
+def test_a_run_that_is_stuck_for_120_s(clock: Clock, kind: str, told: int) -> None:
+    """From second 10 on no step is made; a stop is an excuse, and a pause of this process is no time."""
+    detector, pause = StuckDetector(clock=clock), 0
+    for second in range(1, 401):
+        if kind == "all are paused" and second == 60:
+            pause = 350
+        clock.now = 100.0 + second + pause
+        step = min(second, 10) + (kind == "moves once" and second >= 60)
+        if detector.update(step, excused=kind == "somebody is stopped" and 20 <= second <= 160):
+            break
+    assert second == told
 
 
 def test_a_run_that_keeps_up(clock: Clock) -> None:
