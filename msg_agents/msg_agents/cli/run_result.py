@@ -50,10 +50,12 @@ def finish(
             complain(result.failures[0], "failed:")
     say(_ending(result), result.report)
     _show(result, as_json, verbose)
+    for line in result.not_kept:
+        complain(line, "not kept:")
     if result.incomplete or (analyse and result.bag is not None and result.comparison is None):
         sys.exit(ExitCode.INCOMPLETE)
-    if result.comparison is not None:
-        sys.exit(result.comparison.exit_code)
+    code = ExitCode.FINE if result.comparison is None else result.comparison.exit_code
+    sys.exit(code or (ExitCode.BAD_INPUT if result.not_kept else code))
 
 
 def _ending(result: RunResult) -> dict[str, Any]:
@@ -70,9 +72,9 @@ def _ending(result: RunResult) -> dict[str, Any]:
 
 def _show(result: RunResult, as_json: bool, verbose: bool) -> None:
     """Print the result on stdout; of an interrupted run, also write result.json."""
-    document = result.to_json()
     if result.interrupted:
         result.write()
+    document = result.to_json()
     if as_json:
         print_json(document)
         return

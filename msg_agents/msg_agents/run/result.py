@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from msg_analysis.common.files import REPORT_FILE, RESULT_FILE, write_whole
 from msg_analysis.common.text import json_text
+from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run import Run
 
@@ -149,6 +150,8 @@ class RunResult:
         with the prediction; None before ``conclude``
     report
         file of the report; None: not written
+    not_kept
+        files that could not be written, on a full disk for example, and why, one line each
     """
 
     experiment: Experiment
@@ -167,6 +170,7 @@ class RunResult:
     trajectory: Run | None = None
     comparison: Comparison | None = None
     report: Path | None = None
+    not_kept: list[str] = field(default_factory=list)
 
     @property
     def interrupted(self) -> bool:
@@ -201,6 +205,7 @@ class RunResult:
             "events": self.events,
             "rejected_messages": self.rejected_messages,
             "failures": self.failures,
+            "not_kept": self.not_kept,
             "clocks": self.clocks,
             "channel": self.channel,
             "until": self.until,
@@ -208,9 +213,16 @@ class RunResult:
         }
 
     def write(self) -> None:
-        """Write result.json into the bag, if there is a comparison, or an interrupted run that left a bag."""
+        """Write result.json into the bag, if there is a comparison, or an interrupted run that left a bag.
+
+        An error of the system is noted in ``not_kept``.
+        """
         if self.bag is not None and (self.comparison is not None or (self.interrupted and self.recorded)):
-            write_whole(self.bag / RESULT_FILE, json_text(self.to_json(), 1).encode() + b"\n")
+            file = self.bag / RESULT_FILE
+            try:
+                write_whole(file, json_text(self.to_json(), 1).encode() + b"\n")
+            except OSError as error:
+                self.not_kept.append(f"{file}: {error.strerror}")
 
     def interrupt(self, by: int, during: str) -> None:
         """Note that a signal has ended the run or the comparison.
@@ -241,7 +253,10 @@ def _without_comparison(experiment: Experiment) -> dict[str, Any]:
 
 
 def conclude(result: RunResult, report: ReportWhen = "always", **limits: float) -> None:
-    """Set the ``comparison`` (``limits``: arguments of it) of a run whose bag was read, and write report and result."""
+    """Set the ``comparison`` (``limits``: arguments of it) of a run whose bag was read, and write report and result.
+
+    What cannot be written is noted in ``not_kept``: the verdict holds without it.
+    """
     if result.trajectory is None or result.bag is None:
         return
     from msg_analysis.inference.pool import compare
@@ -255,16 +270,17 @@ def conclude(result: RunResult, report: ReportWhen = "always", **limits: float) 
     if report == "always" or (report == "on-failure" and comparison.verdict != "agrees"):
         from msg_analysis.report.page import write_report
 
-        file = result.bag / REPORT_FILE
-        write_report(
-            comparison,
-            file,
-            restarts=result.restarts,
-            rejected_messages=result.rejected_messages,
-            events=result.events,
-            wall_time=result.wall_time,
-            channel=result.channel,
-        )
-        result.report = file
+        try:
+            result.report = write_report(
+                comparison,
+                result.bag / REPORT_FILE,
+                restarts=result.restarts,
+                rejected_messages=result.rejected_messages,
+                events=result.events,
+                wall_time=result.wall_time,
+                channel=result.channel,
+            )
+        except InputError as error:
+            result.not_kept.append(str(error))
     result.comparison = comparison
     result.write()

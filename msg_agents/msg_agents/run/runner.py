@@ -369,7 +369,7 @@ def _keep_logs(folder: Path, directory: Path, result: RunResult) -> None:
         # The argument of shutil.Error is a list of (from, to, reason).
         reason = error.args[0][0][2] if isinstance(error, shutil.Error) else str(error)
         shutil.rmtree(directory, ignore_errors=True)
-        result.failures.append(f"the logs of the processes could not be kept: {reason}")
+        result.not_kept.append(f"{directory}: {reason}")
 
 
 def _settle(bag: Path, result: RunResult) -> None:

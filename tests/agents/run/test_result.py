@@ -1,10 +1,19 @@
 """What the processes of a run report: events, refused messages, what they wait for."""
 
+import json
 from collections import Counter
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from msg_agents.run.result import EventLog, StatusSummary, read_status_files, write_report
+import pytest
+from full_disk import full_disk
+from networks import experiment
+
+from msg_agents.cli.run_result import finish
+from msg_agents.run.result import EventLog, RunResult, StatusSummary, read_status_files, write_report
+from msg_agents.terminal import Interruption
+from msg_analysis.twin.simulate import simulate
 
 
 def test_events() -> None:
@@ -72,3 +81,30 @@ def test_counts_add_up_and_the_latest_word_on_waiting_counts(tmp_path: Path) -> 
 
 def test_a_full_disk_is_no_failure(tmp_path: Path) -> None:
     write_report(tmp_path / "no such folder" / "x.json", {})
+
+
+@pytest.mark.parametrize(
+    ("limit", "lost"), [(100, ["report.html", "result.json"]), (50_000, ["report.html"]), (None, ["result.json"])]
+)
+@pytest.mark.parametrize("as_json", [True, False])
+def test_the_verdict_is_said_without_room_for_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], limit: int | None, lost: list[str], as_json: bool
+) -> None:
+    """Files longer than so many bytes cannot be written; None: something else is where result.json should be."""
+    what = experiment(3, run={"duration": 100, "replicas": 8})
+    result = RunResult(what, tmp_path, trajectory=simulate(what))
+    if limit is None:
+        (tmp_path / "result.json").mkdir()
+    with nullcontext() if limit is None else full_disk(limit), pytest.raises(SystemExit) as ended:
+        finish(result, as_json, interruption=Interruption())
+    stdout, stderr = capsys.readouterr()
+    verdict = result.comparison.verdict
+    assert ended.value.code == {"agrees": 2, "disagrees": 1}[verdict]
+    assert verdict in stdout.lower()
+    if as_json:
+        assert json.loads(stdout)["not_kept"] == result.not_kept
+    said = [line for line in stderr.splitlines() if line.startswith("not kept: ")]
+    assert [line.split(":")[1].strip() for line in said] == [str(tmp_path / name) for name in lost]
+    assert sorted(path.name for path in tmp_path.iterdir() if path.is_file()) == sorted(
+        {"report.html", "result.json"} - set(lost)
+    )
