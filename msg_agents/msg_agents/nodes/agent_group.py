@@ -34,6 +34,7 @@ from msg_analysis.model.step_model import Wiring
 # batches for it by our profiles for one machine, and 5,000 by others: 40 MB in either case. One fits into a datagram.
 BATCH_SIZE, SMALL_BATCH_SIZE = 60_000, 2**13
 BATCH_TIME = 0.1  # s of wall time after which a batch is sent with the next state, however small it is
+LOOK_PERIOD = 0.5  # s between two looks whether the recorder is there
 ONLY_TOPICS = "MSG_AGENTS_ONLY_TOPICS"  # variable that turns this off where it is set, for comparison
 FEWEST = 16  # agents elsewhere that a process must need to read batches: fewer topics cost little, and ROS shows them
 FRESH = 0.02  # s for which what was found out about other processes is not looked up again
@@ -48,6 +49,7 @@ class StateBatches:
         self._messages: list[bytes] = []
         self._size, self._due = 0, 0.0
         self._found = False
+        self._most = 0  # readers that it had when the recorder was there
         bounded = has_profile_for(self.publisher.topic_name)
         self._full = BATCH_SIZE if bounded else SMALL_BATCH_SIZE
         every(node, SEND_PERIOD, self.send)
@@ -73,6 +75,14 @@ class StateBatches:
         """Whether the recorder has been discovered."""
         self._found = self._found or self._node.has_readers(self.publisher, [RECORDER])
         return self._found
+
+    def recorder_there(self) -> bool:
+        """Whether the recorder, once found, is still there: its lease for this process has not ended."""
+        count = self.publisher.get_subscription_count()
+        if count < self._most and not self._node.has_readers(self.publisher, [RECORDER]):
+            return False  # when it is back, its name may come later
+        self._most = count
+        return True
 
 
 def reads_most(remote: int, others: int) -> bool:
@@ -223,6 +233,9 @@ class AgentGroup:
         self._batches = [each for each in (self.states, self.exact_states) if each]
         self._resend: Publisher | None = None
         self._sending = False  # whether ``_send_states`` will be called
+        self.paused = False  # whether the recorder has gone: agents in lockstep wait for it
+        if self._awaits_recorder:
+            every(self._host, LOOK_PERIOD, self._look_for_recorder)
         self._asked: dict[int, int] = {}  # agents (from 0) that are to be asked for their states from a step on
         if any(agent.resumed for agent in self.nodes):  # which will ask: in time to be discovered with the rest
             self._resend = self._host.publisher_of(topics.RESEND)
@@ -231,6 +244,15 @@ class AgentGroup:
         if record.until:
             self._host.subscribe(topics.STOP, self._receive_stop)
         self._host.finish_at_end(self.nodes)
+
+    def _look_for_recorder(self) -> None:
+        """Make no steps while it is gone, which it is when it was stopped for too long; then repeat what it missed."""
+        gone = not all(batches.recorder_there() for batches in self._batches)
+        if gone == self.paused:
+            return
+        self.paused = gone
+        for agent in () if gone else self.nodes:
+            agent.rejoin()
 
     def _end_turns(self) -> None:
         if self.links.read and not self._sending:  # other processes wait for these states

@@ -57,6 +57,12 @@ class LockstepAgent(Agent):
         super().begin()
         self._turns.join(self)
 
+    def rejoin(self) -> bool:
+        """See Agent. It may have been waiting for the recorder."""
+        there = super().rejoin()
+        self._turns.ask(self)
+        return there
+
     def _first_missed(self) -> int:
         """See Agent. What is used from one step before the window on: no peer is further behind."""
         first, reception = max(0, self._law.step - LOCKSTEP_WINDOW - 1), self._law.air
@@ -73,7 +79,7 @@ class LockstepAgent(Agent):
             return Health("has made all steps", values=values)
         if not stall.stalled:
             return Health(f"at step {step}", values=values)
-        waiting = self.values.waiting_for()
+        waiting = "the recorder" if self._group.paused else self.values.waiting_for()
         if overdue and step == 0 and self.get_name() in self.duplicate_names():
             self._group.fail(self.duplicate_name_error([self.get_name()], stall.stalled))  # others have started
         elif overdue:
@@ -101,7 +107,7 @@ class LockstepAgent(Agent):
 
     def _make_steps(self) -> None:
         synchronizer, law = self.values, self._law
-        while synchronizer.ready():
+        while not self._group.paused and synchronizer.ready():
             mode, values = synchronizer.inputs()
             law.advance(mode, values)
             synchronizer.advance()
