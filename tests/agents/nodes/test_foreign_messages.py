@@ -110,6 +110,7 @@ def test_damaged_messages(tmp_path: Path, pace: str) -> None:
         assert not node.done.done()
     for node in nodes:
         node.finish(complete=False, deadline=0.0)
+    for node in nodes:
         node.destroy_node()
     del presence
     assert {"/graph", "/resend", "/progress", "/experiment", "/end", "/leave", "/states", "/agent_3/state"} <= read
