@@ -19,7 +19,7 @@ import yaml
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from msg_agents.discovery.rtps import LOOPBACK, LOOPBACK_PROFILE, PROFILE_VARIABLES, discovery_ports, disposal_message
+from msg_agents.discovery.rtps import LOOPBACK, discovery_ports, disposal_message
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.runs import read_result
 from msg_analysis.twin.check import check
@@ -193,10 +193,10 @@ LONGEST_STOP = 120.0 if "STRESS" in os.environ else 2.0  # s
 @pytest.mark.timeout(600)
 def test_stopped_processes(network: Any, repetition: int, rng: random.Random) -> None:
     """Any of the run, up to all, for any time: the others wait for them, and nothing is lost."""
-    file = network.file(run={"duration": 300, "processes": rng.choice([1, 2, 5])})
+    file = network.file(run={"duration": 800, "processes": rng.choice([2, 5])})
     run = network.record(file, "--json")
     network.wait_for_steps()
-    time.sleep(rng.uniform(0.0, 1.0))
+    time.sleep(rng.uniform(0.0, 0.5))
     there = sorted(network.processes(), key=lambda process: process.pid)
     victims = rng.sample(there, rng.choice([1, len(there), rng.randint(1, len(there))]))
     for process in victims:
@@ -204,24 +204,6 @@ def test_stopped_processes(network: Any, repetition: int, rng: random.Random) ->
     time.sleep(rng.uniform(1.0, LONGEST_STOP))
     for process in rng.sample(victims, len(victims)):
         process.kill(signal.SIGCONT)
-    assert network.completed(run)["restarts"] == []
-
-
-@pytest.mark.timeout(150)
-def test_a_recorder_that_was_dropped(network: Any, tmp_path: Path) -> None:
-    """It was stopped for longer than its lease, which is short in a profile of the user's: agents wait, and repeat."""
-    profile = tmp_path / "short.xml"
-    text, changes = re.subn(r"(<leaseDuration><sec>)\d+", r"\g<1>4", LOOPBACK_PROFILE.read_text())
-    profile.write_text(text.replace("<leaseAnnouncement><sec>3", "<leaseAnnouncement><sec>1"))
-    assert changes == 1
-    file = network.file(run={"duration": 1500, "processes": 2})
-    variables = dict.fromkeys(PROFILE_VARIABLES, str(profile))
-    run = network.execute(*network.recording(file), "--json", **variables)
-    network.wait_for_steps()
-    (recorder,) = network.processes("recorder")
-    recorder.kill(signal.SIGSTOP)
-    time.sleep(7.0)
-    recorder.kill(signal.SIGCONT)
     assert network.completed(run)["restarts"] == []
 
 
