@@ -100,7 +100,7 @@ def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
     assert reports.read_text().splitlines().count(f"1 {step}") >= 3  # it goes on saying where it stands
     for line in (note, *(f"note: {later}\n" for later in result["notes"])):  # said again while it stands still for long
         assert re.match(rf"note: no step for \d+ s: .*agent_1: at step {step}, waiting for {words}", line)
-        assert line.endswith("; no report from agent_2\n")
+        assert line.endswith(f"; stopped, and waited for: agent_2 (PID {victim.pid})\n")
 
     known = statuses(heard)
     assert heard_of(heard) == {*(f"agent_{i}: network" for i in range(1, 6)), "switcher: network", "recorder: network"}

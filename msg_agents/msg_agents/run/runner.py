@@ -313,9 +313,10 @@ def _watch(
 def _stall_causes(supervisor: Supervisor, names: Sequence[str] | None) -> str:
     """Causes of a stall, as far as they are known; a silent process is stopped, or waits for one that is."""
     words = [f"{node}: {message}" for node, message in sorted(supervisor.status().waiting.items())]
-    if stopped := [f"{child.spec.name} (PID {child.process.pid})" for child in supervisor.running if child.stopped]:
-        words.append(f"stopped, and waited for: {', '.join(stopped)}")
-    silent = [child.spec.name for child in supervisor.silent if not child.stopped]
+    stopped = {child.spec.name: child.process.pid for child in supervisor.running if child.stopped}
+    if stopped:
+        words.append("stopped, and waited for: " + ", ".join(f"{name} (PID {pid})" for name, pid in stopped.items()))
+    silent = [child.spec.name for child in supervisor.silent if child.spec.name not in stopped]
     if silent:
         words.append("no report from " + ", ".join(silent))
     if not words and supervisor.steps:  # the processes that know are on another host
