@@ -120,7 +120,7 @@ def check_domain() -> None:
 
 def discovery_scope() -> str:
     """Where the nodes of this process find others, as text."""
-    domain, reach = os.environ.get("ROS_DOMAIN_ID", "0"), os.environ.get(RANGE_VARIABLE, "SUBNET")
+    domain, reach = os.environ.get("ROS_DOMAIN_ID") or "0", os.environ.get(RANGE_VARIABLE) or "SUBNET"
     return f"in ROS_DOMAIN_ID {domain} and within ROS_AUTOMATIC_DISCOVERY_RANGE {reach}"
 
 
@@ -166,7 +166,8 @@ def profile_variables(profile: Path, distribution: str | None = None) -> dict[st
 def node_environment(domain: int, profile: Path = LOOPBACK_PROFILE) -> dict[str, str]:
     """Our environment with what the nodes need; another discovery range or profile of the user's is kept."""
     own = {"PYTHONUNBUFFERED": "1", "ROS_DOMAIN_ID": str(domain)}
-    environment = {**SINGLE_THREAD, **os.environ, **own}
+    given = {name: value for name, value in os.environ.items() if value}  # empty is unset, as in ROS 2 and Python
+    environment = {**SINGLE_THREAD, **given, **own}
     local = environment.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
     if local and not any(environment.get(name) for name in PROFILE_VARIABLES):
         environment[RANGE_VARIABLE] = "SYSTEM_DEFAULT"  # the profile decides
@@ -208,14 +209,13 @@ def run_environment(
     with ExitStack() as stack:
         if domain is None:
             domain = stack.enter_context(free_domain(domains_for(participants)))
-        environment = node_environment(domain, RELAYED_PROFILE) | dict(changes)
         relay = None
         if uses_relay(changes):
             require_loopback()
-            try:
+            with suppress(OSError):  # many others are in this domain
                 relay = stack.enter_context(DiscoveryRelay(domain))
-            except OSError:  # many others are in this domain
-                environment = node_environment(domain) | dict(changes)
+        # The relayed profile announces to the relay only: without it, no process would find another.
+        environment = node_environment(domain, RELAYED_PROFILE if relay else LOOPBACK_PROFILE) | dict(changes)
         require_discovery(environment)
         require_shared_memory()
         environment |= other_logs(folder / ROS_LOGS)
@@ -226,4 +226,4 @@ def uses_relay(changes: Mapping[str, str]) -> bool:
     """Whether the middleware will follow our profile: not if that of the user, or of several hosts, is used."""
     environment = node_environment(0, RELAYED_PROFILE) | dict(changes)
     ours = environment.get(PROFILE_VARIABLES[-1]) == str(RELAYED_PROFILE)
-    return ours and environment.get("RMW_IMPLEMENTATION", "rmw_fastrtps").startswith("rmw_fastrtps")
+    return ours and (environment.get("RMW_IMPLEMENTATION") or "rmw_fastrtps").startswith("rmw_fastrtps")

@@ -31,7 +31,7 @@ SMALL_BLOCK = 200_000  # the same where there are several such arrays: they stay
 
 
 def _large() -> int:
-    value = os.environ.get(LARGE_VARIABLE, str(LARGE))
+    value = os.environ.get(LARGE_VARIABLE) or str(LARGE)
     try:
         return int(value)
     except ValueError:

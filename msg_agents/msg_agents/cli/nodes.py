@@ -280,7 +280,7 @@ def _run_nodes(
         exit_with_pipe(lifeline)
     from msg_agents.nodes.process import run_nodes
 
-    executor = os.environ.get("MSG_AGENTS_EXECUTOR", "events")
+    executor = os.environ.get("MSG_AGENTS_EXECUTOR") or "events"
     throughput = record.experiment.run.pace == "lockstep"
     options |= {"status_file": status_file, "relay": introduction, "peer_timeout": timeout}
     options["one_record"] = lifeline is not None and timeout is None

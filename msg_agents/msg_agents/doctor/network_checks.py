@@ -153,7 +153,7 @@ def check_server() -> CheckResult:
 def check_peers() -> CheckResult:
     """Other machines that are named."""
     peers = os.environ.get(PEERS_VARIABLE)
-    alone = os.environ.get(RANGE_VARIABLE, "LOCALHOST") == "LOCALHOST"
+    alone = (os.environ.get(RANGE_VARIABLE) or "LOCALHOST") == "LOCALHOST"
     warning = f"{PEERS_VARIABLE}: {peers}: nodes of a run contact these machines: unset it, or {RANGE_VARIABLE}"
     text = f"{peers} (not used by a run on this machine)" if peers else "none"
     return warn_if("static_peers", warning if peers and not alone else None, text)

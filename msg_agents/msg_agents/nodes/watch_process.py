@@ -207,7 +207,7 @@ def run_watcher(
 
 
 def _other_domain() -> str:
-    mine = os.environ.get("ROS_DOMAIN_ID", "0")
+    mine = os.environ.get("ROS_DOMAIN_ID") or "0"
     found = [str(domain) for domain in held_domains() if str(domain) != mine]
     return "Another domain: --domain D" + (f"; runs on this machine are in {', '.join(found)}" if found else "")
 

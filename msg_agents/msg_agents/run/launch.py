@@ -310,4 +310,4 @@ class LaunchedReplay(LaunchedProcesses):
 
 def environment() -> dict[str, str]:
     """Additions to the launch's environment."""
-    return {name: os.environ.get(name, number) for name, number in SINGLE_THREAD.items()}
+    return {name: os.environ.get(name) or number for name, number in SINGLE_THREAD.items()}

@@ -20,7 +20,7 @@ from msg_agents.discovery.rtps import (
     has_profile_for,
     profile_for_hosts,
 )
-from msg_agents.environment import node_environment, profile_variables
+from msg_agents.environment import node_environment, profile_variables, run_environment
 from msg_analysis.messages.topics import STATES, TRUTHS
 
 OLD, NEW = "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"
@@ -165,3 +165,28 @@ def test_the_older_variable_for_this_machine_does_not_reach_the_nodes(
     environment = node_environment(0)
     assert "ROS_LOCALHOST_ONLY" not in environment
     assert environment[NEW].endswith("loopback.xml")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("RMW_IMPLEMENTATION", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_DISCOVERY_SERVER", "ROS_LOCALHOST_ONLY"),
+        *("ROS_DOMAIN_ID", "FASTDDS_BUILTIN_TRANSPORTS", "OMP_NUM_THREADS", *PROFILE_VARIABLES),
+    ],
+)
+def test_an_empty_variable_is_one_that_is_not_set(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As compose files make it by ``NAME: ${NAME}``."""
+    found = []
+    for change in (lambda: monkeypatch.delenv(name, raising=False), lambda: monkeypatch.setenv(name, "")):
+        change()
+        with run_environment(tmp_path, 231, {}, 3) as (_, environment, relay):
+            found.append((environment, relay is None))
+    assert found[0] == found[1]
+    assert not found[0][1]
+
+
+def test_without_a_relay_no_profile_relies_on_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
+    with run_environment(tmp_path, 231, {}, 3) as (_, environment, relay):
+        assert relay is None
+        assert environment[NEW] == str(LOOPBACK_PROFILE)
