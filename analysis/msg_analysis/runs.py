@@ -180,7 +180,7 @@ def tested_error(document: dict[str, Any], file: Path) -> dict[str, float | None
 
 Status = Literal["compared", "not compared", "recording", "torn", "empty", "foreign", "damaged"]
 
-_STAMP = re.compile(r"_(\d{8}_\d{6})(?:_\d+)?$")  # of the folder of a run: its start, by the clock of its machine
+_STAMP = re.compile(r"_(\d{8}_\d{6})(?:_\d+)?$")  # of the folder of a run: its start, in UTC
 _CLOCKS = 10**18  # ns: a bag that starts earlier, in 2001, has the simulated time of the twin
 _OURS = {"log", ".recording"}  # what a run makes before anything is recorded
 
@@ -191,7 +191,7 @@ class RunEntry:
 
     folder: str
     status: Status
-    date: datetime  # of the start, in local time
+    date: datetime  # of the start, in UTC
     problem: str | None = None  # why the folder is foreign or damaged
     name: str | None = None  # of the experiment
     seed: int | None = None
@@ -233,7 +233,7 @@ def _entry(folder: Path) -> RunEntry:
         names = {entry.name for entry in folder.iterdir()}
         date = _date(folder, names)
     except OSError as error:
-        return RunEntry(str(folder), "damaged", datetime.now().astimezone(), error.strerror)
+        return RunEntry(str(folder), "damaged", datetime.now(UTC), error.strerror)
     report = str(folder / REPORT_FILE) if REPORT_FILE in names else None
     problem = None
     if RESULT_FILE in names:
@@ -248,21 +248,21 @@ def _entry(folder: Path) -> RunEntry:
 
 
 def _date(folder: Path, names: set[str]) -> datetime:
-    """When the run began: by the name of its folder, its record, its bag, or when the bag was last changed."""
+    """When the run began, in UTC: by its record, the name of its folder, its bag, or when the bag was last changed."""
+    from msg_analysis.bags.reading import started
+
+    if (recorded := started(folder)) is not None:
+        return recorded.astimezone(UTC)
     stamp = _STAMP.search(folder.name)
     if stamp:
         try:
-            return datetime.strptime(stamp[1], "%Y%m%d_%H%M%S").astimezone()
+            return datetime.strptime(stamp[1], "%Y%m%d_%H%M%S").replace(tzinfo=UTC)
         except ValueError:  # no date
             pass
-    from msg_analysis.bags.reading import started  # here: where all folders have dates, no bag is touched
-
-    if (recorded := started(folder)) is not None:
-        return recorded.astimezone()
     start = starting_time(folder) if METADATA_FILE in names else None
     if start is not None and start > _CLOCKS:
-        return datetime.fromtimestamp(start / 1e9, UTC).astimezone()
-    return datetime.fromtimestamp((first_file(folder) or folder).stat().st_mtime).astimezone()
+        return datetime.fromtimestamp(start / 1e9, UTC)
+    return datetime.fromtimestamp((first_file(folder) or folder).stat().st_mtime, UTC)
 
 
 def _compared(folder: Path, date: datetime, report: str | None) -> RunEntry:
@@ -386,7 +386,7 @@ class RunFilter:
 
 
 def moment(text: str, option: str, now: datetime, *, end: bool = False) -> datetime:
-    """A date (its beginning, or its ``end``), a local or zoned date and time, or an age before ``now``; InputError."""
+    """A date (its beginning, or its ``end``), a time in UTC or with a zone, or an age before ``now``; InputError."""
     age = _AGE.fullmatch(text)
     try:
         if age:
@@ -394,7 +394,7 @@ def moment(text: str, option: str, now: datetime, *, end: bool = False) -> datet
         found = datetime.fromisoformat(text)
         if end and not re.search(r"[T: ]", text):
             found += timedelta(days=1)
-        return found if found.tzinfo else found.astimezone()
+        return found if found.tzinfo else found.replace(tzinfo=UTC)
     except (ValueError, OverflowError):
         raise InputError(
             f"{option} {text}: expected a date (2026-11-25), a date and a time (2026-11-25T14:30), or an age in "

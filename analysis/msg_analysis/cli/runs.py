@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     multiple=True,
     help="Only runs with this verdict; none: without one. Repeatable.",
 )
-@click.option("--since", metavar="WHEN", help="Only runs from then on: 2026-11-25, 2026-11-25T14:30, or 7d for 7 days.")
+@click.option("--since", metavar="WHEN", help="Only runs from then on: 2026-11-25, 2026-11-25T14:30 (UTC), or 7d.")
 @click.option("--until", metavar="WHEN", help="Only runs up to then; a date is included.")
 @seed_option
 @click.option("--last", type=click.IntRange(1), metavar="N", help="Only the newest N of these.")
@@ -75,12 +75,12 @@ def runs(
 
     Uses saved results (or the run record); does not read states. The page compares the runs of an experiment.
     """
-    from datetime import datetime
+    from datetime import UTC, datetime
 
     from msg_analysis.common.files import require_place
     from msg_analysis.runs import RunFilter, list_runs, moment
 
-    now = datetime.now().astimezone()
+    now = datetime.now(UTC)
     wanted = RunFilter(
         since=moment(since, "--since", now) if since is not None else None,
         until=moment(until, "--until", now, end=True) if until is not None else None,

@@ -10,7 +10,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -138,7 +138,7 @@ def render_runs(runs: Sequence[RunEntry], folder: Path, place: Path) -> str:
         signs=SYMBOLS,
         names=[name for name, _ in Counter(run.name for run in runs if run.name is not None).most_common()],
         data={"runs": rows, "documents": [texts for _, texts in documents.values()], "half": HALF_WIDTH_95},
-        written=datetime.now().astimezone().strftime("%Y-%m-%d %H:%M"),
+        written=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     )
 
 

@@ -337,7 +337,7 @@ def print_salvage(document: dict[str, Any], console: Console) -> None:
 
 
 _STYLES = {"agrees": "green", "disagrees": "bold red", "late": "yellow", "incomplete": "yellow"}
-_OPTIONAL = ("predicted", "z", "± (95 %)", "date", "experiment")  # of runs, as in ``that_fit``
+_OPTIONAL = ("predicted", "z", "± (95 %)", "date (UTC)", "experiment")  # of runs, as in ``that_fit``
 
 
 def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Console) -> None:
@@ -345,7 +345,7 @@ def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Cons
     if not runs:
         console.print(Text(f"{folder}: no run" if not total else f"{folder}: none of {counted(total, 'run')}"))
         return
-    heads = ["run", "experiment", "date", "seed", "verdict", "system error", "± (95 %)", "predicted", "z"]
+    heads = ["run", "experiment", "date (UTC)", "seed", "verdict", "system error", "± (95 %)", "predicted", "z"]
     rows = [
         [
             Path(run.folder).name,
@@ -362,7 +362,7 @@ def print_runs(runs: Sequence[RunEntry], folder: Path, total: int, console: Cons
     ]
     columns = dict(zip(heads, zip(*rows, strict=True), strict=True))
     if all(Path(run.folder).name.startswith(f"{run.name}_{run.date:%Y%m%d_%H%M}") for run in runs):
-        del columns["experiment"], columns["date"]  # the names of the folders have them
+        del columns["experiment"], columns["date (UTC)"]  # the names of the folders have them
     shown = that_fit(console, columns, _OPTIONAL)
     table = number_table(console, f"Runs in {folder}", *shown)
     for run, cells in zip(runs, zip(*shown.values(), strict=True), strict=True):

@@ -11,7 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ def temporary_directory(room: int | None = None, memory: Path = MEMORY) -> Itera
 def make_bag_directory(experiment: Experiment, out: Path, *, option: str = "--out: ") -> Path:
     """Make an empty directory <out>/<name>_<time> for a new bag; ``option``: how the user gave ``out``."""
     require_utf8(out)
-    stem = f"{experiment.name}_{datetime.now():%Y%m%d_%H%M%S}"
+    stem = f"{experiment.name}_{datetime.now(UTC):%Y%m%d_%H%M%S}"
     candidate, number = out / stem, 2
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -5,6 +5,7 @@ import fcntl
 import json
 import os
 import shutil
+import time
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,7 @@ def test_a_run_with_a_result(tmp_path: Path, bag: Path) -> None:
     (folder / "pair_0.mcap").write_bytes(b"not read")
     (folder / "report.html").write_text("")
     entry = only(tmp_path)
-    assert entry.date == datetime(2026, 11, 25, 13, 5, 1).astimezone()
+    assert entry.date == datetime(2026, 11, 25, 13, 5, 1, tzinfo=UTC)
     kept = {key: RESULT[key] for key in ("verdict", "run", "seed", "simulated_time")}
     kept |= {key: RESULT["system_error"][key] for key in ("measured", "predicted", "standard_error", "z")}
     kept |= {"status": "compared", "date": entry.date.isoformat(), "problem": None, "name": "pair", "prediction": None}
@@ -81,12 +82,12 @@ def test_a_short_run_has_the_error_given_the_path(tmp_path: Path) -> None:
 
 
 def test_runs_without_a_result(tmp_path: Path, bag: Path) -> None:
-    """Whole, torn, being recorded; the date is that of the name."""
+    """Whole, torn, being recorded; the date is that of the record."""
     shutil.copytree(bag, tmp_path / bag.name)
     entry = only(tmp_path)
     assert (entry.status, entry.name, entry.seed, entry.verdict) == ("not compared", "pair", 7, None)
     assert entry.run == str(read_bag(bag).record.run)
-    assert entry.date == datetime(2026, 11, 25, 12).astimezone()
+    assert entry.date == read_bag(bag).record.started
     (file,) = (tmp_path / bag.name).glob("*.mcap")
     file.write_bytes(file.read_bytes()[:-500])
     (tmp_path / bag.name / "metadata.yaml").unlink()
@@ -125,6 +126,23 @@ def test_other_folders_are_listed_with_a_word(tmp_path: Path) -> None:
     expected = damaged | {"empty": "empty", "photos": "foreign", "bag": "foreign"}
     assert {name: entry.status for name, entry in found.items()} == expected
     assert "tests: expected a list of objects" in (found["result_c"].problem or "")
+
+
+@pytest.mark.parametrize("zone", ["America/New_York", "Asia/Tokyo", "Pacific/Kiritimati"])
+def test_dates_do_not_depend_on_the_zone_of_a_machine(zone: str, tmp_path: Path, bag: Path, monkeypatch: Any) -> None:
+    """The folder was named by another clock; the record has UTC."""
+    began = read_bag(bag).record.started
+    shutil.copytree(bag, tmp_path / "pair_20260101_000000")
+    monkeypatch.setenv("TZ", zone)
+    time.tzset()
+    try:
+        entry = only(tmp_path)
+        since = moment(f"{began:%Y-%m-%dT%H:%M:%S}", "--since", began)
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert entry.to_json()["date"] == f"{began:%Y-%m-%dT%H:%M:%S}+00:00"
+    assert RunFilter(since=since).choose([entry]) == [entry]
 
 
 def test_dates_without_a_name(tmp_path: Path) -> None:
@@ -204,9 +222,9 @@ def test_order(key: Any, found: str) -> None:
         ("30m", False, NOW - timedelta(minutes=30)),
         ("12h", True, NOW - timedelta(hours=12)),
         ("7d", False, NOW - timedelta(days=7)),
-        ("2026-11-25", False, datetime(2026, 11, 25).astimezone()),
-        ("2026-11-25", True, datetime(2026, 11, 26).astimezone()),
-        ("2026-11-25T14:30", True, datetime(2026, 11, 25, 14, 30).astimezone()),
+        ("2026-11-25", False, datetime(2026, 11, 25, tzinfo=UTC)),
+        ("2026-11-25", True, datetime(2026, 11, 26, tzinfo=UTC)),
+        ("2026-11-25T14:30", True, datetime(2026, 11, 25, 14, 30, tzinfo=UTC)),
         ("2026-11-25T14:30+02:00", False, datetime(2026, 11, 25, 12, 30, tzinfo=UTC)),
     ],
 )
