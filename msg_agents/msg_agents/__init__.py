@@ -23,7 +23,7 @@ __all__ = ["run_network"]
 def run_network(experiment: str | Path | Experiment, out: str | Path = "runs", **options: Any) -> Run:
     """Run an experiment as a network of ROS 2 processes, as ``msg-agents run`` does, and read its bag.
 
-    To be called from the main thread, since it handles signals.
+    In the main thread, a signal ends the run in order; in others, signals are those of the main thread.
 
     Parameters
     ----------

@@ -12,6 +12,7 @@ import select
 import signal
 import sys
 import termios
+import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
@@ -22,6 +23,11 @@ from typing import Any, Self
 from msg_analysis.errors import killed_by
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def _can_handle() -> bool:
+    """Whether this thread can set handlers of signals; in others, as of asyncio, signals are the main thread's."""
+    return threading.current_thread() is threading.main_thread()
 
 
 def exit_on_signals() -> None:
@@ -59,7 +65,7 @@ class Interruption:
     def keep(self) -> None:
         """Keep signals from now on."""
         for number in SIGNALS:
-            if number not in self._handlers and not _under_nohup(number):
+            if number not in self._handlers and not _under_nohup(number) and _can_handle():
                 self._handlers[number] = signal.signal(number, self._catch)
 
     def end(self) -> None:

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Self
 import click
 from click.exceptions import Exit
 
-from msg_analysis.errors import INTERRUPTED, ExitCode, InputError, killed_by
+from msg_analysis.errors import INTERRUPTED, ExitCode, InputError, killed_by, lack
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -67,6 +67,7 @@ class CommandGroup(click.Group):
         """Run the program; see click.Command."""
         _open_closed_streams()
         _tolerate_streams()
+        os.environ["MPLBACKEND"] = "Agg"  # that of a Jupyter kernel, for example, cannot be loaded here
         return super().main(*args, **extra)
 
     def make_context(self, *args: Any, **extra: Any) -> click.Context:
@@ -98,19 +99,35 @@ def _exit_codes() -> Iterator[None]:
     except OSError as error:
         from msg_analysis.common.files import no_temporary_directory
 
-        if error.filename is not None:
+        if error.filename is not None and lack(error) is None:
             complain(f"{error.filename}: {error.strerror}")
         elif error.errno in NOT_WRITTEN:
             place = "stdout" if _stdout_can_fail() else "a file"
             _drop_stdout()
             complain(f"{place}: {error.strerror}: the result could not be written")
-        elif words := no_temporary_directory(error):
+        elif words := lack(error) or no_temporary_directory(error):
             complain(words)
         else:
-            raise
+            raise _fault(error) from error
         raise Exit(ExitCode.BAD_INPUT) from error
     except KeyboardInterrupt as error:
         raise Exit(INTERRUPTED) from error
+    except (Exit, click.Abort):
+        raise
+    except Exception as error:
+        raise _fault(error) from error
+
+
+def _fault(error: Exception) -> Exit:
+    """Say what the process lacks, or that the program has a fault; the end of the command."""
+    if words := lack(error):
+        complain(words)
+        return Exit(ExitCode.BAD_INPUT)
+    from traceback import format_exception
+
+    click.echo("".join(format_exception(error)), err=True, nl=False)
+    complain("a fault of this program: please report it, with the lines above and the command")
+    return Exit(ExitCode.FAULT)
 
 
 def _open_closed_streams() -> None:
@@ -162,6 +179,13 @@ def _drop_stdout() -> None:
     """Redirect stdout to /dev/null, so that the flush at exit does not fail again."""
     with suppress(OSError, ValueError):  # a stream without a file, in tests
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def plain_matplotlib() -> None:
+    """Before a command draws: the settings of the user, such as LaTeX, are for other figures."""
+    import matplotlib as mpl
+
+    mpl.rcdefaults()
 
 
 def complain(text: str, label: str = "error:") -> None:

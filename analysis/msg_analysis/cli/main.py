@@ -4,7 +4,7 @@
 """The command line ``msg-analysis``: each command parses, calls one function and prints.
 
 Results go to stdout, everything else to stderr. Exit codes: 0 fine or agrees, 1 disagrees, 2 bad usage or
-input, 3 data incomplete. Slow imports are made inside the commands that need them.
+input, 3 data incomplete, 4 late, 70 a fault of the program. Slow imports are made inside the commands that need them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from msg_analysis.cli import runs, sweep, theory
-from msg_analysis.cli.console import CommandGroup, complain, examples, print_json, print_text, result_console
+from msg_analysis.cli.console import (
+    CommandGroup,
+    complain,
+    examples,
+    plain_matplotlib,
+    print_json,
+    print_text,
+    result_console,
+)
 from msg_analysis.cli.options import (
     BAG,
     PATH,
@@ -187,6 +195,7 @@ def figures(
     """
     from msg_analysis.paper.figures import write_figures
 
+    plain_matplotlib()
     numbers = (1, 2, 3) if example == "all" else (int(example),)
     chosen = tuple(dict.fromkeys(formats))
     if emulate:

@@ -41,6 +41,12 @@ class InputPath(click.Path):
         self._suffixes = suffixes
         self._holds = tuple(holds)
 
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path; an empty text, as of a shell variable that is not set, is none. See click.ParamType."""
+        if not os.fspath(value):
+            self.fail("an empty text: expected a path", param, ctx)
+        return super().convert(value, param, ctx)
+
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         """Complete to such paths, and to directories on the way to them; see click.ParamType."""
         del ctx, param

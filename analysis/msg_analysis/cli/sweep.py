@@ -13,7 +13,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from msg_analysis.cli.console import complain, examples, print_json, print_note, print_notes, print_text, result_console
+from msg_analysis.cli.console import (
+    complain,
+    examples,
+    plain_matplotlib,
+    print_json,
+    print_note,
+    print_notes,
+    print_text,
+    result_console,
+)
 from msg_analysis.cli.options import YAML, choice_option, json_option, out_option
 from msg_analysis.errors import ExitCode, InputError, killed_by
 from msg_analysis.sweeps.points import require_libraries
@@ -103,6 +112,7 @@ def sweep(
         document = finite(describe_sweep(plan, done, judgement, rows))
         try:
             files = write_tables(rows, document, directory)
+            plain_matplotlib()
             shown = picture(plan, rows, column)
             files += write_figure(shown, f"{plan.name}: {plan.kind}", directory)
             page = render_sweep(plan, rows, column, summary(document), judgement.verdict)
@@ -171,6 +181,7 @@ def emulate(
     from msg_analysis.sweeps.results import ResultStore
 
     require_libraries()
+    plain_matplotlib()
     runs = [run for number in numbers for run in runs_of(number)]
     directory = out / "emulation"
     network = options(directory, False, 1)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from msg_analysis.cli.console import examples, print_json, result_console
+from msg_analysis.cli.console import examples, plain_matplotlib, print_json, result_console
 from msg_analysis.cli.options import (
     FILE,
     SOURCE,
@@ -217,6 +217,7 @@ def spectrum(
         from msg_analysis.report.figures import require_format, spectrum_figure, write_spectrum
 
         require_format(figure)
+        plain_matplotlib()
     found = measure_spectrum(source, level) if is_bag(source) else predicted_spectrum(load_experiment(source, changes))
     if figure:
         write_spectrum(spectrum_figure(found.predicted, found.log, found.density), figure)

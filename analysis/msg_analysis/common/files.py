@@ -23,6 +23,8 @@ REPORT_FILE = "report.html"  # the same
 
 def require_place(file: Path | None) -> None:
     """Refuse, before long work, a path where no file can be put, whatever the permissions; None: no file."""
+    if file is not None:
+        require_utf8(file)
     if file is not None and not file.parent.is_dir():
         raise InputError(f"{file}: no such directory {file.parent}: create it")
     if file is not None and file.exists() and not file.is_file():

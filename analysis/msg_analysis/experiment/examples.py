@@ -47,8 +47,10 @@ def find(given: str | Path, folder: Path = Path()) -> Path:
     """The file of an experiment: ``given``, relative to ``folder``, or an example. InputError: neither."""
     # A file wins over an example, also with the ending .yaml. What has a slash or an ending is a path, not checked.
     word = str(given)
+    if not word:
+        raise InputError(f"no experiment: the text is empty: expected a file, or one of {', '.join(names())}")
     path = folder / word
-    if os.sep in word or (path.exists() and not path.is_dir()):
+    if os.sep in word or word in (os.curdir, os.pardir) or (path.exists() and not path.is_dir()):
         return path
     if path.suffix:
         if path.suffix == SUFFIX and path.stem in names():
@@ -58,7 +60,7 @@ def find(given: str | Path, folder: Path = Path()) -> Path:
         return own
     if word in names():
         return FOLDER / f"{word}{SUFFIX}"
-    if path.is_dir() or word == "":
+    if path.is_dir():
         return path
     raise InputError(f"{word}: no such file, and no example of this name: expected a file, or one of {_listed(word)}")
 

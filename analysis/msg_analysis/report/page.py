@@ -205,7 +205,7 @@ def write_report(
     }
     html = render(comparison, wall_time=wall_time, **network)
     try:
-        write_whole(path, html.encode())
+        write_whole(path, html.encode(errors="replace"))  # names of files need not be UTF-8
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}): choose another place") from error
     return path

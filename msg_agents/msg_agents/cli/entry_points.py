@@ -21,15 +21,9 @@ if TYPE_CHECKING:
 
 def _run(*command: str) -> None:
     atexit.register(_leave_garbage)
-    try:
-        from msg_analysis.cli.entry_point import collect_garbage_seldom  # not above: ros2 loads the verb without it
+    from msg_analysis.cli.entry_point import command_line  # not above: ros2 loads the verb without it
 
-        collect_garbage_seldom()
-        from msg_agents.cli.main import main
-    except KeyboardInterrupt:  # the command group handles it only after these imports
-        from msg_analysis.errors import INTERRUPTED
-
-        sys.exit(INTERRUPTED)
+    main = command_line("msg_agents.cli.main")
     main([*command, *sys.argv[1:]], prog_name="msg-agents")
 
 
