@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from msg_analysis.arithmetic.reproducible import exponential, reproducible_product
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.graphs import hops
 
@@ -92,6 +93,20 @@ class MarkovChain:
 
         transition = np.clip(np.asarray(scipy.linalg.expm(self.matrix * dt), dtype=float), 0.0, None)
         return np.asarray(transition / transition.sum(axis=1, keepdims=True))
+
+    def jumps_within(self, dt: float) -> float:
+        """Mean number of jumps in dt of the stationary chain in continuous time; 0 for another one."""
+        leaving = -np.diag(self.matrix) * dt if self.time == "continuous" else np.zeros(1)
+        return float((self.stationary * leaving).sum()) if leaving.any() else 0.0
+
+    def sampled(self, dt: float) -> MarkovChain:
+        """The chain in continuous time at the times 0, dt, ..., the same to the last bit on every machine."""
+        squarings = max(0, math.frexp(float(np.abs(self.matrix).max()) * dt)[1])
+        transition = exponential(self.matrix * (dt * 2.0**-squarings))
+        for _ in range(squarings):
+            transition = np.clip(reproducible_product(transition, transition), 0.0, None)
+            transition /= transition.sum(axis=1, keepdims=True)  # an error of a row's sum would double each time
+        return MarkovChain("discrete", transition)
 
     def holding_periods(self, initial: FloatArray, random: np.random.Generator) -> Iterator[tuple[int, float]]:
         """Exact path of the chain, without end: (mode from 0, time spent in it); ``initial`` (n,): law of the first."""

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
 
 
+MOST_JUMPS = 1000.0  # in a step, in the mean, that are drawn one by one; part of the definition of a run
+
+
 @dataclass(frozen=True, slots=True)
 class HoldingPeriod:
     """A stretch of steps with one graph."""
@@ -43,6 +46,8 @@ def _sampled(
     chain: MarkovChain, initial: FloatArray, random: np.random.Generator, steps: int, dt: float
 ) -> Iterator[HoldingPeriod]:
     """The chain at the times 0, dt, ..., (steps - 1) dt."""
+    if chain.jumps_within(dt) > MOST_JUMPS:
+        chain, dt = chain.sampled(dt), 1.0
     time, first, sequence = 0.0, 0, 0
     for mode, held in chain.holding_periods(initial, random):
         time += held

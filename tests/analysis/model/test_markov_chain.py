@@ -106,6 +106,24 @@ def test_path_has_the_transition_probabilities(time: str) -> None:
         assert scipy.stats.chisquare(counts, expected[i] * len(following)).pvalue > 1e-5
 
 
+@pytest.mark.parametrize("rate", [1e5, 1e9, 1e12])
+def test_very_fast_switching_has_the_same_law(rate: float) -> None:
+    """Graphs 1 and 2 alternate fast and graph 3 is rare: pairs of steps by chi-square, p > 1e-5: the false-alarm rate.
+
+    Averaging (Simon and Ando 1961): within dt = 0.3 the fast pair is in its stationary law 2/3, 1/3.
+    """
+    gamma = np.array([[-rate, rate, 0.0], [2 * rate, -2 * rate - 3.0, 3.0], [1.5, 0.0, -1.5]])
+    case = setup("continuous", gamma, 20_000)
+    modes = mode_path(case, case.chain.stationary)
+    slow = scipy.linalg.expm(np.array([[-1.0, 1.0], [1.5, -1.5]]) * 0.3)  # 3.0 from a third of the time
+    within = np.array([2 / 3, 1 / 3])
+    expected = np.vstack([[*(slow[0, 0] * within), slow[0, 1]]] * 2 + [[*(slow[1, 0] * within), slow[1, 1]]])
+    for i in range(3):
+        following = modes[1:][modes[:-1] == i]
+        counts = np.bincount(following, minlength=3)
+        assert scipy.stats.chisquare(counts, expected[i] * len(following)).pvalue > 1e-5
+
+
 def test_holding_times_are_exponential() -> None:
     """Kolmogorov-Smirnov on 5,000 holding times, p > 1e-4: the false-alarm rate."""
     chain = MarkovChain("continuous", generator_of(2, 2))
