@@ -25,10 +25,14 @@ LOCAL := --no-index --no-deps --no-build-isolation
 # Some container images set it. Every process of a network, and every worker of the tests, would compile all modules.
 unexport PYTHONDONTWRITEBYTECODE
 
+# Of the user's pip: packages go into the environment that is set up here.
+export PIP_USER := 0
+unexport PIP_TARGET PIP_PREFIX PIP_ROOT
+
 # With --jobs, what is started here would look for other jobs of this make, and build with one core.
 unexport MAKEFLAGS MFLAGS
 
-.PHONY: help setup demo wheels wheels-test test test-fast test-ros stress fuzz mutants lint lint-container format bench calibrate docs colcon colcon-test container lock clean
+.PHONY: help setup demo wheels wheels-test test test-fast test-ros test-least stress fuzz mutants lint lint-container format bench calibrate docs colcon colcon-test container lock clean
 
 help: ## Say what can be made
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -97,6 +101,15 @@ ROS_TESTS := $(addprefix tests/integration/test_,lockstep.py bag.py faults.py re
 
 test-ros: setup ## Run the tests that depend on ROS 2 most: test-ros ROS_DISTRO=kilted
 	$(TEST) $(SEVERAL_AT_ONCE) $(ROS_TESTS)
+
+# Over what is pinned, so that the rest is the same.
+build/least/.installed: requirements/least.txt | setup
+	rm -rf build/least
+	$(PIP) install --no-deps --target build/least --requirement requirements/least.txt
+	@touch $@
+
+test-least: build/least/.installed ## Run the tests of msg_analysis with the least versions of its libraries
+	PYTHONPATH=$(CURDIR)/build/least $(TEST) $(SEVERAL_AT_ONCE) --deselect tests/analysis/report/test_export.py tests/analysis
 
 STRESS ?= 20
 

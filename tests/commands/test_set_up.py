@@ -110,3 +110,11 @@ def test_an_unknown_distribution() -> None:
     result = make("demo", "ROS_DISTRO=foxy")
     assert (result.returncode, result.stdout) == (2, "")
     assert f"ROS_DISTRO=foxy: no requirements for it: expected one of: {' '.join(DISTRIBUTIONS)}." in result.stderr
+
+
+def test_places_of_the_users_pip_are_not_used() -> None:
+    """With PIP_USER pip refuses to install into an environment, with the others it installs elsewhere."""
+    given = {"PIP_USER": "1", "PIP_TARGET": "/nowhere", "PIP_PREFIX": "/nowhere", "PIP_ROOT": "/nowhere"}
+    show = ["make", "--silent", "--directory", str(ROOT), "--eval=show-environment: ; @env", "show-environment"]
+    shown = subprocess.run(show, env=os.environ | given, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert [line for line in shown if line.split("=")[0] in given] == ["PIP_USER=0"]
