@@ -44,6 +44,13 @@ def by_pip() -> set[str]:
     return {re.split("[<>=]", word.strip("'"))[0] for word in words.split()}
 
 
+def test_least_versions_are_those_that_are_tested() -> None:
+    lines = (ROOT / "requirements" / "least.txt").read_text().splitlines()
+    tested = {line.replace("==", ">=") for line in lines if "==" in line} - {"contourpy>=1.0.7"}  # matplotlib's
+    named = set(re.findall(r'"(\w+>=[\d.]+)"', (ROOT / "analysis" / "setup.py").read_text()))
+    assert named == tested | {"pydantic>=2"}
+
+
 def test_there_are_packages() -> None:
     assert len(PACKAGES) == 5
 

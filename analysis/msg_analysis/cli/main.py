@@ -270,8 +270,10 @@ def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Pa
     The names of the files are printed; existing files of these names are replaced. Exit code 3: states or graphs of
     the run are missing.
     """
-    import pyarrow.csv  # noqa: F401  before the progress of the work begins
-    import pyarrow.parquet  # noqa: F401
+    if csv or parquet:
+        from msg_analysis.common.resources import pyarrow_problem
+
+        pyarrow_problem()  # loads it before the progress of the work begins
 
     from msg_analysis.bags.reading import read_bag
     from msg_analysis.cli.console import WorkProgress

@@ -95,6 +95,7 @@ def sweep(
         plan = load_sweep(sweep_file, checking.done)
     print_notes(plan)
     from msg_analysis.common.files import write_whole
+    from msg_analysis.common.resources import pyarrow_problem
     from msg_analysis.common.text import finite
     from msg_analysis.report.list_pages import render_sweep
     from msg_analysis.report.sweep_plots import write_figure
@@ -112,6 +113,8 @@ def sweep(
         document = finite(describe_sweep(plan, done, judgement, rows))
         try:
             files = write_tables(rows, document, directory)
+            if problem := pyarrow_problem():
+                print_note(f"without results.parquet: pyarrow cannot be loaded ({problem})")
             plain_matplotlib()
             shown = picture(plan, rows, column)
             files += write_figure(shown, f"{plan.name}: {plan.kind}", directory)

@@ -16,6 +16,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
+from msg_analysis.errors import NotAvailableError
+
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
@@ -121,3 +123,18 @@ def distribution_at(place: Path | None, sourced: str) -> str:
     # Wheels set no variable; ros-<name>-rclpy is installed beside theirs. ROS_DISTRO may be that of another ROS 2 then.
     wheels = sorted(place.glob("ros_*_rclpy-*.dist-info")) if place else []
     return wheels[0].name.split("_")[1] if wheels else sourced
+
+
+def pyarrow_problem() -> str | None:
+    """Why pyarrow cannot be loaded, for example since it needs a newer NumPy; None: it can."""
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError as error:
+        return str(error)
+    return None
+
+
+def require_pyarrow(what: str) -> None:
+    """NotAvailableError where pyarrow cannot be loaded, which something needs."""
+    if problem := pyarrow_problem():
+        raise NotAvailableError(f"{what}: pyarrow cannot be loaded ({problem}): install a version that fits")

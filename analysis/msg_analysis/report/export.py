@@ -8,6 +8,7 @@ Agents, graphs and replicas count from 1, as in all files. What is missing is nu
 
 from __future__ import annotations
 
+import csv
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ import numpy as np
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.common.arrays import BLOCK_NUMBERS, AnyArray, BoolArray, FloatArray, IntArray, pieces, release
 from msg_analysis.common.files import require_place, written_whole
-from msg_analysis.common.resources import tell
+from msg_analysis.common.resources import pyarrow_problem, require_pyarrow, tell
 from msg_analysis.common.text import agent_name
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.model.run import Run
@@ -40,7 +41,17 @@ class RunTable:
 
     name: str
     trajectory: Run
-    schema: pa.Schema
+
+    @property
+    def schema(self) -> pa.Schema:
+        """Of Arrow, with the run record."""
+        import pyarrow as pa
+
+        kinds = {"step": pa.int64(), "agent": pa.int32(), "replica": pa.int32(), "graph": pa.int32()}
+        kinds |= {"name": pa.string(), "graph_name": pa.string()}
+        names = _COLUMNS[self.name](self.trajectory, 0, 0)
+        about = {b"msg_analysis.run_record": self.trajectory.record.to_json().encode()}
+        return pa.schema([(name, kinds.get(name, pa.float64())) for name in names], metadata=about)
 
     @property
     def steps(self) -> int:
@@ -51,14 +62,19 @@ class RunTable:
         """The rows, step after step, and the step behind the last one of each piece."""
         import pyarrow as pa
 
+        schema = self.schema
+        for columns, end in self.columns(rows):
+            arrays = [_arrow(columns[field.name], field.type) for field in schema]
+            yield pa.RecordBatch.from_arrays(arrays, schema=schema), end
+
+    def columns(self, rows: int = ROWS) -> Iterator[tuple[dict[str, Any], int]]:
+        """The same as arrays of numpy; missing is masked or NaN."""
         trajectory = self.trajectory
         wide = trajectory.values[:1].size if self.name == "states" else trajectory.states[:1].size
         length = max(1, rows // max(wide, 1))
         for first in range(0, self.steps, length):
             end = min(first + length, self.steps)
-            columns = _COLUMNS[self.name](trajectory, first, end)
-            arrays = [_arrow(columns[field.name], field.type) for field in self.schema]
-            yield pa.RecordBatch.from_arrays(arrays, schema=self.schema), end
+            yield _COLUMNS[self.name](trajectory, first, end), end
             for array in (trajectory.states, trajectory.published, trajectory.made):
                 if array is not None:
                     release(array)
@@ -66,19 +82,7 @@ class RunTable:
 
 def run_tables(trajectory: Run) -> list[RunTable]:
     """``states`` (a row per state and replica), ``graphs`` and ``errors``; their columns are in docs/commands.md."""
-    import pyarrow as pa
-
-    about = {b"msg_analysis.run_record": trajectory.record.to_json().encode()}
-    kinds = {"step": pa.int64(), "agent": pa.int32(), "replica": pa.int32(), "graph": pa.int32()}
-    kinds |= {"name": pa.string(), "graph_name": pa.string()}
-    return [
-        RunTable(
-            table,
-            trajectory,
-            pa.schema([(name, kinds.get(name, pa.float64())) for name in columns(trajectory, 0, 0)], metadata=about),
-        )
-        for table, columns in _COLUMNS.items()
-    ]
+    return [RunTable(table, trajectory) for table in _COLUMNS]
 
 
 def _states(trajectory: Run, first: int, end: int) -> dict[str, Any]:
@@ -140,6 +144,9 @@ class _Names:
     def __init__(self, texts: Sequence[str], places: IntArray) -> None:
         self.texts, self.places = texts, places
 
+    def tolist(self) -> list[str | None]:
+        return [self.texts[place] if place >= 0 else None for place in self.places.tolist()]
+
     def arrow(self) -> pa.Array:
         import pyarrow as pa
 
@@ -187,6 +194,7 @@ def data_frame(trajectory: Run, table: Table) -> pd.DataFrame:
     import pyarrow as pa
 
     require_pandas()
+    require_pyarrow("to_dataframe")
     found = {each.name: each for each in run_tables(trajectory)}
     if table not in found:
         raise InputError(f"to_dataframe: {table!r}: expected one of {', '.join(found)}")
@@ -272,6 +280,8 @@ def export_run(trajectory: Run, directory: Path, forms: Sequence[Form], rows: in
     }
     if "npz" in forms:
         writers[directory / "run.npz"] = lambda file, shown: _write_arrays(trajectory, file, shown, rows)
+    if "parquet" in forms:
+        require_pyarrow("Parquet")
     if "rrd" in forms:
         require_rerun()
         writers[directory / "run.rrd"] = lambda file, shown: write_recording(trajectory, file, shown)
@@ -296,6 +306,16 @@ def _readable(path: Path) -> Iterator[None]:
 
 
 def _table_writer(table: RunTable, form: Form, rows: int) -> Callable[[Path, str], None]:
+    def write_text(file: Path, shown: str) -> None:
+        with file.open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(_COLUMNS[table.name](table.trajectory, 0, 0))
+            for columns, done in table.columns(rows):
+                tell(f"writing {shown}", done, table.steps)
+                # Of what is missing, masked or NaN, nothing is written.
+                cells = [[None if cell != cell else cell for cell in column.tolist()] for column in columns.values()]
+                writer.writerows(zip(*cells, strict=True))
+
     def write(file: Path, shown: str) -> None:
         import pyarrow.csv
         import pyarrow.parquet
@@ -310,7 +330,7 @@ def _table_writer(table: RunTable, form: Form, rows: int) -> Callable[[Path, str
                 tell(f"writing {shown}", done, table.steps)
                 writer.write_batch(piece)
 
-    return write
+    return write_text if form == "csv" and pyarrow_problem() else write  # pyarrow is much faster
 
 
 def _write_arrays(trajectory: Run, file: Path, shown: str, rows: int) -> None:

@@ -131,6 +131,15 @@ def stacked_panels(*sizes: float) -> tuple[NotebookFigure, Sequence[Axes]]:
     return figure, list(panels[:, 0])
 
 
+def legend_beside(figure: Figure, place: str, *entries: Any, **how: Any) -> None:
+    """A legend outside of the panels, at ``right upper`` or ``upper right``."""
+    try:
+        figure.legend(*entries, loc=f"outside {place}", **how)
+    except ValueError:  # before matplotlib 3.7
+        corner = "upper left" if place == "right upper" else "lower right"
+        figure.axes[0].legend(*entries, loc=corner, bbox_to_anchor=(1.0, 1.0), **how)
+
+
 def run_figure(trajectory: Run, agents: Sequence[int] | None, replica: int) -> NotebookFigure:
     """States of agents (from 0; None: the first ones) over time, and the graph of every step. InputError: no agent."""
     experiment = trajectory.record.experiment
@@ -151,7 +160,7 @@ def run_figure(trajectory: Run, agents: Sequence[int] | None, replica: int) -> N
         axes.set(ylabel="state", xlim=(0.0, max(float(times[-1]), experiment.step_length)))
         axes.set_title(plain(experiment.name), loc="left")
         axes.tick_params(labelbottom=False)
-        figure.legend(loc="outside right upper", fontsize=8)
+        legend_beside(figure, "right upper", fontsize=8)
         _draw_graphs(band, trajectory)
         band.set_xlim(axes.get_xlim())
     return figure
@@ -292,5 +301,5 @@ def spectrum_figure(
         below.set(xlabel="frequency [cycles per unit of simulated time]", ylabel="spectral density", xscale="log")
         if any((np.asarray(line.get_ydata()) > 0.0).any() for line in below.get_lines()):
             below.set_yscale("log")
-        figure.legend(*above.get_legend_handles_labels(), loc="outside right upper", fontsize=8)
+        legend_beside(figure, "right upper", *above.get_legend_handles_labels(), fontsize=8)
     return figure

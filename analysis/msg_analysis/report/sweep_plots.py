@@ -33,7 +33,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import measured_text, number_text
 from msg_analysis.experiment.problems import show
-from msg_analysis.report.figures import STYLE, NotebookFigure, plain, rendered
+from msg_analysis.report.figures import STYLE, NotebookFigure, legend_beside, plain, rendered
 from msg_analysis.report.look import DARK_GREY, MODE_COLOURS, shifted, shorten
 from msg_analysis.report.plot_style import BLACK, DARK_SCALE, GREY, INK, LINES, SANS, SCALE, new_figure, show_values
 from msg_analysis.sweeps.results import Picture, PlotPoint, Series, axis_name, column_words, key_words, value_text
@@ -382,7 +382,7 @@ def _add_legend(figure: Figure, axes: Axes, picture: Picture, colours: Sequence[
     if any(place.value is None for place in picture.places):
         enter("no result", BLACK, marker="x", ls="", ms=5)
     if entries:
-        figure.legend(*zip(*entries, strict=True), loc="outside upper right", ncols=3)
+        legend_beside(figure, "upper right", *zip(*entries, strict=True), ncols=3)
     if len(picture.series) > 1:
         chosen = np.unique(np.linspace(0, len(picture.series) - 1, _IN_LEGEND).round().astype(int))
         handles = [Line2D([], [], color=colours[i], marker=_SHAPES[i % len(_SHAPES)], ms=4.5, lw=1.2) for i in chosen]

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import ValidationError
 
+from msg_analysis.common.resources import require_pyarrow
 from msg_analysis.common.text import markdown_table
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graph_sources import plain
@@ -76,6 +77,7 @@ class Sweep:
         from msg_analysis.report.export import require_pandas
 
         require_pandas()
+        require_pyarrow("to_dataframe")
         return arrow_table(self.rows).to_pandas()
 
     def plot(self, column: str | None = None) -> Figure:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import csv
 import fcntl
 import io
 import json
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from msg_analysis.common.files import write_whole
+from msg_analysis.common.resources import pyarrow_problem
 from msg_analysis.common.text import HALF_WIDTH_95, agent_text, json_text
 from msg_analysis.errors import ExitCode, InputError
 from msg_analysis.experiment.problems import show
@@ -242,16 +244,29 @@ def arrow_table(rows: Sequence[Row]) -> pa.Table:
 
 
 def write_tables(rows: Sequence[Row], document: Mapping[str, Any], directory: Path) -> list[Path]:
-    """Write ``results.parquet``, ``results.csv`` and ``results.json``, each whole or not at all."""
-    import pyarrow.csv
-    import pyarrow.parquet
+    """Write ``results.csv``, ``results.json`` and, where pyarrow can be loaded, ``results.parquet``, each whole."""
+    content = {"json": json_text(document, 1).encode() + b"\n"}
+    if pyarrow_problem():
+        text = io.StringIO()
+        writer = csv.DictWriter(text, column_names(rows), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
+        content = {"csv": text.getvalue().encode()} | content
+    else:
+        import pyarrow.csv
+        import pyarrow.parquet
 
-    table = arrow_table(rows)
-    parquet, text = io.BytesIO(), io.BytesIO()
-    pyarrow.parquet.write_table(table, parquet)
-    pyarrow.csv.write_csv(table, text, pyarrow.csv.WriteOptions(quoting_style="needed"))
-    content = {"parquet": parquet.getvalue(), "csv": text.getvalue(), "json": json_text(document, 1).encode() + b"\n"}
+        table = arrow_table(rows)
+        parquet, data = io.BytesIO(), io.BytesIO()
+        pyarrow.parquet.write_table(table, parquet)
+        pyarrow.csv.write_csv(table, data, pyarrow.csv.WriteOptions(quoting_style="needed"))
+        content = {"parquet": parquet.getvalue(), "csv": data.getvalue()} | content
     return [write_whole(directory / f"results.{name}", data) for name, data in content.items()]
+
+
+def _cell(value: Any) -> Any:
+    """A value in CSV as pyarrow writes it."""
+    return json.dumps(value) if isinstance(value, bool | list | dict) else value
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,6 +47,30 @@ def exported(bag: Path) -> Path:
     return folder
 
 
+def test_csv_and_arrays_need_no_pyarrow(exported: Path, bag: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    """A new one beside an older NumPy cannot be imported; it quotes headers, and leaves the zeros of 1.0 out."""
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    result = export(bag, "--csv", "--npz", "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+
+    def parsed(cell: str) -> str | float:
+        try:
+            return float(cell)
+        except ValueError:
+            return cell
+
+    for name in ("states.csv", "graphs.csv", "errors.csv"):
+        ours, theirs = (
+            [[parsed(cell) for cell in row] for row in csv.reader((folder / name).open(newline=""))]
+            for folder in (tmp_path, exported)
+        )
+        assert ours == theirs
+    assert (tmp_path / "run.npz").read_bytes() == (exported / "run.npz").read_bytes()
+    refused = export(bag, "--parquet", "--out", tmp_path)
+    assert refused.exit_code == 2
+    assert "Parquet: pyarrow cannot be loaded" in refused.stderr
+
+
 NAMES = [f"{table}.{form}" for form in ("csv", "parquet") for table in ("states", "graphs", "errors")] + ["run.npz"]
 
 

@@ -1,15 +1,18 @@
 """What is done is done once, what fails fails alone, and all runs are judged together."""
 
+import csv
 import dataclasses
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
+import pyarrow
 import pytest
 import yaml
 
@@ -19,7 +22,15 @@ from msg_analysis.sweeps import workers as conducting
 from msg_analysis.sweeps.cluster import ClusterWorkers
 from msg_analysis.sweeps.grid import load_sweep
 from msg_analysis.sweeps.points import DONE, FAILED, Job, Outcome, evaluate
-from msg_analysis.sweeps.results import JOURNAL, ResultStore, arrow_table, evaluate_sweep, picture, rows_of
+from msg_analysis.sweeps.results import (
+    JOURNAL,
+    ResultStore,
+    arrow_table,
+    evaluate_sweep,
+    picture,
+    rows_of,
+    write_tables,
+)
 from msg_analysis.sweeps.workers import LocalWorkers, Lost, WorkersLostError, run_jobs
 
 
@@ -204,6 +215,13 @@ def test_a_scheduler_that_does_not_answer() -> None:
         ClusterWorkers("tcp://127.0.0.1:9", patience=0.2).__enter__()
 
 
+def numbers(cell: str) -> str | float:
+    try:
+        return float(cell)
+    except ValueError:
+        return cell
+
+
 def test_columns_and_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     in_this_process(monkeypatch)
     over = {"noise.process": [1.0, [1, 2, 1, 1, 1]], "switching.generator": [[[-1, 1], [1, -1]], [[-9, 9], [9, -9]]]}
@@ -215,6 +233,14 @@ def test_columns_and_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     rows = rows_of(sweep, outcomes, evaluate_sweep(outcomes, 0.01))
     table = arrow_table(rows)
     assert table.num_rows == 12
+    parsed = []
+    for library in (pyarrow, None):  # a new one beside an older NumPy cannot be imported
+        monkeypatch.setitem(sys.modules, "pyarrow", library)
+        files = {file.suffix: file for file in write_tables(rows, {}, tmp_path)}
+        parsed.append([[numbers(cell) for cell in row] for row in csv.reader(files[".csv"].open(newline=""))])
+    assert parsed[0] == parsed[1]
+    assert ".parquet" not in files
+    monkeypatch.setitem(sys.modules, "pyarrow", pyarrow)
     assert str(table.schema.field("node_errors[2].measured").type) == "double"
     assert str(table.schema.field("seed").type) == "int64"
     assert table.column("noise.process").to_pylist()[::6] == ["1.0", "[1, 2, 1, 1, 1]"]
