@@ -63,7 +63,7 @@ setup(
         "mcap",
         "networkx>=2.8.8",
         "numpy>=1.26.4",
-        "pyarrow",
+        "pyarrow>=17.0.0",
         "pydantic>=2",
         "pyyaml>=6.0.1",
         "rich>=13.7.1",

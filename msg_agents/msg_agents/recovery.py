@@ -22,7 +22,7 @@ from uuid import UUID
 
 from msg_agents.discovery.rtps import PREFIX_SIZE, remove_participant
 from msg_agents.stepping.synchronizer import RESEND_LIMIT
-from msg_analysis.common.files import write_whole
+from msg_analysis.common.files import lock, write_whole
 from msg_analysis.errors import InputError
 from msg_analysis.messages.acceptance import state_frame
 from msg_analysis.model.run_record import RunRecord
@@ -139,7 +139,7 @@ class Takeover:
         # Open, and locked, for as long as this process lives.
         self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InputError(
                 f"--checkpoint: another process is running {path.stem}: end that process, or give another directory"

@@ -46,7 +46,10 @@ def by_pip() -> set[str]:
 
 def test_least_versions_are_those_that_are_tested() -> None:
     lines = (ROOT / "requirements" / "least.txt").read_text().splitlines()
-    tested = {line.replace("==", ">=") for line in lines if "==" in line} - {"contourpy>=1.0.7"}  # matplotlib's
+    tested = {line.replace("==", ">=") for line in lines if "==" in line}
+    tested = {
+        line for line in tested if not line.startswith(("contourpy", "pandas", "pytz"))
+    }  # of matplotlib, or extra
     named = set(re.findall(r'"(\w+>=[\d.]+)"', (ROOT / "analysis" / "setup.py").read_text()))
     assert named == tested | {"pydantic>=2"}
 

@@ -115,6 +115,13 @@ def test_an_unknown_distribution() -> None:
 def test_places_of_the_users_pip_are_not_used() -> None:
     """With PIP_USER pip refuses to install into an environment, with the others it installs elsewhere."""
     given = {"PIP_USER": "1", "PIP_TARGET": "/nowhere", "PIP_PREFIX": "/nowhere", "PIP_ROOT": "/nowhere"}
-    show = ["make", "--silent", "--directory", str(ROOT), "--eval=show-environment: ; @env", "show-environment"]
-    shown = subprocess.run(show, env=os.environ | given, capture_output=True, text=True, check=True).stdout.splitlines()
-    assert [line for line in shown if line.split("=")[0] in given] == ["PIP_USER=0"]
+    show = [
+        "make",
+        "--silent",
+        "--directory",
+        str(Path(__file__).parents[2]),
+        "--eval=show-environment: ; @env",
+        "show-environment",
+    ]
+    shown = subprocess.run(show, env=os.environ | given, capture_output=True, text=True, check=True)
+    assert [line for line in shown.stdout.splitlines() if line.split("=")[0] in given] == ["PIP_USER=0"]

@@ -1,5 +1,6 @@
 """Shells in which people start commands: limits, a folder that is gone, empty texts, settings of matplotlib."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -11,9 +12,14 @@ import pytest
 from click.testing import CliRunner
 
 from msg_agents.cli.main import main as agents_main
+from msg_agents.recovery import Takeover
+from msg_agents.run.folder import temporary_directory
 from msg_agents.terminal import Interruption
+from msg_analysis import Experiment
+from msg_analysis.bags.writing import recording_pid
 from msg_analysis.cli.console import CommandGroup
 from msg_analysis.cli.main import main as analysis_main
+from msg_analysis.sweeps.results import ResultStore
 
 PROGRAMS = {
     "msg-agents": "from msg_agents.cli.entry_points import msg_agents as start",
@@ -109,3 +115,20 @@ def test_in_other_threads_signals_are_left_to_the_main_one() -> None:
     thread.start()
     thread.join()
     assert found == [None]
+
+
+@pytest.mark.parametrize("reason", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
+def test_file_systems_without_locks(reason: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lustre without -o flock, NFS without its daemon, FUSE: nothing that only a lock would tell ends the work."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(reason, os.strerror(reason))
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    bag = Experiment.load("line_ring").simulate(duration=5).save(tmp_path / "bag")
+    assert recording_pid(bag) is None
+    with ResultStore.open(tmp_path / "sweep") as store:
+        assert store.damaged == 0
+    assert Takeover(tmp_path / "agent_1").predecessor == b""
+    with temporary_directory() as folder:
+        assert folder.is_dir()

@@ -27,7 +27,7 @@ from msg_analysis.bags.files import FileCount, bag_information, write_metadata
 from msg_analysis.bags.mcap_writing import LatchedMessage, WrittenFile
 from msg_analysis.bags.stored_file import DEFAULT_STORAGE, Storage
 from msg_analysis.common.arrays import BLOCK_NUMBERS, IntArray, release
-from msg_analysis.common.files import require_utf8
+from msg_analysis.common.files import lock, require_utf8
 from msg_analysis.errors import BagError
 from msg_analysis.messages.acceptance import graph_message
 from msg_analysis.messages.messages import StateCodec, encode_string
@@ -77,7 +77,7 @@ class BagWriter:
         except OSError as error:
             raise BagError(f"{directory}: cannot be made ({error.strerror}): choose another place") from error
         with self._writing():
-            fcntl.flock(self._marker, fcntl.LOCK_EX)  # the system releases it when this process ends
+            lock(self._marker, fcntl.LOCK_EX)  # the system releases it when this process ends
             json.dump({"pid": os.getpid()}, self._marker)
             self._marker.flush()
             self._begin_file()

@@ -6,12 +6,13 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import yaml
 
@@ -45,6 +46,17 @@ def no_temporary_directory(error: OSError) -> str | None:
     if "temporary directory" not in str(error.strerror):
         return None
     return f"TMPDIR: {error.strerror}: set it to a directory that can be written"
+
+
+def lock(file: int | IO[Any], operation: int) -> bool:
+    """Lock a file, as flock; False where its file system has no locks: NFS, Lustre or FUSE, for example."""
+    try:
+        fcntl.flock(file, operation)
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+            raise
+        return False
+    return True
 
 
 def write_whole(path: Path, content: bytes) -> Path:

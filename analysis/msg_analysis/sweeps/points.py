@@ -38,11 +38,9 @@ _SOURCES = (
 
 
 def require_libraries(*, cluster: bool = False) -> None:
-    """InputError that names the libraries that only sweeps (on a cluster) need and that are not installed."""
-    needed = ("pyarrow", "distributed") if cluster else ("pyarrow",)
-    missing = [name for name in needed if importlib.util.find_spec(name) is None]
-    if missing:
-        raise InputError(f"{' and '.join(missing)}: not installed: sweeps need it: pip install {' '.join(missing)}")
+    """InputError if a library is not installed that only sweeps on a cluster need."""
+    if cluster and importlib.util.find_spec("distributed") is None:
+        raise InputError("distributed: not installed: --scheduler needs it: pip install distributed")
 
 
 @functools.cache

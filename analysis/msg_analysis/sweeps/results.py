@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from msg_analysis.common.files import write_whole
+from msg_analysis.common.files import lock, write_whole
 from msg_analysis.common.resources import pyarrow_problem
 from msg_analysis.common.text import HALF_WIDTH_95, agent_text, json_text
 from msg_analysis.errors import ExitCode, InputError
@@ -92,7 +92,7 @@ class ResultStore:
             place = error.filename or directory
             raise InputError(f"{place}: {error.strerror}: choose another place with --out") from error
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             outcomes, damaged, whole = _read(path)
         except OSError as error:
             os.close(descriptor)

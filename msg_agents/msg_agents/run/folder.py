@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from msg_agents.environment import MEMORY, free_space
+from msg_analysis.common import files
 from msg_analysis.common.files import require_utf8
 from msg_analysis.common.shared_folders import clear_unlocked, own_folder
 from msg_analysis.errors import InputError
@@ -42,8 +43,7 @@ def temporary_directory(room: int | None = None, memory: Path = MEMORY) -> Itera
     path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
     lock = os.open(path, os.O_RDONLY)  # marks folders in use; ends with its process
     try:
-        with suppress(OSError):  # the file system has no locks, and nobody clears there
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        files.lock(lock, fcntl.LOCK_EX)
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)

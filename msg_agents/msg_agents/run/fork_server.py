@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any, NoReturn, Self
 
 from msg_analysis.common import programs
+from msg_analysis.common.files import lock
 
 PROGRAM = [sys.executable, "-m", "msg_agents.cli.node_server"]  # calls ``serve``
 LONGEST_TITLE = 200  # bytes; ROS names a log file by the title, and a longer name than 255 cannot be written
@@ -93,7 +94,8 @@ def exit_with_lock(folder: Path) -> None:
 
     def wait() -> None:
         with contextlib.suppress(OSError):
-            fcntl.flock(os.open(folder, os.O_RDONLY), fcntl.LOCK_SH)
+            if not lock(os.open(folder, os.O_RDONLY), fcntl.LOCK_SH):
+                threading.Event().wait()  # nothing tells when the parent ends
 
     _end_after(wait)
 
