@@ -136,7 +136,9 @@ def test_errors_in_every_format(exported: Path, messages: Any, bag: Path) -> Non
     assert list(frame.columns) == ["step", "time", "system_error", "error_1", "error_2", "error_3"]
     np.testing.assert_allclose(frame[["error_1", "error_2", "error_3"]], wanted, rtol=1e-12)
     np.testing.assert_allclose(frame["system_error"], wanted.sum(axis=1), rtol=1e-12)
-    assert np.array_equal(pd.read_csv(exported / "errors.csv").to_numpy(), frame.to_numpy())
+    assert np.array_equal(
+        pd.read_csv(exported / "errors.csv", float_precision="round_trip").to_numpy(), frame.to_numpy()
+    )
     np.testing.assert_allclose(np.load(exported / "run.npz")["errors"], wanted, rtol=1e-12)
     run = read_bag(bag)
     assert run.to_dataframe("errors").equals(frame)
