@@ -125,8 +125,8 @@ def _fault(error: Exception) -> Exit:
         return Exit(ExitCode.BAD_INPUT)
     from traceback import format_exception
 
-    click.echo("".join(format_exception(error)), err=True, nl=False)
-    complain("a fault of this program: please report it, with the lines above and the command")
+    complain("a fault of this program: please report it, with the lines below and the command")
+    click.echo("".join(format_exception(error)), err=True, nl=False)  # its last line is shown of a node
     return Exit(ExitCode.FAULT)
 
 

@@ -332,7 +332,7 @@ def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View
             return False
         step = min((supervisor.steps[i] for i in child.spec.agents), default=-1) if supervisor.steps else -1
         after = f" after step {step}" if step >= 0 else ""
-        words = f" ({child.last_line()})" if child.process.poll() == CRASHED else ""
+        words = f" ({child.last_line()})" if child.process.poll() in CRASHED else ""
         result.restarts.append(f"{child.spec.name}: {child.failure}{words}{after}, started again")
         events.killed(child.spec.name, child.spec.agents, step, result.restarts[-1])
         view.note(result.restarts[-1])

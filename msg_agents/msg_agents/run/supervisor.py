@@ -38,7 +38,7 @@ SEND_PERIOD = 0.5  # s of wall time after which agents send the recorder what th
 DRAIN_TIME = 3.0  # s
 EARLY = 3.0  # s after which an agent that has ended without its last step is not waited for any more
 LATE = 10.0  # s after the end of the run after which a process that has not left is not waited for any more
-CRASHED = 1  # exit code of Python after an uncaught exception
+CRASHED = 1, ExitCode.FAULT  # exit codes after an uncaught exception, of Python and of a command
 STATUS_FOLDER, STEPS, CLOCKS = "status", "steps.json", "clocks.json"
 
 HUNG = 60.0  # s
@@ -151,7 +151,7 @@ class Child:
         code = self.process.poll()
         if not self.spec.resumes or code is None:
             return False
-        return code < 0 or (code == CRASHED and self.number == 1)  # a crash of its own will probably repeat: one try
+        return code < 0 or (code in CRASHED and self.number == 1)  # a crash of its own will probably repeat: one try
 
     def has_traceback(self) -> bool:
         """Whether it has printed one."""

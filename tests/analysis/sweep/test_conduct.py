@@ -5,7 +5,6 @@ import dataclasses
 import os
 import signal
 import sys
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
