@@ -70,10 +70,9 @@ def test_a_fault_of_the_program_is_no_verdict(error: Exception, monkeypatch: pyt
     monkeypatch.setattr("msg_analysis.cli.main.load_experiment", fail)
     done = CliRunner().invoke(analysis_main, ["predict", "line_ring"])
     assert (done.exit_code, done.stdout) == (70, "")
-    assert "Traceback" in done.stderr
-    assert done.stderr.endswith(
-        "error: a fault of this program: please report it, with the lines above and the command\n"
-    )
+    words, _, traceback = done.stderr.partition("Traceback")
+    assert words == "error: a fault of this program: please report it, with the lines below and the command\n"
+    assert traceback.rstrip().endswith(f"{type(error).__name__}: {error}")
 
 
 def test_figures_do_not_depend_on_settings_of_matplotlib(tmp_path: Path) -> None:
