@@ -72,7 +72,7 @@ def test_a_fault_of_the_program_is_no_verdict(error: Exception, monkeypatch: pyt
     assert (done.exit_code, done.stdout) == (70, "")
     words, _, traceback = done.stderr.partition("Traceback")
     assert words == "error: a fault of this program: please report it, with the lines below and the command\n"
-    assert traceback.rstrip().endswith(f"{type(error).__name__}: {error}")
+    assert type(error).__name__ in traceback.splitlines()[-1]
 
 
 def test_figures_do_not_depend_on_settings_of_matplotlib(tmp_path: Path) -> None:

@@ -1,7 +1,9 @@
 """The commands ``runs`` and ``diff``: what they print, and their exit codes."""
 
+import dataclasses
 import io
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -25,6 +27,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("place")
     for seed in (7, 8):
         made = Experiment.parse(DOCUMENT).simulate(seed=seed)
+        started = datetime(2026, 11, 20 + seed, 12, tzinfo=UTC)
+        made = dataclasses.replace(made, record=dataclasses.replace(made.record, started=started))
         made.save(place / "runs" / f"pair_2026112{seed}_120000")
     result = made.compare().to_json()
     (place / "runs" / "pair_20261128_120000" / "result.json").write_text(json_text(result))
