@@ -131,9 +131,8 @@ def solved_in_decimals(matrix, right):
     return mpmath.matrix([mpmath.mpf(str(x)) for x in found])
 
 
-@pytest.mark.parametrize(("decades", "most"), [(2, 1e-6), (12, np.inf)])
-@pytest.mark.parametrize("steps", [False, True])
-def test_the_claimed_error_covers_the_true_one(claimed_error, steps, decades, most, monkeypatch):
+@pytest.mark.parametrize(("decades", "steps", "least"), [(2, False, 12), (2, True, 12), (12, False, 12), (12, True, 8)])
+def test_the_claimed_error_covers_the_true_one(claimed_error, steps, decades, least, monkeypatch):
     """Twenty networks with weights and rates over so many decades, in the steps' law at very small steps, too."""
     monkeypatch.setattr(claimed_error.mpmath, "lu_solve", solved_in_decimals)
     solved = 0
@@ -143,9 +142,9 @@ def test_the_claimed_error_covers_the_true_one(claimed_error, steps, decades, mo
             true, claimed = claimed_error.errors(experiment, steps=steps)
         except InputError:  # the graphs do not connect the agents, or the solver refuses the equations
             continue
-        assert true <= claimed <= most, seed
+        assert true <= claimed <= 1e-6, seed
         solved += 1
-    assert solved >= 8  # with 12 decades, twelve are refused
+    assert solved >= least  # of steps with 12 decades, twelve are refused
 
 
 @pytest.mark.parametrize("seed", range(3))
