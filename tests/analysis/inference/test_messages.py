@@ -168,7 +168,7 @@ def test_innovations_are_freed_of_noise_that_is_known(case):
 @pytest.mark.parametrize("case", CASES)
 def test_right_runs_agree(case):
     """Whole verdicts, one run each: with a right program, one of the nine disagrees with probability 9 %."""
-    found = compare(made(case, 11, duration=60, replicas=2))
+    found = compare(made(case, 11, duration=60, replicas=2), max_missed=1.0)  # many are late
     assert found.verdict == "agrees", [test for test in found.tests if test.rejected]
     names = {test.name.removesuffix(", corrected") for test in found.tests}
     assert {"system error", "covariance", "residuals: gains", "residuals: whiteness"} <= names
