@@ -110,7 +110,7 @@ class RunningEvidence(EvidenceWatch):
 
     def __init__(self, prediction: Prediction, replicas: int) -> None:
         super().__init__(prediction, replicas)
-        if self.sums.error is None:
+        if not self.sums.plain:
             raise ValueError("the states alone do not give the evidence of this run")
         self._prediction, self._replicas = prediction, replicas
         self._length = max(1, BLOCK_NUMBERS // self.sums.numbers_per_step)
