@@ -190,10 +190,11 @@ def sixty_digits(experiment: Experiment) -> FloatArray:
 
 def extremes() -> Iterator[Row]:
     """Rates and gains over eighteen orders of magnitude; time is that of one solve."""
-    for name, graphs in (("line and ring of 4", LINE_RING), ("two graphs in pieces, union connected", PIECES)):
-        for rate in (1e-8, 1e-4, 1.0, 1e4, 1e6, 1e10):
+    cases = (("line and ring of 4", LINE_RING, 1e-8), ("two graphs in pieces, union connected", PIECES, 1e-5))
+    for name, graphs, slowest in cases:  # graphs in pieces that switch more seldom are refused
+        for rate in (slowest, 1e-4, 1.0, 1e4, 1e6, 1e10):
             yield extreme(f"{name}, rates {rate:g} and {rate / 1000:g}", {"graphs": graphs}, rate)
-        for gain in (1e-3, 1e6):
+        for gain in (1e-3, 1e6) if graphs is LINE_RING else (1e-3,):  # with 1e6, graphs in pieces are refused
             leaders = {"problem": "tracking", "leaders": {"agents": [2], "gain": gain}}
             yield extreme(f"{name}, leader's gain {gain:g}", {"graphs": graphs, **leaders}, 1.0)
 

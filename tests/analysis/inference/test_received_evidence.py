@@ -65,9 +65,8 @@ def test_messages_are_those_of_the_bag(name: str, tmp_path: Path) -> None:
 def test_is_the_evidence_of_the_comparison(name: str) -> None:
     """Whatever the order of the states is, and however often one looks."""
     run = simulate(law(duration=20.0, **LAWS[name]))
-    disorder = (
-        0.0 if name in ("plain", "states far from zero") else 30.0
-    )  # there, the next graph counts, which comes with the next step
+    # Where the states alone count, so does the next graph, which comes with the next step.
+    disorder = 0.0 if name in ("plain", "states far from zero") else 30.0
     live, wanted = watched(run, disorder=disorder), whole_sums(run, predict(run.record.experiment))
     found, families = live.report(), live.evidence.sums.families()
     assert (found.refused, live.evidence.count) == ({}, 400)
