@@ -7,11 +7,16 @@ from __future__ import annotations
 
 import fnmatch
 import math
+import re
 import time
 from collections.abc import Callable, Iterable, Sequence
 
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.errors import InputError
+from msg_analysis.experiment.problems import show
+
+_TOPIC = re.compile("(/[A-Za-z_][A-Za-z0-9_]*)+")
+_LONGEST_TOPIC = 247
 
 
 def parse_rate(word: object) -> float:
@@ -85,6 +90,16 @@ def select_topics(topics: Iterable[str], wanted: Sequence[str], excluded: Sequen
     return chosen
 
 
+def problem_of_name(topic: str) -> str | None:
+    """Why ROS 2 has no topic of that name, which is absolute; None where it can have one."""
+    if len(topic) <= _LONGEST_TOPIC and _TOPIC.fullmatch(topic):
+        return None
+    return (
+        f"not a name of a topic in ROS 2: expected at most {_LONGEST_TOPIC} letters, digits, _ and /, with no digit "
+        "behind a /"
+    )
+
+
 def parse_remaps(remaps: Sequence[str], topics: Sequence[str]) -> dict[str, str]:
     """New names of all topics that are played, by old name; each of ``remaps`` is ``old:=new``."""
     names = {name: name for name in topics}
@@ -95,5 +110,7 @@ def parse_remaps(remaps: Sequence[str], topics: Sequence[str]) -> dict[str, str]
         old, new = (name if name.startswith("/") else f"/{name}" for name in (old, new))
         if old not in names:
             raise InputError(f"--remap: {old}: no such topic is played: expected one of {', '.join(topics)}")
+        if problem := problem_of_name(new):
+            raise InputError(f"--remap: {show(new)}: {problem}")
         names[old] = new
     return names

@@ -24,7 +24,7 @@ from mcap.records import Channel, Schema
 from msg_analysis.bags.files import bag_files, offered_profiles, stored_file
 from msg_analysis.bags.mcap_reading import CHUNK_TIMES, McapFile
 from msg_analysis.bags.mcap_records import INDEX_HEAD, MAGIC, RECORD
-from msg_analysis.bags.stored_file import DamageError
+from msg_analysis.bags.stored_file import DamageError, ros_topic
 from msg_analysis.errors import BagError
 
 # Bytes of messages held to be put in order. A bag that needs more is played out of order rather than held in memory.
@@ -39,7 +39,7 @@ class BagTopic:
     """A topic of a bag."""
 
     name: str  # absolute
-    type_name: str  # such as ``std_msgs/msg/String``
+    type_name: str  # such as ``std_msgs/msg/String``; empty where the bag does not state it
     encoding: str  # of the messages; ``cdr`` in ROS 2
     type_hash: str  # empty where the bag does not state it
     latched: bool  # whether a publisher kept its messages for late subscribers
@@ -57,7 +57,14 @@ class _Outline:
     lows: list[tuple[int, int]] = field(default_factory=list)  # (end of a piece [bytes], its earliest log time [ns])
     start: int | None = None  # earliest log time [ns]; None without messages
     end: int | None = None  # latest log time [ns]
-    damage: str | None = None
+    torn: str | None = None
+    damaged_chunks: int = 0  # so far
+
+    @property
+    def damage(self) -> str | None:
+        """What is wrong with it, as far as it was read."""
+        damaged = f"damaged chunks that are left out: {self.damaged_chunks}" if self.damaged_chunks else None
+        return "; ".join(filter(None, (self.torn, damaged))) or None
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,58 +82,64 @@ class Playback:
     def __init__(self, path: Path, most_held: int = MOST_HELD) -> None:
         self._most_held = most_held  # bytes
         self._outlines: list[_Outline] = []
-        unreadable: list[BagError] = []
+        self._unreadable: list[BagError] = []
         for file in bag_files(Path(path)):
             try:
                 self._outlines.append(_quick_outline(file) or _outline(file))
             except (BagError, OSError) as error:  # as for other readers, the rest of the bag counts
-                unreadable.append(BagError(str(error)))
+                self._unreadable.append(BagError(str(error)))
         if not self._outlines:
-            raise unreadable[0]
+            raise self._unreadable[0]
         starts = [outline.start for outline in self._outlines if outline.start is not None]
         ends = [outline.end for outline in self._outlines if outline.end is not None]
         if not starts:
             raise BagError(f"{path}: has no messages: there is nothing to play")
         self.start, self.end = min(starts), max(ends)  # extreme log times [ns]
-        # A line per damaged file, some only after reading.
-        self.damage = [f"{error}: left out" for error in unreadable]
-        self.damage += [f"{outline.path}: {outline.damage}" for outline in self._outlines if outline.damage]
         self.topics: dict[str, BagTopic] = {}  # with messages, by name
         for outline in self._outlines:
             for number, channel in outline.channels.items():
                 self._add(channel, outline.schemas.get(channel.schema_id), outline.counts.get(number, 0))
 
+    @property
+    def damage(self) -> list[str]:
+        """A line per damaged file, some only after reading."""
+        lines = [f"{outline.path}: {outline.damage}" for outline in self._outlines if outline.damage]
+        return [f"{error}: left out" for error in self._unreadable] + lines
+
     def _add(self, channel: Channel, schema: Schema | None, messages: int) -> None:
         if not messages:
             return
-        type_name, type_hash = schema.name if schema else "", channel.metadata.get("topic_type_hash", "")
+        name, type_name = ros_topic(channel.topic), schema.name if schema else ""
+        type_hash = channel.metadata.get("topic_type_hash", "")
         latched = any(
             isinstance(each, dict) and each.get("durability") in _LATCHED for each in offered_profiles(channel)
         )
-        new = BagTopic(channel.topic, type_name, channel.message_encoding, type_hash, latched)
-        topic = self.topics.setdefault(channel.topic, new)
+        topic = self.topics.setdefault(name, BagTopic(name, type_name, channel.message_encoding, type_hash, latched))
         topic.latched |= latched
         topic.messages += messages
-        if schema is not None and schema.name != topic.type_name:
+        topic.type_name = topic.type_name or type_name
+        if type_name and type_name != topic.type_name:
             raise BagError(
-                f"topic {channel.topic}: its messages are {topic.type_name} and {schema.name}: expected one type "
-                "of each topic"
+                f"topic {name}: its messages are {topic.type_name} and {type_name}: expected one type of each topic"
             )
 
     def messages(self, topics: Collection[str], until: int = 2**63) -> Iterator[Message]:
         """The messages of some topics up to the time ``until`` [ns]; the rest of the bag is not read."""
+        if until >= self.end:
+            until = 2**63  # read all of it, to know what is damaged
         newest: dict[str, int] = {}
         pending: list[tuple[int, int, str, bytes]] = []  # time, position in the bag, topic, data
         position = held = 0
         repeated = _Repetitions() if len(self._outlines) > 1 else None
         for number_of_file, (outline, later) in enumerate(zip(self._outlines, self._starts_after(), strict=True)):
             lows = _Lows(outline.lows, later)
-            file = stored_file(outline.path)
+            file, low = stored_file(outline.path), 0
             names: dict[int, str | None] = {}
             for batch in file.batches():
                 for number, channel in file.channels.items():
                     if number not in names:
-                        names[number] = channel.topic if channel.topic in topics else None
+                        name = ros_topic(channel.topic)
+                        names[number] = name if name in topics else None
                 places = zip(batch.start.tolist(), batch.size.tolist(), strict=True)
                 for (number, sequence, time, published), (start, size) in zip(batch.head.tolist(), places, strict=True):
                     topic = names.get(number)
@@ -150,10 +163,10 @@ class Playback:
                     yield Message(time, topic, data)
                 del pending[:ready]
                 if low > until:
-                    return
-            if file.damaged_chunks and outline.damage is None:
-                outline.damage = f"damaged chunks that are left out: {file.damaged_chunks}"
-                self.damage.append(f"{outline.path}: {outline.damage}")
+                    break
+            outline.damaged_chunks = max(outline.damaged_chunks, file.damaged_chunks)
+            if low > until:
+                return
         for time, _, topic, data in pending:
             if time <= until:
                 yield Message(time, topic, data)
@@ -257,8 +270,5 @@ def _outline(path: Path) -> _Outline:
     outline.start = min((low for _, low in outline.lows), default=None)
     outline.counts = dict(counts)
     outline.channels, outline.schemas = file.channels, file.schemas
-    notes = [file.torn] if file.torn else []
-    if file.damaged_chunks:
-        notes.append(f"damaged chunks that are left out: {file.damaged_chunks}")
-    outline.damage = "; ".join(notes) or None
+    outline.torn, outline.damaged_chunks = file.torn, file.damaged_chunks
     return outline

@@ -215,6 +215,11 @@ def ros_type(name: str) -> str:
     return f"{found[1]}/msg/{found[2]}" if found else name
 
 
+def ros_topic(name: str) -> str:
+    """The absolute name of a topic in ROS 2, from that in DDS, such as ``rt/chatter``."""
+    return name if name.startswith("/") else f"/{name.removeprefix('rt/')}"
+
+
 def no_time(head: AnyArray) -> BoolArray:
     """(messages,) whether the log or publish time is 2^63 ns or more, which no clock shows."""
     octets = head.view(np.uint8).reshape(len(head), MESSAGE_HEAD.itemsize)

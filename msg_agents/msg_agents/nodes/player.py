@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from typing import Any
 import rclpy
 from builtin_interfaces.msg import Time
 from rclpy.duration import Duration
-from rclpy.exceptions import InvalidTopicNameException
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
@@ -24,11 +23,12 @@ from msg_agents.environment import discovery_scope
 from msg_agents.nodes.parameters import ros_arguments
 from msg_agents.nodes.process import leave
 from msg_agents.nodes.ros import LeanNode, RCLError, foreign_message_class, ros_profile
-from msg_agents.replay import BagClock, parse_remaps, select_topics
+from msg_agents.replay import BagClock, parse_remaps, problem_of_name, select_topics
 from msg_agents.terminal import Interruption, JobControl, Keyboard
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.bags.playback import BagTopic, Message, Playback
 from msg_analysis.errors import InputError
+from msg_analysis.experiment.problems import show
 from msg_analysis.messages.topics import CLOCK, LATCHED, STREAM
 
 SETTLED = 0.8  # s without a change in the readers, after which discovery counts as finished
@@ -81,12 +81,20 @@ class Played:
     begun: bool = False  # whether the required readers were there
 
 
-def message_classes(topics: Iterable[BagTopic], *, all_wanted: bool, on_note: Callable[[str], None]) -> dict[str, Any]:
-    """Message classes by name of the topics that can be played: of all if the user chose them (``all_wanted``)."""
+def message_classes(
+    topics: Iterable[BagTopic], names: Mapping[str, str], *, all_wanted: bool, on_note: Callable[[str], None]
+) -> dict[str, Any]:
+    """Message classes by name of the topics that can be played as ``names`` say: of all if they were chosen."""
     found, unplayable = {}, []
     for topic in topics:
         if topic.encoding != "cdr":
             unplayable.append(f"{topic.name} (the encoding of its messages is {topic.encoding or 'unknown'}, not cdr)")
+            continue
+        if not topic.type_name:
+            unplayable.append(f"{topic.name} (the type of its messages is not in the bag)")
+            continue
+        if problem := problem_of_name(names[topic.name]):
+            unplayable.append(f"{show(topic.name)} ({problem})")
             continue
         try:
             found[topic.name] = foreign_message_class(topic.type_name)
@@ -94,7 +102,8 @@ def message_classes(topics: Iterable[BagTopic], *, all_wanted: bool, on_note: Ca
             unplayable.append(f"{topic.name} ({error})")
     if unplayable and (all_wanted or not found):
         raise InputError(
-            f"cannot be played: {', '.join(unplayable)}: install the type, or leave the topic out with --exclude"
+            f"cannot be played: {', '.join(unplayable)}: install missing types, rename topics with --remap, or leave "
+            "them out with --exclude"
         )
     for line in unplayable:
         on_note(f"not played: {line}")
@@ -136,16 +145,14 @@ class Player(LeanNode):
                     f"{CLOCK.name} as it was recorded, or choose more with --topics"
                 )
             on_note(f"{CLOCK.name} of the bag is not played: --clock publishes its own")
-        types = message_classes([bag.topics[name] for name in chosen], all_wanted=bool(options.topics), on_note=on_note)
         names = parse_remaps(options.remaps, chosen)
+        topics = [bag.topics[name] for name in chosen]
+        types = message_classes(topics, names, all_wanted=bool(options.topics), on_note=on_note)
         self._latched = {name for name in types if bag.topics[name].latched}
         self._writers: dict[str, Publisher] = {}
         for name, kind in types.items():
-            try:
-                qos = ros_profile(LATCHED if name in self._latched else STREAM)
-                self._writers[name] = self.create_publisher(kind, names[name], qos)
-            except InvalidTopicNameException as error:
-                raise InputError(f"--remap: {name}:={names[name]}: {error}") from error
+            qos = ros_profile(LATCHED if name in self._latched else STREAM)
+            self._writers[name] = self.create_publisher(kind, names[name], qos)
         self._check_definitions()
         self._ticker = self.publisher_of(CLOCK) if options.clock else None
         self._time = BagClock(self._first, options.rate, paused=options.paused)
@@ -399,9 +406,9 @@ def play(
     """Play a bag (or one of its files) in this process; BagError, InputError: not a bag, or not playable like that."""
     # Ctrl-C raises KeyboardInterrupt, another signal SystemExit: only ``on_progress`` then has said how far it came.
     bag = Playback(path)
-    for line in bag.damage:
+    said = bag.damage
+    for line in said:
         on_note(line)
-    known = len(bag.damage)
     with ros_arguments():
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Player] = []
@@ -422,7 +429,8 @@ def play(
                 nodes[0].play()
                 complete = True
     finally:
-        for line in bag.damage[known:]:
-            on_note(line)
+        for line in bag.damage:
+            if line not in said:
+                on_note(line)
         leave(nodes, None, complete=complete)
     return nodes[0].played

@@ -2,13 +2,18 @@
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytest.importorskip("rclpy")
 
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.validate_full_topic_name import validate_full_topic_name
+
 from msg_agents.nodes.player import message_classes
 from msg_agents.nodes.ros import foreign_message_class
+from msg_agents.replay import parse_remaps
 from msg_analysis.bags.playback import BagTopic
 from msg_analysis.errors import InputError
 
@@ -28,20 +33,50 @@ def topic(name: str, type_name: str) -> BagTopic:
     return BagTopic(name, type_name, "cdr", "", False, 1)
 
 
+def classes(topics: list[BagTopic], notes: list[str], *, all_wanted: bool = False) -> dict[str, Any]:
+    names = {each.name: each.name for each in topics}
+    return message_classes(topics, names, all_wanted=all_wanted, on_note=notes.append)
+
+
 def test_odd_types() -> None:
     notes: list[str] = []
     good = topic("/good", "std_msgs/msg/String")
-    message_classes([good], all_wanted=True, on_note=notes.append)
+    classes([good], notes, all_wanted=True)
     before = set(sys.modules)
-    topics = [topic(f"/{number}", type_name) for number, type_name in enumerate(ODD)]
-    found = message_classes([*topics, good], all_wanted=False, on_note=notes.append)
+    topics = [topic(f"/t{number}", type_name) for number, type_name in enumerate(ODD)]
+    found = classes([*topics, good], notes)
     assert [(name, kind.__name__) for name, kind in found.items()] == [("/good", "String")]
-    assert [note.partition(" (the type ")[0] for note in notes] == [f"not played: /{n}" for n in range(len(ODD))]
+    assert [note.partition(" (the type ")[0] for note in notes] == [f"not played: /t{n}" for n in range(len(ODD))]
     assert all(note.isprintable() and len(note) < 150 for note in notes)
     assert set(sys.modules) == before
     for each in topics:
-        with pytest.raises(InputError, match="install the type, or leave the topic out"):
-            message_classes([each], all_wanted=False, on_note=notes.append)
+        with pytest.raises(InputError, match="install missing types"):
+            classes([each], notes)
+
+
+NAMES = [
+    *("/a", "/_a/b_1/__", "/" + "a" * 246, "/" + "a" * 247, "/", "//", "/a//b", "/a/", "/1a", "/a/1", "/a b", "/a-b"),
+    *("/~x", "/~/x", "/a{b}", "/{node}", "/é", "/a\nb", "/a\n", "/\x1b[2J", "/a.b", "/A"),
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_of_topics(name: str) -> None:
+    """What rclpy refuses is named in one line; such a topic of a bag can be played under another name."""
+    string, notes = "std_msgs/msg/String", list[str]()
+    topics, there = [topic(name, string), topic("/good", string)], ["/good", name]
+    try:
+        validate_full_topic_name(name)
+    except InvalidTopicNameException:
+        there.remove(name)
+        with pytest.raises(InputError, match=r"^--remap: [^\n]*: not a name of a topic") as refused:
+            parse_remaps([f"/good:={name}"], ["/good"])
+        notes.append(str(refused.value))
+    assert sorted(classes(topics, notes)) == sorted(there)
+    assert len(notes) == 2 * (name not in there)
+    assert all(note.isprintable() for note in notes)
+    names = {name: "/other", "/good": "/good"}
+    assert len(message_classes(topics, names, all_wanted=True, on_note=notes.append)) == 2
 
 
 @pytest.mark.parametrize("listed", ["msg/X.idl", "msg/Y.idl", None])

@@ -153,7 +153,7 @@ def test_torn_and_damaged(tmp_path: Path) -> None:
     at = whole.index((100).to_bytes(20, "little"))
     file.write_bytes(whole[:at] + b"\xff" + whole[at + 1 :])
     bag = Playback(file)
-    found = [int.from_bytes(message.data, "little") for message in bag.messages(list(bag.topics))]
+    found = [int.from_bytes(message.data, "little") for message in bag.messages(list(bag.topics), bag.end)]
     assert bag.damage == [f"{file}: damaged chunks that are left out: 1"]
     assert 100 not in found
     assert len(messages) - 10 < len(found) < len(messages)
@@ -177,6 +177,22 @@ def test_two_types_on_a_topic(tmp_path: Path) -> None:
         writer.finish()
     with pytest.raises(BagError, match="topic /a: its messages are one/msg/A and two/msg/B"):
         Playback(tmp_path / "bag.mcap")
+
+
+@pytest.mark.parametrize("kind", ["std_msgs::msg::dds_::String_", "std_msgs/msg/dds_/String_", "std_msgs/String"])
+def test_names_of_dds(tmp_path: Path, kind: str) -> None:
+    """Topics and types have the names that ROS 2 gives them; a channel without a type has that of its topic."""
+    with (tmp_path / "bag.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema(kind, "", b"")
+        for number, (name, of) in enumerate([("rt/a/b", 0), ("/a/b", schema), ("rt/a/b", schema), ("a/c", 0)]):
+            writer.add_message(writer.register_channel(name, "cdr", of), number, bytes([number]), number)
+        writer.finish()
+    bag = Playback(tmp_path)
+    assert {name: topic.type_name for name, topic in bag.topics.items()} == {"/a/b": "std_msgs/msg/String", "/a/c": ""}
+    found = [(message.topic, message.data[0]) for message in bag.messages(["/a/b"])]
+    assert found == [("/a/b", 0), ("/a/b", 1), ("/a/b", 2)]
 
 
 @pytest.mark.parametrize("flipped", [0x01, 0x40, 0x80])
