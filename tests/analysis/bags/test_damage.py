@@ -66,7 +66,7 @@ def recorded(tmp_path: Path, make_run: MakeRun) -> tuple[Run, Path]:
 
 
 def test_torn_at_every_chunk_and_at_many_bytes(recorded: tuple[Run, Path], tmp_path: Path) -> None:
-    """What is there up to the tear comes back; of every tenth, and those at chunks, it is salvaged."""
+    """What is there up to the tear comes back; of some, and those at chunks, it is salvaged."""
     run, whole = recorded
     data, (summary, everything) = whole.read_bytes(), contents(whole)
     with whole.open("rb") as stream:
@@ -77,7 +77,7 @@ def test_torn_at_every_chunk_and_at_many_bytes(recorded: tuple[Run, Path], tmp_p
     states = dict(zip(ends, counts, strict=True))  # up to there; channels 1, 2: experiment, graph
     assert len(states) > 5
     cuts = {*states, *(end - 1 for end in states), len(data) - 1, len(data) - 9}
-    cuts |= set(random.Random(2).sample(range(len(data)), 500))
+    cuts |= set(random.Random(2).sample(range(len(data)), 150))
     head = data.index(b"/experiment") - 200  # the run record stands before the topics
     torn, previous = tmp_path / "torn.mcap", -1
     for cut in sorted(cuts):
@@ -93,7 +93,7 @@ def test_torn_at_every_chunk_and_at_many_bytes(recorded: tuple[Run, Path], tmp_p
         previous = found.completeness.received
         assert states.get(cut, previous) == previous
     assert previous == 123
-    for cut in [*states, *(cut for cut in sorted(cuts)[::10] if cut > min(states))]:
+    for cut in [*list(states)[::4], *(cut for cut in sorted(cuts)[::10] if cut > min(states))]:
         torn.write_bytes(data[:cut])
         report = salvaged(torn, everything)
         assert report.kept_bytes + report.dropped_bytes == cut
@@ -105,7 +105,7 @@ def test_flipped_bytes(recorded: tuple[Run, Path], tmp_path: Path) -> None:
     data, (summary, everything) = whole.read_bytes(), contents(whole)
     end = summary.chunk_indexes[-1].chunk_start_offset + summary.chunk_indexes[-1].chunk_length
     flipped, rng, costs = tmp_path / "flipped.mcap", random.Random(3), 0
-    for number in range(200):
+    for number in range(100):
         place = rng.randrange(len(data))
         flipped.write_bytes(data[:place] + bytes([data[place] ^ 1 << rng.randrange(8)]) + data[place + 1 :])
         try:
@@ -121,7 +121,7 @@ def test_flipped_bytes(recorded: tuple[Run, Path], tmp_path: Path) -> None:
         costs += found.completeness.missing > 0
         if number % 10 == 0 and found.completeness.received:
             salvaged(flipped, everything)
-    assert costs > 12
+    assert costs > 6
 
 
 @pytest.mark.parametrize("compression", ["none", "zstd"])
@@ -132,9 +132,9 @@ def test_damage_around_a_chunk(tmp_path: Path, make_run: MakeRun, compression: C
     data, (summary, everything) = file.read_bytes(), contents(file)
     chunk = summary.chunk_indexes[-1]
     content = chunk.chunk_start_offset + chunk.chunk_length
-    places = [*range(chunk.chunk_start_offset + 9, content - chunk.compressed_size, 2)]
-    places += range(content, content + chunk.message_index_length, 7)
-    assert len(places) > 30
+    places = [*range(chunk.chunk_start_offset + 9, content - chunk.compressed_size, 4)]
+    places += range(content, content + chunk.message_index_length, 23)
+    assert len(places) > 15
     damaged, count = tmp_path / "damaged.mcap", 0
     for place in places:
         damaged.write_bytes(data[:place] + bytes([data[place] ^ 0x41]) + data[place + 1 :])

@@ -1,10 +1,13 @@
 """Bags in sqlite3, made by hand in the schemas of rosbag2's versions, and by rosbags: read, played, salvaged."""
 
+import contextlib
+import os
 import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +20,7 @@ from click.testing import CliRunner
 from rosbags.highlevel import AnyReader
 
 from experiments import Run, read_bag, write_trajectory
+from msg_analysis.bags.files import stored_file
 from msg_analysis.bags.playback import Playback
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.cli.main import main
@@ -272,6 +276,30 @@ def test_a_hot_journal(ours: Run, messages: list[Message], tmp_path: Path) -> No
     assert set(before) == {"x.db3", "x.db3-journal"}
     assert np.array_equal(read_bag(tmp_path / "copy").states, ours.states)
     assert {file.name: file.read_bytes() for file in (tmp_path / "copy").iterdir()} == before
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give up its rights and take them back")
+@pytest.mark.parametrize("ends", [["-wal"], ["-wal", "-shm"], ["-journal"]])
+def test_what_cannot_be_written(ends: list[str], messages: list[Message]) -> None:
+    """Read-only copies from a running recorder, of a user without rights: SQLite would make or mend a file there."""
+    with tempfile.TemporaryDirectory() as here, tempfile.TemporaryDirectory() as there, contextlib.ExitStack() as stack:
+        connection = sqlite3.connect(database(Path(here) / "x.db3", messages))
+        for statement in (f"journal_mode={'WAL' if '-wal' in ends else 'DELETE'}", "cache_size=1"):
+            connection.execute(f"PRAGMA {statement}")
+        connection.execute("DELETE FROM messages WHERE id > 100")
+        if "-wal" in ends:
+            connection.commit()
+        for end in ("", *ends):
+            shutil.copy(f"{here}/x.db3{end}", there)
+        connection.close()
+        Path(there).chmod(0o555)
+        os.seteuid(65534)
+        stack.callback(os.seteuid, 0)
+        with pytest.raises(PermissionError):
+            Path(there, "y").touch()
+        found = sum(len(batch.size) for batch in stored_file(Path(there, "x.db3")).batches())
+        assert found == (100 if "-wal" in ends else len(messages))
+        assert {path.name for path in Path(there).iterdir()} == {f"x.db3{end}" for end in ("", *ends)}
 
 
 @pytest.mark.parametrize("form", ["{}::msg::dds_::{}_", "{}/{}", "{}::msg::{}", "{}/msg/{}", ""])
