@@ -33,6 +33,7 @@ from msg_analysis.bags.mcap_records import (
     RECORD_HEAD,
     SUMMARY_OPCODES,
     Source,
+    chunk_length,
     fits,
     is_message,
     read_summary,
@@ -57,6 +58,7 @@ CHUNK_TIMES = struct.Struct("<QQ")  # first and last log time, at the start of a
 CHUNK_CRC = slice(RECORD.size + 24, RECORD.size + 28)  # place of the CRC in the record of a chunk
 MOST_OTHERS = 2**18  # records of a chunk that are no messages: two for every number of a channel
 MOST_DESCRIBED = 2**26  # bytes of the schemas and channels in the chunks of a file: what they describe is kept
+_IN_CHUNKS = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
 _LOOSE = 2**18  # bytes of a batch of messages that are not in chunks
 
 
@@ -127,7 +129,11 @@ class McapFile(StoredFile):
                 self._chunks += 1
                 chunk = _Chunk(content, self.whole_bytes)
             elif opcode == Opcode.MESSAGE:
-                yield _loose_batch(content, *places, self.whole_bytes, chunks=self._chunks > 0)
+                batch = _loose_batch(content, *places, self.whole_bytes, chunks=self._chunks > 0)
+                if len(batch.size) < len(places[0]):
+                    self._skipped += 1
+                    self._consult_summary()
+                yield batch
             else:
                 with contextlib.suppress(DamageError):
                     self.note(opcode, content)
@@ -169,9 +175,10 @@ class McapFile(StoredFile):
                 yield opcode, content, (np.array([0]), np.array([length]))
             chunk = opcode == Opcode.CHUNK or fits(Opcode.CHUNK, content)
             # Of a damaged chunk that is not compressed, no message is taken: nothing would tell that it was changed.
-            inside = bool(self._chunks or chunk or (self.stated and self.stated.chunk_count)) and not self._ended
+            chunks = self.stated.chunk_count if self.stated else self._chunks or chunk
+            inside = bool(chunks) and not self._ended
             source.unread(head + content)
-            skipped = source.skip((Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL) if inside else ())
+            skipped = source.skip(_IN_CHUNKS if inside else ())
             if skipped is None:
                 fitting = bool(content) and fits(opcode, content)
                 self.whole_bytes += (RECORD.size + length) * fitting
@@ -180,7 +187,9 @@ class McapFile(StoredFile):
                     self.torn = f"no record at byte {self.whole_bytes}, where one should be"
                 return
             index = self._chunks and (opcode == Opcode.MESSAGE_INDEX or fits(Opcode.MESSAGE_INDEX, content))
-            self._skipped += chunk or not (index or self._ended)
+            array = int.from_bytes(content[INDEX_HEAD - 4 : INDEX_HEAD], "little")
+            more = skipped > RECORD.size + max(length, INDEX_HEAD + array)  # than the index, if it is one
+            self._skipped += chunk or (not self._ended and (more or not index))
             self.false_indexes += 1
             self.whole_bytes += skipped
             yield 0, b"", (none, none)
@@ -197,7 +206,7 @@ class McapFile(StoredFile):
         if opcode == Opcode.FOOTER:
             return len(content) == FOOTER.size
         if opcode == Opcode.CHUNK:  # where bytes of it are lost, it would end in the next one
-            return not self._ended and (source.record_at(0) or _is_right(content))
+            return not self._ended and _ends_there(content, followed=source.whole_ahead(_IN_CHUNKS))
         if self._ended and opcode <= LAST_OPCODE:
             return opcode in SUMMARY_OPCODES or fits(opcode, content)
         if fits(opcode, content):
@@ -290,15 +299,17 @@ class McapFile(StoredFile):
         return np.concatenate([none, *starts]), np.concatenate([none, *sizes])
 
 
-def _is_right(chunk: bytes) -> bool:
-    """Whether the content of a chunk ends where its record does, and has the right checksum or whole records."""
+def _ends_there(chunk: bytes, *, followed: bool) -> bool:
+    """Whether a chunk ends where its record does; ``followed``: a whole record stands there."""
+    beyond = (chunk_length(chunk) or 0) - len(chunk)  # more than 0: the size in its head may be wrong
+    if beyond < 0 or (followed and not beyond):
+        return not beyond
     try:
         data = unpack(chunk, zstandard.ZstdDecompressor())
     except Exception:  # decompressors raise many kinds of errors on damage
         return False
-    crc = CHUNK.unpack_from(chunk)[3]
-    walked = crc or sum(RECORD.size + len(content) for _, content in walk(data, 0, len(data)))
-    return fits(Opcode.CHUNK, chunk) and walked in (crc, len(data))
+    whole = sum((RECORD.size + len(each)) * (opcode in _IN_CHUNKS) for opcode, each in walk(data, 0, len(data)))
+    return CHUNK.unpack_from(chunk)[3] > 0 or (not beyond and whole == len(data))
 
 
 def _keep_memory() -> None:

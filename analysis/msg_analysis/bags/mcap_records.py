@@ -63,7 +63,7 @@ _ALIKE = 16  # records of equal length in a row, after which more are expected
 def fits(opcode: int, content: bytes) -> bool:
     """Whether the content of a record that is no message is one of its type, to its last byte."""
     if opcode == Opcode.CHUNK:
-        return _chunk_length(content) == len(content)
+        return chunk_length(content) == len(content)
     if opcode == Opcode.MESSAGE_INDEX:
         size = int.from_bytes(content[INDEX_HEAD - 4 : INDEX_HEAD], "little")
         return len(content) == INDEX_HEAD + size and not size % 16
@@ -77,7 +77,7 @@ def fits(opcode: int, content: bytes) -> bool:
     return stream.tell() == len(content)
 
 
-def _chunk_length(head: bytes) -> int | None:
+def chunk_length(head: bytes) -> int | None:
     """Bytes of the content of a chunk, by its first ones; None: not those of a chunk."""
     if len(head) < CHUNK.size + LENGTH.size:
         return None
@@ -228,18 +228,21 @@ class Source:
             if len(head) < RECORD.size:
                 return None
             if match:
-                opcode, length = RECORD.unpack(head)
-                if opcode not in others and self._whole(opcode, length):
+                if self.whole_ahead(others):
                     return skipped
                 skipped, self._at = skipped + 1, self._at + 1
 
-    def _whole(self, opcode: int, length: int) -> bool:
-        """Whether the record ahead is whole: of the right type and followed by another."""
-        if not _plausible(opcode, length):
+    def whole_ahead(self, others: Collection[int]) -> bool:
+        """Whether a whole record is ahead, of no type in ``others`` and followed by another, or the end of the file."""
+        head = self._peek(RECORD.size)
+        if len(head) < RECORD.size:
+            return True
+        opcode, length = RECORD.unpack(head)
+        if opcode in others or not _plausible(opcode, length):
             return False
         if opcode == Opcode.CHUNK:
             start = self._peek(RECORD.size + CHUNK.size + LENGTH.size + 4)[RECORD.size :]
-            return _chunk_length(start) == length and self.record_at(RECORD.size + length)
+            return chunk_length(start) == length and self.record_at(RECORD.size + length)
         if length > _LARGEST_FOUND:
             return False
         record = self._peek(RECORD.size + length)

@@ -1,6 +1,7 @@
 """Bags that were cut or damaged anywhere: what is whole comes back, and no wrong number."""
 
 import contextlib
+import itertools
 import os
 import random
 import shutil
@@ -249,3 +250,24 @@ def test_damage_costs_what_it_touches(kind: str, tmp_path: Path) -> None:
         assert set(found) <= set(messages), case
         assert {message[1] for message in messages} - free <= {message[1] for message in found}, case
         assert len(found) == len(messages) or file.damaged_chunks or file.torn, case
+
+
+@pytest.mark.parametrize("kind", ["zstd", "lz4", "none", "no CRC"])
+@pytest.mark.parametrize("way", ["ends at a later chunk", "is a message"])
+def test_a_chunk_that_looks_whole(kind: str, way: str, tmp_path: Path) -> None:
+    """Its length leads to a later chunk, or its opcode is that of a message: it alone is lost, and that is counted."""
+    path = tmp_path / "x.mcap"
+    messages = of_others(path, random.Random(5), **KINDS[kind])
+    data = path.read_bytes()
+    chunks = [each for each in records(data) if each[0] == 6]
+    for (_, start, end), (_, later, _) in itertools.pairwise(chunks[1:6:2]):
+        head = (
+            struct.pack("<BQ", 6, later - start - 9)
+            if way == "ends at a later chunk"
+            else b"\5" + data[start + 1 :][:8]
+        )
+        path.write_bytes(data[:start] + head + data[start + 9 :])
+        file = stored_file(path)
+        found = {int(number) for batch in file.batches() for number in batch.head["sequence"]}
+        assert {message[1] for message in messages} - found == numbers(data, 6, start, end)
+        assert file.damaged_chunks == 1
