@@ -150,7 +150,7 @@ class Search:
     ) -> None:
         self.experiment, self.names = experiment, [graph.name for graph in experiment.graph_list]
         self.residuals, self.transitions, self.loss = evidence.residuals, evidence.transitions, evidence.loss
-        self.findings, self.level = findings, level
+        self.findings, self.level, self.steps = findings, level, evidence.steps
         self.families = 0  # classes of candidates, all questions together
         self.renamed: tuple[int, ...] = ()  # of the finding that the names of the graphs are others, once it is a cause
         residuals, loss, broadcast = evidence.residuals, evidence.loss, evidence.broadcast

@@ -103,6 +103,9 @@ def _causes(search: Search, *, about_chain: bool) -> list[Cause]:
         return exact + whole
     best, question = min(others, key=lambda one: one[0].log_p)
     log_p = best.log_p + math.log(search.families)
+    place = best.place
+    if whole and place is not None and 1.5 * (place.last - place.first + 1) >= search.steps:
+        return exact + whole  # of nearly the whole run
     if log_p >= min([math.log(search.level), *(cause.order for cause in whole)]):
         return exact + whole
     if question.explains_others(best):

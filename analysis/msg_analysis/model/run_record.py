@@ -120,11 +120,14 @@ class RunRecord:
 
     @cached_property
     def digest(self) -> int:
-        """A number below 2**60 that two records share only if their runs are the same, whatever wrote them."""
-        document = [str(self.run), self.experiment.to_document(), str(self.until), self.planned]
-        found = hashlib.sha256(json.dumps(document, sort_keys=True).encode() + self.start.tobytes())
-        for matrix in (*self.matrices.weights, *self.matrices.noise_gain) if self.matrices else ():
-            found.update(matrix.tobytes())
+        """A number below 2**60 that two records share only if nodes with them can make one run together.
+
+        Process noise is left out: it is an agent's own, and a fault may be made with it on purpose.
+        """
+        document = self.experiment.to_document()
+        noise = {key: value for key, value in document["noise"].items() if key != "process"}
+        shared = [str(self.run), document | {"noise": noise}, str(self.until), self.planned]
+        found = hashlib.sha256(json.dumps(shared, sort_keys=True).encode() + self.start.tobytes())
         return int.from_bytes(found.digest()[:8]) >> 4
 
     def ended(self, step: int) -> RunRecord:

@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any, NoReturn, Self
 
 from msg_analysis.common import programs
-from msg_analysis.common.files import lock
 
 PROGRAM = [sys.executable, "-m", "msg_agents.cli.node_server"]  # calls ``serve``
 LONGEST_TITLE = 200  # bytes; ROS names a log file by the title, and a longer name than 255 cannot be written
@@ -91,6 +90,7 @@ def exit_with_pipe(descriptor: int) -> None:
 
 def exit_with_lock(folder: Path) -> None:
     """End this process when a folder (``temporary_directory``) is no longer locked, or gone: its parent has ended."""
+    from msg_analysis.common.files import lock  # not for --help: it imports yaml
 
     def wait() -> None:
         with contextlib.suppress(OSError):

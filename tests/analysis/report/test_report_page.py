@@ -212,8 +212,9 @@ def test_rows_links_and_data(tmp_path: Path) -> None:
     """Newest first; the experiment of a bag is in it once, however many runs have it."""
     run = line_ring(run={"dt": 0.1, "duration": 5, "seed": 7, "start": "zero"}).simulate()
     names = ("pair 1_20261125_120000", "pair_20261126_120000")
-    for name in names:
-        run.save(tmp_path / "runs" / name)
+    for day, name in zip((25, 26), names, strict=True):
+        record = dataclasses.replace(run.record, started=datetime(2026, 11, day, 12, tzinfo=UTC))
+        dataclasses.replace(run, record=record).save(tmp_path / "runs" / name)
     (tmp_path / "runs" / names[0] / "report.html").write_text("")
     page = Page(render_runs(list_runs(tmp_path / "runs"), tmp_path / "runs", tmp_path / "pages"))
     assert "2 runs" in page.text
