@@ -250,6 +250,7 @@ def snapshot_document(snapshot: Snapshot, before: Mapping[str, Any] | None = Non
         "nodes": [node.to_json() for node in report.nodes] if report else None,
         "any_time": report.any_time.to_json() if report else None,
         "values": None if recent is None else finite(_newest(recent.states).tolist()),
+        "errors_step": report.last if report else None,  # which the states are ahead of while an agent is silent
         "values_step": None if recent is None else int(recent.steps[-1]),
         "trace": None if recent is None else _trace(snapshot, recent, before and before["trace"]),
         "lateness": report.lateness if report else None,

@@ -96,10 +96,10 @@ class WebServer:
                 self._trace, self._trace_sent, self._traces = trace, json.dumps(finite(trace)), self._traces + 1
             self._moment = finite({key: value for key, value in moment.items() if key != "trace"})
             if system.get("measured") is not None and (
-                not self._history or self._history[-1][0] != moment["values_step"]
+                not self._history or self._history[-1][0] != moment["errors_step"]
             ):
                 keys = ("measured", "predicted", "standard_error")
-                self._history.append(finite([moment["values_step"], *(system[key] for key in keys)]))
+                self._history.append(finite([moment["errors_step"], *(system[key] for key in keys)]))
             self._notify()
 
     def end(self, words: dict[str, Any], report: Path | None = None) -> None:

@@ -212,6 +212,7 @@ def test_a_silent_agent_in_real_time_stops_nobody_else() -> None:
         found = source.snapshot([90, 50, 90, 90, 90], pids={1: 77})
         assert (found.reached, found.silent) == (reached, silent)
         document = snapshot_document(found)
+        assert document["errors_step"] is None  # there are no errors yet
         said = "agent 2 (PID 77) has made no step for 2.1 s; the other 4 are on time" if silent else None
         assert document["warning"] == said
 

@@ -21,7 +21,7 @@ from msg_agents.cli.watching import WebCommand, web_options
 from msg_agents.watch.web_server import MOST_BROWSERS, MOST_CONNECTIONS, WebServer
 from msg_analysis.errors import InputError
 
-MOMENT = {"system": {"measured": 1.5, "predicted": 1.4, "standard_error": 0.1}, "values_step": 7, "reached": 8}
+MOMENT = {"system": {"measured": 1.5, "predicted": 1.4, "standard_error": 0.1}, "errors_step": 7, "reached": 8}
 
 
 @pytest.fixture

@@ -152,7 +152,7 @@ function show(data) {
     }
     at("against").classList.toggle("far", Boolean(seen && seen.exceeded));
     const last = points[points.length - 1];
-    if (!last || last[0] !== data.values_step) points.push([data.values_step, system.measured, system.predicted, system.standard_error]);
+    if (!last || last[0] !== data.errors_step) points.push([data.errors_step, system.measured, system.predicted, system.standard_error]);
     if (points.length > 1200) points = points.filter((_, place) => place % 2 === 1);
   }
   const known = (data.lateness || []).filter((late) => late !== null).sort((a, b) => a - b);
