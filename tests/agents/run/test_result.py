@@ -101,8 +101,7 @@ def test_the_verdict_is_said_without_room_for_it(
     verdict = result.comparison.verdict
     assert ended.value.code == {"agrees": 2, "disagrees": 1}[verdict]
     assert verdict in stdout.lower()
-    if as_json:
-        assert json.loads(stdout)["not_kept"] == result.not_kept
+    assert (json.loads(stdout)["not_kept"] if as_json else result.not_kept) == result.not_kept
     said = [line for line in stderr.splitlines() if line.startswith("not kept: ")]
     assert [line.split(":")[1].strip() for line in said] == [str(tmp_path / name) for name in lost]
     assert sorted(path.name for path in tmp_path.iterdir() if path.is_file()) == sorted(
