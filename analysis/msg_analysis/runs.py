@@ -87,7 +87,8 @@ def keep_result(bag: Path, document: dict[str, Any]) -> None:
         before = {"bag": str(bag)}
     if before.get("run") not in (None, document["run"]):  # not of this run
         before = {"bag": str(bag)}
-    write_whole(bag / RESULT_FILE, json_text(before | document | {"until": before.get("until")}, 1).encode() + b"\n")
+    until = before.get("until") or document["until"]
+    write_whole(bag / RESULT_FILE, json_text(before | document | {"until": until}, 1).encode() + b"\n")
 
 
 def _file(path: Path) -> Path:

@@ -1,5 +1,6 @@
 """What all commands of both command lines have in common: help, options, examples, start-up."""
 
+import inspect
 import itertools
 import os
 import re
@@ -18,6 +19,9 @@ import msg_analysis.bags.stored_file as storage_module
 from msg_analysis.cli import options as cli_options
 from msg_analysis.cli.console import SHORT_HELP
 from msg_analysis.common.files import RESULT_FILE
+from msg_analysis.inference.comparison import MAX_MISSED
+from msg_analysis.inference.pool import compare
+from msg_analysis.model.run import Run
 
 DOCS = Path(__file__).parents[2] / "docs"
 HOOK = run_path(str(DOCS / "hooks/commands.py"))
@@ -154,6 +158,9 @@ def test_constants_of_options() -> None:
     assert cli_options.BAG_SUFFIXES == storage_module.BAG_SUFFIXES
     assert cli_options.SMALLEST_SPLIT == storage_module.SMALLEST_SPLIT
     assert cli_options.RESULT_FILE == RESULT_FILE
+    (option,) = (one for one in PROGRAMS["msg-analysis"].commands["compare"].params if one.name == "max_missed")
+    defaults = [inspect.signature(judge).parameters["max_missed"].default for judge in (compare, Run.compare)]
+    assert [*defaults, option.default] == [MAX_MISSED] * 3
 
 
 @pytest.mark.parametrize("program", PROGRAMS)

@@ -206,17 +206,18 @@ def compare(
             from msg_analysis.report.page import write_report
 
             write_report(comparison, report)
+    document = comparison.to_json()
     if save and len(bags) == 1 and bags[0].is_dir():
         try:
-            keep_result(bags[0], comparison.to_json())
+            keep_result(bags[0], document)
         except OSError as error:
             print_note(f"{bags[0]}: the result could not be kept ({error.strerror}): --no-save leaves it out")
     if as_json:
-        print_json(comparison.to_json())
+        print_json(document)
     else:
         from msg_analysis.report.comparison_text import print_comparison
 
-        print_comparison(comparison.to_json(), result_console(), verbose=verbose)
+        print_comparison(document, result_console(), verbose=verbose)
         if report:
             print_text(f"report: {report}")
     context.exit(comparison.exit_code)

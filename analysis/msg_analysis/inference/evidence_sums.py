@@ -20,8 +20,6 @@ from msg_analysis.inference.question import Block, Diagnostic, Finding, Law, Run
 from msg_analysis.inference.questions import QUESTIONS, evidence_weights
 from msg_analysis.inference.received_values import (
     DIGITS,
-    HIDDEN,
-    QUIET_ROUNDING,
     ReceivedValues,
     RepeatedNoise,
     errors_have_digits,
@@ -244,7 +242,7 @@ class EvidenceSums:
         variances = np.diagonal(self._process, axis1=1, axis2=2)[reception.graphs, agents] + reception.link_variance
         still = variances <= self._floor
         if self._independent and still.any():
-            allowed = QUIET_ROUNDING * reception.size() + HIDDEN * np.sqrt(np.where(still, variances, 0.0))
+            allowed = reception.allowed(np.sqrt(np.where(still, variances, 0.0)))
             moved = (np.abs(e).max(axis=2) > allowed) & still
             parts.impossible += analyses.counts(np.asarray(moved.any(axis=1)))
         return np.asarray(np.sqrt(np.where(still, np.inf, variances)))

@@ -19,7 +19,6 @@ from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.question import Block, Diagnostic, Finding, Law, Place, Statistics, Test, agent_words
-from msg_analysis.inference.received_values import HIDDEN, QUIET_ROUNDING
 from msg_analysis.inference.residuals import received_residuals
 
 ROUNDING = 2.0**-40  # of the largest x(0): smaller differences are for ``check``
@@ -97,15 +96,14 @@ class WithoutNoise(Exact):
     def __init__(self, law: Law) -> None:
         super().__init__(law)
         self._found: Finding | None = None
-        self._hidden = HIDDEN * np.sqrt(np.square(law.step.noise_gain).sum(axis=2))  # (n, m) noise that counts as none
+        self._deviations = np.sqrt(np.square(law.step.noise_gain).sum(axis=2))  # (n, m) of process noise
 
     def add(self, block: Block) -> FloatArray:
         """Nothing is computed where all agents have noise."""
         quiet = np.isinf(block.scale)
         if self._found is None and quiet.any():
-            away = np.abs(received_residuals(self.law.step, block.reception, block.after)) * quiet[:, :, None]
-            agents = np.arange(away.shape[1])
-            allowed = QUIET_ROUNDING * block.reception.size() + self._hidden[block.reception.graphs, agents]
+            away = np.abs(received_residuals(self.law.step, block.reception, block.after))
+            allowed = block.reception.allowed(self._deviations[block.reception.graphs, np.arange(away.shape[1])])
             wrong = np.argwhere((away.max(axis=2) > allowed) & quiet)
             if len(wrong):
                 at, agent = wrong[0].tolist()

@@ -121,6 +121,10 @@ class ReceivedValues:
             total += np.abs(self.weights[:, :, d, None] * received)
         return np.asarray(total.max(axis=2))
 
+    def allowed(self, deviations: FloatArray) -> FloatArray:
+        """(b, m): largest residuals that rounding leaves, and noise of these deviations (b, m) that counts as none."""
+        return QUIET_ROUNDING * self.size() + HIDDEN * deviations
+
     def patterns(self, order: IntArray | None = None) -> Iterator[tuple[IntArray, IntArray | None, IntArray]]:
         """Groups of like steps: graphs (m,) and order (m,) of the agents, by ``order`` (b, m), and steps (a,)."""
         if order is None and (self.graphs == self.modes[:, None]).all():

@@ -30,8 +30,8 @@ def finish(
     interruption: Interruption,
     analyse: bool = True,
     report: ReportWhen = "always",
-    max_missed: float = 0.05,
     verbose: bool = False,
+    **limits: float,
 ) -> None:
     """Print the failures, compare what was recorded (until a signal), show the result, and exit with its code."""
     for line in result.failures:
@@ -44,7 +44,7 @@ def finish(
         progress = WorkProgress()
         try:
             with interruption.let_through(), progress, watched(progress):
-                conclude(result, report, max_missed=max_missed)
+                conclude(result, report, **limits)
         except KeyboardInterrupt:
             result.interrupt(signal.SIGINT, "while the run was compared with the prediction")
             complain(result.failures[0], "failed:")

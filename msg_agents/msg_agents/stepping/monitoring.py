@@ -72,6 +72,30 @@ def silence_text(
     return f"{who} made no step for {seconds:.1f} s; the other {others} {'is' if others == 1 else 'are'} on time"
 
 
+class StepAges:
+    """Since when each agent has made its newest step."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._steps: list[int] = []
+        self._moved: list[float] = []  # s
+
+    def update(self, steps: Sequence[int]) -> list[int]:
+        """Take the newest step of every agent (from 0); which have made one since the last call."""
+        now = self._clock()
+        if len(steps) != len(self._steps):
+            self._steps, self._moved = list(steps), [now] * len(steps)
+        moved = [agent for agent, (old, new) in enumerate(zip(self._steps, steps, strict=True)) if new > old]
+        for agent in moved:
+            self._steps[agent], self._moved[agent] = steps[agent], now
+        return moved
+
+    def ages(self) -> list[float]:
+        """Seconds since each agent has made its newest step."""
+        now = self._clock()
+        return [now - moved for moved in self._moved]
+
+
 @dataclass(frozen=True, slots=True)
 class Lag:
     """A run in real time is behind its clock."""
@@ -89,13 +113,12 @@ class LagDetector:
         self._began: float | None = None
         self._first = 0
         self._next_warning = LAG_TIME
-        self._moved: list[tuple[int, float]] = []  # newest step of every agent, and since when
+        self._ages = StepAges(clock)
 
     def update(self, steps: Sequence[int]) -> Lag | None:
         """After each look at the newest step of every agent: what to warn of now, and again when it has doubled."""
         now, step = self._clock(), min(steps)
-        before = self._moved if len(self._moved) == len(steps) else [(-1, now)] * len(steps)
-        self._moved = [old if new <= old[0] else (new, now) for old, new in zip(before, steps, strict=True)]
+        self._ages.update(steps)
         if self._began is None or step == self._first:  # waiting for the epoch
             self._began, self._first = now, step
             return None
@@ -104,9 +127,9 @@ class LagDetector:
         if behind < self._next_warning:
             return None
         self._next_warning = 2.0 * behind
-        ages = {agent: now - since for agent, (_, since) in enumerate(self._moved)}
-        silent = tuple(agent for agent, age in ages.items() if age > LAG_TIME / 2.0)
-        others = [steps[agent] for agent in ages if agent not in silent]
+        ages = self._ages.ages()
+        silent = tuple(agent for agent, age in enumerate(ages) if age > LAG_TIME / 2.0)
+        others = [step for agent, step in enumerate(steps) if agent not in silent]
         if not silent or not others or due - min(others) >= LAG_TIME * self._rate:
             return Lag(behind, ())
         return Lag(behind, silent, min(ages[agent] for agent in silent))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from msg_agents.stepping.monitoring import silence_text
+from msg_agents.stepping.monitoring import StepAges, silence_text
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.text import agent_text, finite
 from msg_analysis.model.graph_path import HoldingPeriod, holding_periods
@@ -64,27 +64,16 @@ class Presence:
     """Which agents make no new steps, and since when."""
 
     def __init__(self, names: Sequence[str] | None, clock: Callable[[], float]) -> None:
-        self._names, self._clock = names, clock
-        self._steps: list[int] = []
-        self._moved: list[float] = []  # when each made its newest step [s]
+        self._names, self._steps = names, StepAges(clock)
+        self.ages = self._steps.ages
         self.gone: set[int] = set()  # agents (from 0) whose process has ended, until a new one makes a step
 
     def add(self, steps: Sequence[int], ended: Iterable[int]) -> list[str]:
         """Take the newest step of every agent, by index, and the agents whose process has ended; what is new."""
-        now = self._clock()
-        if len(steps) != len(self._steps):
-            self._steps, self._moved = list(steps), [now] * len(steps)
-        back = [agent for agent, (old, new) in enumerate(zip(self._steps, steps, strict=True)) if new > old]
-        for agent in back:
-            self._steps[agent], self._moved[agent] = steps[agent], now
+        back = self._steps.update(steps)
         returned = sorted(self.gone.intersection(back))
         self.gone = self.gone.difference(back).union(ended)
         return [f"{agent_text(agent + 1, self._names)} is back" for agent in returned if agent not in self.gone]
-
-    def ages(self) -> list[float]:
-        """Seconds since each agent has made its newest step."""
-        now = self._clock()
-        return [now - moved for moved in self._moved]
 
 
 class HoldingPeriods:

@@ -51,10 +51,13 @@ def test_the_result_of_one_bag_is_kept_with_it(bags: list[Path], tmp_path: Path)
     call("compare", bag, bags[1])
     document = json.loads(call("compare", bag, "--no-save", "--json").stdout)
     assert not (bag / "result.json").exists()
-    (bag / "result.json").write_text(json.dumps({"run": document["run"], "rate": 7.0, "restarts": ["agent_1: x"]}))
+    (bag / "result.json").write_text(
+        json.dumps({"run": document["run"], "rate": 7.0, "restarts": ["agent_1: x"], "until": {"rule": "x"}})
+    )
     call("compare", bag)
     saved = json.loads((bag / "result.json").read_text())
     assert (saved["rate"], saved["restarts"], saved["verdict"]) == (7.0, ["agent_1: x"], document["verdict"])
+    assert saved["until"] == {"rule": "x"}
     assert json.loads(call("runs", tmp_path, "--json").stdout)["runs"][0]["verdict"] == document["verdict"]
 
 
