@@ -20,6 +20,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from msg_agents.discovery.rtps import LOOPBACK, discovery_ports, disposal_message
+from msg_agents.run.result import read_steps
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.runs import read_result
 from msg_analysis.twin.check import check
@@ -177,9 +178,10 @@ def test_stopped_recorder(network: Any) -> None:
     """Everybody waits for it in the end, for longer than the 20 s after which DDS drops who is silent by default."""
     file = network.file(run={"duration": 400, "processes": 2})
     run = network.record(file, "--json")
-    network.wait_for_steps()
+    steps = network.wait_for_steps()
     (recorder,) = network.processes("recorder")
     recorder.kill(signal.SIGSTOP)
+    network.wait_for(lambda: min(read_steps(steps)) == 8000, 90, "the last step")
     time.sleep(22.0)
     recorder.kill(signal.SIGCONT)
     result = network.completed(run)
