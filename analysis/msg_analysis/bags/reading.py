@@ -107,15 +107,15 @@ def read_record(path: str | Path, *, most: int | None = None) -> RunRecord:
             for batch, kind in contents.network_topics(file, file.batches()):
                 seen += len(batch.data)
                 if most is not None and seen > most:
+                    contents.note_copies(file)
                     return _choose(contents)
                 contents.learn(batch, kind)
-                contents.learn_metadata(file)
                 for record in contents.records.values():
                     if isinstance(record, RunRecord):
                         return record
         except BagError as error:
             unreadable.append(error)
-        contents.learn_metadata(file)
+        contents.note_copies(file)
     if len(unreadable) == len(files):
         raise unreadable[0]
     return _choose(contents)
@@ -131,16 +131,16 @@ class _Contents:
     # By their bytes: every file of a split bag may begin with those in force.
     graphs: dict[bytes, ActiveGraph] = field(default_factory=dict)
     stops: set[tuple[bytes, int]] = field(default_factory=set)  # run, and the step at which it ended early
-    # Run records by text, in order, from the topic and from the metadata of our files, or why a text is not one: that
-    # matters only if no text is (another program's topic).
+    # Run records by text, in order, or why a text is not one: that matters only if no text is (another program's topic).
     records: dict[str, RunRecord | InputError] = field(default_factory=dict)
+    copies: dict[str, None] = field(default_factory=dict)  # the texts in the metadata of our files
     refused: Counter[str] = field(default_factory=Counter)
 
     def read(self, file: StoredFile, batches: Iterable[Batch]) -> None:
         """Take all of a file."""
         for batch, kind in self.network_topics(file, batches):
             self._add(batch, kind)
-        self.learn_metadata(file)
+        self.note_copies(file)
         self.refused[Refusal.TORN_FILE] += file.torn is not None
         self.refused[Refusal.DAMAGED_CHUNK] += file.damaged_chunks
 
@@ -160,11 +160,19 @@ class _Contents:
             known = len(file.channels)
             yield batch, kind_of[batch.channel]
 
-    def learn_metadata(self, file: StoredFile) -> None:
-        """Take the run records in the metadata of a file."""
-        for record in file.metadata:
-            if record.name == RECORD_NAME and "record" in record.metadata and len(self.records) < MOST_RECORDS:
-                self._learn(record.metadata["record"])
+    def note_copies(self, file: StoredFile) -> None:
+        """Keep the run records in the metadata of a file."""
+        texts = (each.metadata.get("record") for each in file.metadata if each.name == RECORD_NAME)
+        self.copies |= {text: None for text in texts if text is not None}
+
+    def learn_copies(self) -> None:
+        """Take the run records in metadata where the topic has none; else count those that differ from it."""
+        # The topic is in chunks with a checksum, and no other program can publish on it in our bags; metadata has none.
+        if any(isinstance(record, RunRecord) for record in self.records.values()):
+            self.refused[Refusal.NOT_OF_RECORD] += len(self.copies.keys() - self.records.keys())
+            return
+        for text in itertools.islice(self.copies, MOST_RECORDS):
+            self._learn(text)
 
     def _add(self, batch: Batch, kind: AnyArray) -> None:
         self.learn(batch, kind)  # first: states of a known run are put in their places at once
@@ -217,6 +225,7 @@ def _widths(experiment: Experiment) -> tuple[int, int]:
 
 def _choose(contents: _Contents) -> RunRecord:
     """The run record of the one run that has states."""
+    contents.learn_copies()
     path, damaged = contents.path, contents.refused[Refusal.DAMAGED_CHUNK]
     found = contents.records.values()
     if not found and damaged:
@@ -238,8 +247,8 @@ def _choose(contents: _Contents) -> RunRecord:
         first = records.setdefault(each.run.bytes, each)
         if first is not each and first.to_json() != each.to_json():
             raise BagError(
-                f"{path}: two records of run {each.run} contradict each other, and one of them is forged: another "
-                "program published on the topic `experiment`; record the run again"
+                f"{path}: two records of run {each.run} contradict each other: one of them is damaged, or "
+                "another program published it on the topic `experiment`: copy the bag again, or record the run again"
             )
     if not records:
         raise next(each for each in found if isinstance(each, InputError))
@@ -323,14 +332,14 @@ def _modes(contents: _Contents, run: bytes, steps: int, planned: int, graphs: in
 
 def record_document(path: Path) -> dict[str, Any]:
     """The document of the run record, checked if another recorded the bag; BagError: none is found; InputError."""
-    text = _head_record(path) or read_record(path, most=MOST_SEARCHED).to_json()
     try:
-        document = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: its run record is not JSON ({error}): the bag is damaged") from error
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: its run record is not a JSON object: the bag is damaged")
-    return document
+        document = json.loads(_head_record(path) or "null")
+    except (ValueError, RecursionError):  # damaged: the topic has it, too
+        document = None
+    if isinstance(document, dict):
+        return document
+    found: dict[str, Any] = json.loads(read_record(path, most=MOST_SEARCHED).to_json())
+    return found
 
 
 def started(path: Path) -> datetime | None:

@@ -23,6 +23,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from experiments import Run, read_bag, write_trajectory
 from msg_analysis.bags.files import stored_file
+from msg_analysis.bags.reading import record_document
 from msg_analysis.bags.salvage import SalvageReport, salvage
 from msg_analysis.bags.stored_file import Compression, Storage
 from msg_analysis.errors import BagError, InputError
@@ -271,3 +272,24 @@ def test_a_chunk_that_looks_whole(kind: str, way: str, tmp_path: Path) -> None:
         found = {int(number) for batch in file.batches() for number in batch.head["sequence"]}
         assert {message[1] for message in messages} - found == numbers(data, 6, start, end)
         assert file.damaged_chunks == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [('"seed": 0', '"seed": 1'), ('"seed"', '"seee"'), ("[[", "[{"), ('"run": "0', '"run": "1'), ("0.05", "0.07")],
+    ids=["a value", "a key", "no JSON", "the run", "not valid"],
+)
+def test_a_damaged_copy_of_the_record(old: str, new: str, tmp_path: Path, make_run: MakeRun) -> None:
+    """The record in the metadata has no checksum; that on the topic has one, and every command goes by it."""
+    run = make_run()
+    write_trajectory(run, tmp_path / "bag")
+    file = tmp_path / "bag" / "bag_0.mcap"
+    text = run.record.to_json()
+    file.write_bytes(file.read_bytes().replace(text.encode(), text.replace(old, new, 1).encode()))
+    salvage(tmp_path / "bag", tmp_path / "out")
+    for bag in ("bag", "out"):
+        found = read_bag(tmp_path / bag)
+        assert found.record.to_json() == text
+        assert np.array_equal(found.states, run.states)
+        assert found.completeness.refused == {"contradicts the run record": 1}
+        assert record_document(tmp_path / bag)["format"] == 1
