@@ -139,7 +139,7 @@ class Takeover:
         # Open, and locked, for as long as this process lives.
         self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
-            lock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, path)
         except BlockingIOError:
             raise InputError(
                 f"--checkpoint: another process is running {path.stem}: end that process, or give another directory"

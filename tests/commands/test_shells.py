@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from click.testing import CliRunner
 
 from msg_agents.cli.main import main as agents_main
 from msg_agents.recovery import Takeover
-from msg_agents.run.folder import temporary_directory
+from msg_agents.run.folder import make_bag_directory, temporary_directory
 from msg_agents.terminal import Interruption
 from msg_analysis import Experiment
 from msg_analysis.bags.writing import recording_pid
@@ -117,17 +118,34 @@ def test_in_other_threads_signals_are_left_to_the_main_one() -> None:
 
 
 @pytest.mark.parametrize("reason", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
-def test_file_systems_without_locks(reason: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lustre without -o flock, NFS without its daemon, FUSE: nothing that only a lock would tell ends the work."""
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda folder: make_bag_directory(Experiment.load("line_ring"), folder),
+        lambda folder: Experiment.load("line_ring").simulate(duration=5).save(folder / "bag"),
+        lambda folder: Takeover(folder / "agent_1"),
+    ],
+    ids=["run", "bag", "agent"],
+)
+def test_file_systems_without_locks(
+    use: Callable[[Path], object],
+    reason: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Lustre without -o flock, NFS without its daemon, FUSE: work goes on, with one note for all that is locked."""
 
     def refuse(*_: object) -> None:
         raise OSError(reason, os.strerror(reason))
 
     monkeypatch.setattr("fcntl.flock", refuse)
-    bag = Experiment.load("line_ring").simulate(duration=5).save(tmp_path / "bag")
-    assert recording_pid(bag) is None
-    with ResultStore.open(tmp_path / "sweep") as store:
-        assert store.damaged == 0
-    assert Takeover(tmp_path / "agent_1").predecessor == b""
-    with temporary_directory() as folder:
+    monkeypatch.setattr("msg_analysis.common.files._without_locks", [])
+    use(tmp_path)
+    with ResultStore.open(tmp_path / "sweep") as store, temporary_directory() as folder:
         assert folder.is_dir()
+        assert store.damaged == 0
+    errors = capsys.readouterr().err
+    assert errors.count("note:") == errors.count("\n") == 1
+    assert f"its file system has no locks ({os.strerror(reason)})" in errors
+    assert recording_pid(tmp_path / "bag") is None

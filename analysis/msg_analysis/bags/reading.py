@@ -131,7 +131,7 @@ class _Contents:
     # By their bytes: every file of a split bag may begin with those in force.
     graphs: dict[bytes, ActiveGraph] = field(default_factory=dict)
     stops: set[tuple[bytes, int]] = field(default_factory=set)  # run, and the step at which it ended early
-    # Run records by text, in order, or why a text is not one: that matters only if no text is (another program's topic).
+    # Run records by text, in order, or why a text is not one: that matters only if none is (another program's topic).
     records: dict[str, RunRecord | InputError] = field(default_factory=dict)
     copies: dict[str, None] = field(default_factory=dict)  # the texts in the metadata of our files
     refused: Counter[str] = field(default_factory=Counter)

@@ -77,7 +77,7 @@ class BagWriter:
         except OSError as error:
             raise BagError(f"{directory}: cannot be made ({error.strerror}): choose another place") from error
         with self._writing():
-            lock(self._marker, fcntl.LOCK_EX)  # the system releases it when this process ends
+            lock(self._marker, fcntl.LOCK_EX, self.directory)  # the system releases it when this process ends
             json.dump({"pid": os.getpid()}, self._marker)
             self._marker.flush()
             self._begin_file()

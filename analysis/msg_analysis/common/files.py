@@ -48,13 +48,25 @@ def no_temporary_directory(error: OSError) -> str | None:
     return f"TMPDIR: {error.strerror}: set it to a directory that can be written"
 
 
-def lock(file: int | IO[Any], operation: int) -> bool:
-    """Lock a file, as flock; False where its file system has no locks: NFS, Lustre or FUSE, for example."""
+_without_locks: list[Path] = []  # of which it was said
+
+
+def lock(file: int | IO[Any], operation: int, path: Path | None = None) -> bool:
+    """Lock a file, as flock; False where its file system has no locks: NFS, Lustre or FUSE, for example.
+
+    Of the first such ``path`` in this process, a note says so.
+    """
     try:
         fcntl.flock(file, operation)
     except OSError as error:
         if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
             raise
+        if path is not None and not _without_locks:
+            from msg_analysis.common.console import print_note  # rich
+
+            _without_locks.append(path)
+            words = f"its file system has no locks ({error.strerror})"
+            print_note(f"{path}: {words}: two programs that use it at the same time do not notice each other")
         return False
     return True
 

@@ -26,6 +26,7 @@ from subprocess import Popen
 from typing import Any, Literal, Self
 
 from msg_analysis.common import programs
+from msg_analysis.common.files import lock
 from msg_analysis.common.resources import SINGLE_THREAD, __version__
 from msg_analysis.common.shared_folders import own_folder
 from msg_analysis.errors import InputError
@@ -224,14 +225,13 @@ def _slot(at_once: int, stopping: Callable[[], bool]) -> Iterator[int]:
     # A place is a locked file, inherited by the network: it is free when all processes that hold it have ended.
     while True:
         for number in range(at_once):
-            descriptor = os.open(own_folder() / f"sweep_{number}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            file = own_folder() / f"sweep_{number}.lock"
+            descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
             try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, file)
             except BlockingIOError:
                 os.close(descriptor)
                 continue
-            except OSError:  # the file system has no locks: as if nobody had one
-                pass
             try:
                 yield descriptor
             finally:

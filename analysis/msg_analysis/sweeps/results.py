@@ -92,7 +92,7 @@ class ResultStore:
             place = error.filename or directory
             raise InputError(f"{place}: {error.strerror}: choose another place with --out") from error
         try:
-            lock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, path)
             outcomes, damaged, whole = _read(path)
         except OSError as error:
             os.close(descriptor)

@@ -43,7 +43,7 @@ def temporary_directory(room: int | None = None, memory: Path = MEMORY) -> Itera
     path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=parent))
     lock = os.open(path, os.O_RDONLY)  # marks folders in use; ends with its process
     try:
-        files.lock(lock, fcntl.LOCK_EX)
+        files.lock(lock, fcntl.LOCK_EX, path)
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)
@@ -60,9 +60,13 @@ def make_bag_directory(experiment: Experiment, out: Path, *, option: str = "--ou
         while True:
             try:
                 candidate.mkdir()  # no other run can then take that name
-                return candidate
+                break
             except FileExistsError:
                 candidate, number = out / f"{stem}_{number}", number + 1
+        directory = os.open(candidate, os.O_RDONLY)
+        files.lock(directory, fcntl.LOCK_SH, candidate)  # the recorder, which locks it, cannot show the note
+        os.close(directory)
+        return candidate
     except OSError as error:
         place = "is a file" if out.is_file() else f"cannot be written ({error.strerror})"
         raise InputError(f"{option}{out}: {place}: give a directory for the bags of runs") from error
