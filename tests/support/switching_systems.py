@@ -89,7 +89,7 @@ def system(random, m, gamma, kind="symmetric", dt=None, loss=False):
     noise, law = lift.T @ (f @ f.transpose(0, 2, 1)) @ lift, stationary_law(gamma)
     if dt is None:
         return JumpSystem("continuous", lift.T @ z @ lift, noise, gamma, law, lift)
-    chain = np.clip(scipy.linalg.expm(gamma * dt), 0.0, None)
+    chain = np.clip(scipy.linalg.expm(scipy.linalg.block_diag(gamma * dt, 0.0))[:n, :n], 0.0, None)
     chain /= chain.sum(axis=1, keepdims=True)
     variance = 0.2 * (dt * z * ~np.eye(m, dtype=bool)) ** 2 if loss else None
     return JumpSystem("discrete", np.eye(m - 1) - dt * lift.T @ z @ lift, noise, chain, law, lift, variance)

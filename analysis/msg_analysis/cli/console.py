@@ -305,7 +305,8 @@ class _Progress:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._bar.stop()
+        if self._console.is_terminal:  # elsewhere, older versions of rich would print an empty line
+            self._bar.stop()
 
 
 class SweepProgress(_Progress):

@@ -91,7 +91,10 @@ class MarkovChain:
             return self.matrix.copy()
         import scipy.linalg  # here, since every agent's process would wait for it
 
-        transition = np.clip(np.asarray(scipy.linalg.expm(self.matrix * dt), dtype=float), 0.0, None)
+        with np.errstate(over="ignore", invalid="ignore"):
+            transition = np.clip(np.asarray(scipy.linalg.expm(self.matrix * dt), dtype=float), 0.0, None)
+        if not np.isfinite(transition).all():  # of two fast graphs, in older versions of scipy
+            return self.sampled(dt).matrix
         return np.asarray(transition / transition.sum(axis=1, keepdims=True))
 
     def jumps_within(self, dt: float) -> float:

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import scipy.linalg
 from scipy import special
 
 from msg_analysis.common.text import HALF_WIDTH_95
+from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.graphs import Switching
@@ -167,7 +167,7 @@ def fault_powers(
         if not informations:
             continue
         (agent, sender), tests = min(
-            informations.items(), key=lambda entry: max(test.noncentrality for test in entry[1])
+            informations.items(), key=lambda entry: float(f"{max(test.noncentrality for test in entry[1]):.9g}")
         )
         price = math.log(questions[name] / (weights[name] * level)) if name in questions else math.inf
         found.append(FaultPower(fault, agent, sender, tests, share, price))
@@ -242,7 +242,7 @@ def _switching(step: StepModel, factor: float) -> _Informations:
     law = step.transition
     chain = step.chain
     if chain.time == "continuous":
-        wrong = scipy.linalg.expm(factor * step.dt * chain.matrix)
+        wrong = MarkovChain(chain.time, factor * chain.matrix).transition(step.dt)
     else:
         wrong = np.eye(chain.modes) + factor * (chain.matrix - np.eye(chain.modes))
     if (wrong < 0.0).any():  # the probabilities of leaving would pass 1

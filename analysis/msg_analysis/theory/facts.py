@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import scipy.linalg
 
+from msg_analysis.arithmetic.reproducible import exponential
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
 from msg_analysis.model.step_model import build_step_model
@@ -87,7 +88,7 @@ def check_facts(experiment: Experiment) -> list[Fact]:
         return _discrete([w[block] for w in step.nominal], step.transition, law, consensus)
     if experiment.time == "continuous":
         return _continuous(drifts, chain, law, consensus)
-    return _discrete([np.asarray(scipy.linalg.expm(-z)) for z in drifts], chain, law, consensus)
+    return _discrete([exponential(-z) for z in drifts], chain, law, consensus)
 
 
 def _continuous(drifts: list[FloatArray], generator: FloatArray, law: FloatArray, consensus: bool) -> list[Fact]:

@@ -114,7 +114,7 @@ class DenseSolver:
         self._matrix *= self._scale[:, None]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)  # the condition is judged below
-            self._factors = scipy.linalg.lu_factor(self._matrix)
+            self._factors = scipy.linalg.lu_factor(self._matrix) if self._matrix.size else (self._matrix, np.empty(0))
         self._norm, self._condition = 0.0, 1.0
         if self._matrix.size:
             self._norm = float(np.linalg.norm(self._matrix, 1))
@@ -144,9 +144,10 @@ class DenseSolver:
 
     def _solve(self, right: FloatArray, *, trans: Literal[0, 1]) -> tuple[FloatArray, SolverReport]:
         matrix = self._matrix.T if trans else self._matrix
-        solution = scipy.linalg.lu_solve(self._factors, right, trans=trans)
-        residual = right - matrix @ solution
-        solution += scipy.linalg.lu_solve(self._factors, residual, trans=trans)
+        solution = right
+        if right.size:
+            solution = scipy.linalg.lu_solve(self._factors, right, trans=trans)
+            solution += scipy.linalg.lu_solve(self._factors, right - matrix @ solution, trans=trans)
         residual = np.abs(right - matrix @ solution).max(initial=0.0)
         given = np.abs(right).max(initial=0.0)
         size = self._norm * np.abs(solution).max(initial=0.0) + given

@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.linalg
 
 from experiments import TRACKING, line_ring, predict
@@ -43,7 +44,7 @@ def test_lag_0_and_the_integral_are_the_predicted_covariance(law: str) -> None:
     found = spectrum(prediction, np.array([0]), frequencies)
     assert found.covariances[0] == pytest.approx(prediction.emulated.covariance, rel=1e-12, abs=1e-14)
     assert found.system_autocovariance[0] == pytest.approx(prediction.emulated.system_error, rel=1e-12)
-    integral = np.trapezoid(found.node_densities, frequencies, axis=0)
+    integral = scipy.integrate.trapezoid(found.node_densities, frequencies, axis=0)
     assert integral == pytest.approx(prediction.emulated.node_errors, rel=1e-9)
     assert found.system_density == pytest.approx(found.node_densities.sum(axis=1))
 
