@@ -20,6 +20,7 @@ from urllib.request import url2pathname
 
 HERE = Path(__file__).resolve().parent
 UV = HERE / "uv.txt"
+PROGRAM = Path(sysconfig.get_path("scripts")) / "uv"
 INTERFACES = HERE.parent / "ros_ws" / "src" / "msg_agents_interfaces"
 BUILT = Path(sys.prefix) / "built"  # folder for its wheel, which the Makefile installs
 PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--no-cache-dir"]
@@ -40,6 +41,9 @@ def main(distribution: str) -> None:
     packages = HERE / distribution
     if subprocess.run([*PIP, "install", "--quiet", *hashed(UV)]).returncode:
         print(f"uv cannot be had: {BY_PIP}", file=sys.stderr)
+    elif not PROGRAM.exists():
+        settings = "target, prefix or root in its settings (pip config list)"
+        sys.exit(f"error: pip has installed uv elsewhere than in {sys.prefix}: remove {settings}")
     elif not install_in_two_parts(packages):
         return
     else:
@@ -70,9 +74,8 @@ def install_in_two_parts(packages: Path) -> int:
 
 def install_by_uv(file: Path, cache: Path) -> int:
     """Its exit code; what it prints, without the names of all packages."""
-    uv = str(Path(sysconfig.get_path("scripts")) / "uv")
     # Which of several indexes a file is from does not matter: its hash is checked.
-    command = [uv, "pip", "install", "--python", sys.executable, "--index-strategy", "unsafe-best-match"]
+    command = [str(PROGRAM), "pip", "install", "--python", sys.executable, "--index-strategy", "unsafe-best-match"]
     variables = {"UV_CACHE_DIR": str(cache)} | variables_of_uv() | os.environ
     with subprocess.Popen([*command, *hashed(file)], env=variables, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None

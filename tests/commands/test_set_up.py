@@ -52,6 +52,14 @@ def test_settings_of_pip(install: Any, tmp_path: Path, monkeypatch: pytest.Monke
     }
 
 
+def test_a_pip_that_installs_elsewhere(install: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with a `target` in its file: one error instead of a traceback."""
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=0))
+    monkeypatch.setitem(install.main.__globals__, "PROGRAM", tmp_path / "uv")
+    with pytest.raises(SystemExit, match="error: pip has installed uv elsewhere than in"):
+        install.main("jazzy")
+
+
 def pinned(file: str) -> dict[str, list[str]]:
     """Hashes by package, version, and the Pythons that it is for."""
     found: dict[str, list[str]] = {}
