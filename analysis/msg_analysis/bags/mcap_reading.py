@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -54,7 +53,6 @@ from msg_analysis.bags.stored_file import (
 from msg_analysis.common.arrays import IntArray
 from msg_analysis.errors import BagError
 
-CHUNK_TIMES = struct.Struct("<QQ")  # first and last log time, at the start of a chunk
 CHUNK_CRC = slice(RECORD.size + 24, RECORD.size + 28)  # place of the CRC in the record of a chunk
 MOST_OTHERS = 2**18  # records of a chunk that are no messages: two for every number of a channel
 MOST_DESCRIBED = 2**26  # bytes of the schemas and channels in the chunks of a file: what they describe is kept

@@ -18,13 +18,12 @@ from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
 
-from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 
-from msg_analysis.bags.files import bag_files, offered_profiles, stored_file
-from msg_analysis.bags.mcap_reading import CHUNK_TIMES, McapFile
-from msg_analysis.bags.mcap_records import INDEX_HEAD, MAGIC, RECORD
-from msg_analysis.bags.stored_file import DamageError, ros_topic
+from msg_analysis.bags.files import bag_files, offered_profiles, stored_file, summary_of
+from msg_analysis.bags.mcap_reading import McapFile
+from msg_analysis.bags.mcap_writing import ENTRY, MESSAGE_INDEX
+from msg_analysis.bags.stored_file import ros_topic, ros_type
 from msg_analysis.errors import BagError
 
 # Bytes of messages held to be put in order. A bag that needs more is played out of order rather than held in memory.
@@ -212,48 +211,25 @@ class _Lows:
 
 
 def _quick_outline(path: Path) -> _Outline | None:
-    """Outline by heads of records and the summary alone: of a closed file with all messages in chunks; else None."""
-    outline, file = _Outline(path), McapFile(path)
-    size = path.stat().st_size
-    silent = None  # end of a chunk with times 0: its index tells whether it has messages
-    with path.open("rb") as stream:
-        if stream.read(len(MAGIC)) != MAGIC:
-            return None
-        while len(head := stream.read(RECORD.size)) == RECORD.size:
-            opcode, length = RECORD.unpack(head)
-            end = stream.tell() + length
-            if end > size:  # cut off, or damaged
-                return None
-            if opcode == Opcode.CHUNK:
-                times = stream.read(CHUNK_TIMES.size)
-                if len(times) < CHUNK_TIMES.size:
-                    return None
-                first, last = CHUNK_TIMES.unpack(times)
-                silent = end if first == last == 0 else None
-                if silent is None:
-                    outline.lows.append((end, first))
-            elif opcode == Opcode.MESSAGE_INDEX and silent is not None and length > INDEX_HEAD:
-                outline.lows.append((silent, 0))
-                silent = None
-            elif opcode == Opcode.MESSAGE:
-                return None
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
-                try:
-                    file.note(opcode, stream.read(length))
-                except DamageError:
-                    return None
-            elif opcode == Opcode.FOOTER:
-                break
-            stream.seek(end)
-        else:
-            return None
-    statistics = file.statistics
-    if statistics is None or not statistics.message_count:
+    """Outline by the summary alone: of a closed file with all messages in chunks that have an index; else None."""
+    summary, _ = summary_of(path)
+    statistics = summary.statistics if summary else None
+    if summary is None or statistics is None or not statistics.message_count:
         return None
-    outline.channels, outline.schemas = file.channels, file.schemas
+    outline, file, inside = _Outline(path), McapFile(path), 0
+    for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset):
+        entries = index.message_index_length - MESSAGE_INDEX.size * len(index.message_index_offsets)
+        inside += entries // ENTRY.size
+        if entries:
+            outline.lows.append((index.chunk_start_offset + index.chunk_length, index.message_start_time))
+    for channel in summary.channels.values():
+        file.add_channel(channel)
+    for schema in summary.schemas.values():
+        schema.name = ros_type(schema.name)
+    outline.channels, outline.schemas = file.channels, summary.schemas
     outline.counts = dict(statistics.channel_message_counts)
     outline.start, outline.end = statistics.message_start_time, statistics.message_end_time
-    whole = outline.counts.keys() <= outline.channels.keys() and statistics.chunk_count >= len(outline.lows)
+    whole = outline.counts.keys() <= outline.channels.keys() and inside == statistics.message_count
     return outline if whole else None
 
 

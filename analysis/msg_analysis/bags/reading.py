@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import json
 import re
@@ -17,12 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
-from mcap.records import Metadata
+from mcap.records import Header, Metadata
+from mcap.stream_reader import StreamReader
 
 from msg_analysis.bags.files import FileInventory, bag_files, first_file, stored_file
-from msg_analysis.bags.mcap_records import MAGIC, RECORD
 from msg_analysis.bags.mcap_writing import RECORD_NAME
 from msg_analysis.bags.states import Collector
 from msg_analysis.bags.stored_file import RECORD_LIMIT, Batch, StoredFile
@@ -357,20 +354,13 @@ def _head_record(bag: Path) -> str | None:
     if file is None or file.suffix != ".mcap":
         return None
     try:
-        size = file.stat().st_size
         with file.open("rb") as stream:
-            if stream.read(len(MAGIC)) != MAGIC:
-                return None
-            while len(head := stream.read(RECORD.size)) == RECORD.size:
-                opcode, length = RECORD.unpack(head)
-                if opcode not in (Opcode.HEADER, Opcode.METADATA) or length > min(RECORD_LIMIT, size):
+            for record in StreamReader(stream, emit_chunks=True, record_size_limit=RECORD_LIMIT).records:
+                if not isinstance(record, Header | Metadata):
                     return None
-                content = stream.read(length)
-                if opcode == Opcode.METADATA:
-                    record = Metadata.read(ReadDataStream(io.BytesIO(content)))
-                    if record.name == RECORD_NAME:
-                        found: str | None = record.metadata.get("record")
-                        return found
+                if isinstance(record, Metadata) and record.name == RECORD_NAME:
+                    found: str | None = record.metadata.get("record")
+                    return found
     except OSError as error:
         raise BagError(f"{file}: cannot be read ({error.strerror})") from error
     except Exception:  # the library raises many kinds of errors on damage

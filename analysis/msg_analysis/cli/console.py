@@ -222,6 +222,14 @@ def print_json(document: dict[str, Any], indent: int | None = None) -> None:
     click.echo(json_text(document, indent))
 
 
+def print_result(document: dict[str, Any], show: Callable[[dict[str, Any], Console], None], *, as_json: bool) -> None:
+    """Print a document on stdout: as one JSON object, or as ``show`` does it."""
+    if as_json:
+        print_json(document)
+    else:
+        show(document, result_console())
+
+
 def print_note(line: str) -> None:
     """Print one line on stderr, behind a coloured ``note:``."""
     from msg_analysis.common import console

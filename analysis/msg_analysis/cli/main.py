@@ -22,8 +22,8 @@ from msg_analysis.cli.console import (
     examples,
     plain_matplotlib,
     print_json,
+    print_result,
     print_text,
-    result_console,
 )
 from msg_analysis.cli.options import (
     BAG,
@@ -67,13 +67,10 @@ def main() -> None:
 @json_option
 def predict(experiment: Path, changes: tuple[str, ...], as_json: bool) -> None:
     """Predict the steady errors of EXPERIMENT, exactly."""
-    document = load_experiment(experiment, changes).predict().to_json()
-    if as_json:
-        print_json(document)
-    else:
-        from msg_analysis.report.theory_text import print_prediction
+    from msg_analysis.report.theory_text import print_prediction
 
-        print_prediction(document, result_console())
+    document = load_experiment(experiment, changes).predict().to_json()
+    print_result(document, print_prediction, as_json=as_json)
 
 
 @click.command(
@@ -145,17 +142,13 @@ def leaders(experiment: Path, *, count: int | None, changes: tuple[str, ...], as
     Sets of leaders are compared by joint robustness centrality. The leaders in EXPERIMENT are shown beside them.
     """
     from msg_analysis.cli.console import SolveProgress
+    from msg_analysis.report.theory_text import print_leaders
 
     loaded = load_experiment(experiment, changes)
     with SolveProgress(loaded.name) as progress:
         selection = loaded.leaders(count, **options, watch=progress)
     document = selection.to_json()
-    if as_json:
-        print_json(document)
-    else:
-        from msg_analysis.report.theory_text import print_leaders
-
-        print_leaders(document, result_console())
+    print_result(document, print_leaders, as_json=as_json)
 
 
 @click.command(
@@ -224,10 +217,7 @@ def info(source: Path, as_json: bool) -> None:
         document, show = describe_bag(source), tables.print_bag
     else:
         document, show = describe_experiment(load_experiment(source)), tables.print_experiment
-    if as_json:
-        print_json(document)
-    else:
-        show(document, result_console())
+    print_result(document, show, as_json=as_json)
 
 
 @click.command(epilog=examples("msg-analysis salvage runs/line_ring_20250101_120000 whole"))
@@ -241,14 +231,10 @@ def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
     """
     from msg_analysis.bags.salvage import salvage as salvage_bag
     from msg_analysis.report.documents import describe_salvage
+    from msg_analysis.report.tables import print_salvage
 
     document = describe_salvage(out, salvage_bag(bag, out))
-    if as_json:
-        print_json(document)
-    else:
-        from msg_analysis.report.tables import print_salvage
-
-        print_salvage(document, result_console())
+    print_result(document, print_salvage, as_json=as_json)
 
 
 @click.command(

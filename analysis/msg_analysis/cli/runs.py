@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from msg_analysis.cli.console import examples, print_json, print_note, print_text, result_console
+from msg_analysis.cli.console import examples, print_json, print_note, print_result, print_text, result_console
 from msg_analysis.cli.options import (
     BAG,
     FILE,
@@ -156,10 +156,7 @@ def diff(a: Path, b: Path, *, as_json: bool) -> None:
         one, other = (load_experiment(path) for path in (a, b))
         with SolveProgress("leaders") as search:
             document = experiment_difference(one, other, search)
-    if as_json:
-        print_json(document)
-    else:
-        show(document, result_console())
+    print_result(document, show, as_json=as_json)
 
 
 @click.command(

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import signal
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -25,7 +26,6 @@ from msg_analysis.cli.console import (
 )
 from msg_analysis.cli.options import YAML, choice_option, json_option, out_option
 from msg_analysis.errors import ExitCode, InputError, killed_by
-from msg_analysis.sweeps.points import require_libraries
 
 if TYPE_CHECKING:
     from msg_analysis.sweeps.points import Job, JobResults
@@ -87,7 +87,8 @@ def sweep(
     """
     if workers and scheduler:
         raise InputError("--workers: not together with --scheduler, which has workers of its own: give one of them")
-    require_libraries(cluster=bool(scheduler))
+    if scheduler and importlib.util.find_spec("distributed") is None:
+        raise InputError("distributed: not installed: --scheduler needs it: pip install distributed")
     from msg_analysis.cli.console import SweepProgress
     from msg_analysis.sweeps.grid import load_sweep
 
@@ -183,7 +184,6 @@ def emulate(
     from msg_analysis.sweeps.points import FAILED, options
     from msg_analysis.sweeps.results import ResultStore
 
-    require_libraries()
     plain_matplotlib()
     runs = [run for number in numbers for run in runs_of(number)]
     directory = out / "emulation"

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from msg_analysis.cli.console import examples, plain_matplotlib, print_json, result_console
+from msg_analysis.cli.console import examples, plain_matplotlib, print_result
 from msg_analysis.cli.options import (
     FILE,
     SOURCE,
@@ -53,6 +53,7 @@ def transient(experiment: Path, times: str, *, table: Path | None, as_json: bool
     """Predict the errors over time, from the start of a run."""
     from msg_analysis.common.files import require_place
     from msg_analysis.report.documents import describe_transient, write_transient_csv
+    from msg_analysis.report.theory_text import print_transient
 
     require_place(table)
     loaded = load_experiment(experiment)
@@ -60,12 +61,7 @@ def transient(experiment: Path, times: str, *, table: Path | None, as_json: bool
     document = describe_transient(loaded, _parse_times(times), **options)
     if table:
         write_transient_csv(document, table)
-    if as_json:
-        print_json(document)
-    else:
-        from msg_analysis.report.theory_text import print_transient
-
-        print_transient(document, result_console())
+    print_result(document, print_transient, as_json=as_json)
 
 
 MOST_TIMES = 100_000
@@ -100,16 +96,12 @@ def _parse_times(text: str) -> FloatArray:
 def facts(experiment: Path, as_json: bool) -> None:
     """Check the lemmas of the paper; bounds, graph indices."""
     from msg_analysis.report.documents import describe_facts
+    from msg_analysis.report.theory_text import print_facts
 
     loaded = load_experiment(experiment)
     loaded.require_available("predict")
     document = describe_facts(loaded)
-    if as_json:
-        print_json(document)
-    else:
-        from msg_analysis.report.theory_text import print_facts
-
-        print_facts(document, result_console())
+    print_result(document, print_facts, as_json=as_json)
 
 
 UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}  # of --budget
@@ -151,14 +143,11 @@ def plan(
 
     Length, replicas and time for a precision, and the power of the tests for faults.
     """
+    from msg_analysis.report.theory_text import print_plan
+
     loaded = load_experiment(experiment, changes)
     document = loaded.plan(_parse_share(precision), seconds=_parse_duration(budget), rate=speed, level=level).to_json()
-    if as_json:
-        print_json(document)
-    else:
-        from msg_analysis.report.theory_text import print_plan
-
-        print_plan(document, result_console())
+    print_result(document, print_plan, as_json=as_json)
 
 
 def _parse_share(text: str) -> float:
@@ -209,6 +198,7 @@ def spectrum(
     from msg_analysis.common.files import require_place
     from msg_analysis.errors import ExitCode
     from msg_analysis.report.documents import measure_spectrum, predicted_spectrum
+    from msg_analysis.report.theory_text import print_spectrum
 
     if changes and is_bag(source):
         raise InputError(f"--set: not with the bag {source}, whose experiment is recorded: give an experiment file")
@@ -221,12 +211,7 @@ def spectrum(
     found = measure_spectrum(source, level) if is_bag(source) else predicted_spectrum(load_experiment(source, changes))
     if figure:
         write_spectrum(spectrum_figure(found.predicted, found.log, found.density), figure)
-    if as_json:
-        print_json(found.to_json())
-    else:
-        from msg_analysis.report.theory_text import print_spectrum
-
-        print_spectrum(found.to_json(), result_console())
+    print_result(found.to_json(), print_spectrum, as_json=as_json)
     if not found.complete:
         context.exit(ExitCode.INCOMPLETE)
     context.exit(ExitCode.DISAGREES if found.disagrees else ExitCode.FINE)

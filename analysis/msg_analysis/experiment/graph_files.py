@@ -14,12 +14,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element, TreeBuilder
-from xml.parsers import expat
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from msg_analysis.common.files import DEEPEST, read_bytes
+from msg_analysis.common.files import read_bytes
 from msg_analysis.common.text import counted, listed
 from msg_analysis.experiment.problems import problem, show
 from msg_analysis.experiment.spec import NAME_PATTERN, is_number
@@ -126,31 +126,13 @@ def _content(key: str, file: Path) -> bytes:
 
 def _tree(key: str, file: Path) -> Element:
     """The elements of an XML file by their local names. Not by networkx, which leaves out or refuses too much."""
-    builder, parser, depth = TreeBuilder(), expat.ParserCreate(), 0
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal depth
-        depth += 1
-        if depth > DEEPEST:
-            raise GraphError(key, str(file), f"nested more than {DEEPEST} levels deep", "export it again")
-        builder.start(tag.rpartition(":")[2], attributes)
-
-    def end(tag: str) -> None:
-        nonlocal depth
-        depth -= 1
-        builder.end(tag.rpartition(":")[2])
-
-    def entity(name: str, *_: object) -> None:
-        raise GraphError(key, f"{file}: entity {show(name)}", "expected none", "export it again")
-
-    parser.buffer_text = True
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler, parser.EntityDeclHandler = builder.data, entity
     try:
-        parser.Parse(_content(key, file), True)
-    except (expat.ExpatError, ValueError, LookupError) as error:
+        root = ElementTree.fromstring(_content(key, file))
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise GraphError(key, str(file), f"expected a GraphML file ({error})", "export it again") from error
-    return builder.close()
+    for element in root.iter():
+        element.tag = element.tag.rpartition("}")[2]
+    return root
 
 
 def read_graphml(key: str, file: Path) -> ForeignGraph:

@@ -276,11 +276,7 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
         raise ExperimentError(str(path), lines)
     if instead := other_kind(mapping, "sweep"):
         raise ExperimentError(str(path), [f"is {instead}"])
-    try:
-        spec = SweepSpec.model_validate(dict(mapping))
-    except ValidationError as error:
-        found = [translate(detail, SweepSpec) for detail in error.errors(include_url=False)]
-        raise ExperimentError(str(path), found) from error
+    spec = spec_of(mapping, str(path))
     directory, base = path.parent, spec.experiment
     if isinstance(base, str):
         file = find(base, directory)
@@ -290,6 +286,15 @@ def load_sweep(path: str | Path, checked: Checked = lambda _done, _total: None) 
                 str(path), [problem("experiment", show(base), "expected a file of keys", "correct it")]
             )
     return points_of(path, spec, base, directory, checked)
+
+
+def spec_of(mapping: Mapping[Any, Any], source: str) -> SweepSpec:
+    """The keys of a sweep; ExperimentError: all mistakes."""
+    try:
+        return SweepSpec.model_validate(dict(mapping))
+    except ValidationError as error:
+        found = [translate(detail, SweepSpec) for detail in error.errors(include_url=False)]
+        raise ExperimentError(source, found) from error
 
 
 def _spec_problems(spec: SweepSpec) -> list[str]:

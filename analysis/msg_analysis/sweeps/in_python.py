@@ -12,16 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import ValidationError
-
 from msg_analysis.common.resources import require_pyarrow
 from msg_analysis.common.text import markdown_table
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graph_sources import plain
-from msg_analysis.experiment.problems import ExperimentError, translate
 from msg_analysis.experiment.spec import is_number
 from msg_analysis.sweeps import grid
-from msg_analysis.sweeps.grid import SweepSpec
 from msg_analysis.sweeps.points import JobKind, evaluate, options
 from msg_analysis.sweeps.results import ResultStore, Row, SweepVerdict, arrow_table, evaluate_sweep, rows_of
 from msg_analysis.sweeps.workers import run_jobs
@@ -158,12 +154,7 @@ def sweep(
         "repetitions": repetitions,
         "level": level,
     }
-    try:
-        spec = SweepSpec.model_validate(given)
-    except ValidationError as error:
-        problems = [translate(detail, SweepSpec) for detail in error.errors(include_url=False)]
-        raise ExperimentError("sweep", problems) from None
-    points = grid.points_of(Path(experiment.name), spec, document, Path(), lambda *_: None)
+    points = grid.points_of(Path(experiment.name), grid.spec_of(given, "sweep"), document, Path(), lambda *_: None)
     jobs = [point.job for point in points.points]
     if workers is None and kind != "network":
         outcomes = tuple(evaluate(job) for job in jobs)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import fcntl
 import functools
 import hashlib
-import importlib.util
 import json
 import os
 import shutil
@@ -36,12 +35,6 @@ _SOURCES = (
     *("arithmetic", "common", "experiment", "model", "theory", "twin", "inference"),
     *("sweeps/points.py", "errors.py", "protocol.py"),
 )
-
-
-def require_libraries(*, cluster: bool = False) -> None:
-    """InputError if a library is not installed that only sweeps on a cluster need."""
-    if cluster and importlib.util.find_spec("distributed") is None:
-        raise InputError("distributed: not installed: --scheduler needs it: pip install distributed")
 
 
 @functools.cache

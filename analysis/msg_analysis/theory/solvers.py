@@ -112,11 +112,11 @@ class DenseSolver:
         scale = np.maximum(self._matrix.max(axis=1, initial=0.0), -self._matrix.min(axis=1, initial=0.0))
         self._scale = 1.0 / np.where(scale > 0.0, scale, 1.0)
         self._matrix *= self._scale[:, None]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)  # the condition is judged below
-            self._factors = scipy.linalg.lu_factor(self._matrix) if self._matrix.size else (self._matrix, np.empty(0))
-        self._norm, self._condition = 0.0, 1.0
+        self._factors, self._norm, self._condition = (self._matrix, np.empty(0, np.int32)), 0.0, 1.0
         if self._matrix.size:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)  # the condition is judged below
+                self._factors = scipy.linalg.lu_factor(self._matrix)
             self._norm = float(np.linalg.norm(self._matrix, 1))
             self._condition = float(scipy.linalg.lapack.dgecon(self._factors[0], self._norm)[0])
         self._shape = (n, p)
