@@ -171,12 +171,8 @@ def read_graphml(key: str, file: Path) -> ForeignGraph:
     require_different(key, names.values())
     weights, others = weights_of(key, [(f"{names[a]} - {names[b]}: ", given) for a, b, given in links])
     ordered = sorted(names, key=int) if all(map(is_whole, names)) else names
-    return _directed(
-        [names[node] for node in ordered],
-        [(names[a], names[b], weight) for (a, b, _), weight in zip(links, weights, strict=True)],
-        arcs,
-        ForeignGraph([], [], directed=False, notes=notes + more + others, made_ids=made),
-    )
+    named = [(names[a], names[b], weight) for (a, b, _), weight in zip(links, weights, strict=True)]
+    return _graph([names[node] for node in ordered], named, arcs, notes + more + others, made)
 
 
 class _Attributes:
@@ -231,14 +227,13 @@ def is_whole(node: str) -> bool:
     return node.isascii() and node.isdigit()
 
 
-def _directed(
-    nodes: Sequence[str], links: Sequence[tuple[str, str, float]], arcs: Sequence[bool], rest: ForeignGraph
+def _graph(
+    nodes: Sequence[str], links: list[tuple[str, str, float]], arcs: Sequence[bool], notes: list[str], made_ids: bool
 ) -> ForeignGraph:
-    """The graph of links of which some have a direction, ``arcs``; notes and more as of ``rest``."""
-    if not any(arcs):
-        return replace(rest, nodes=nodes, links=links)
-    back = [(b, a, weight) for (a, b, weight), arc in zip(links, arcs, strict=True) if not arc]
-    return replace(rest, nodes=nodes, links=[*links, *back], directed=True)
+    """The graph of links of which some have a direction, ``arcs``; the others are then arcs both ways."""
+    directed = any(arcs)
+    back = [(b, a, weight) for (a, b, weight), arc in zip(links, arcs, strict=True) if directed and not arc]
+    return ForeignGraph(nodes, links + back, directed, notes, made_ids)
 
 
 _ENDS = (("source", "target"), ("from", "to"))
@@ -284,8 +279,7 @@ def read_csv(key: str, file: Path) -> ForeignGraph:
     weights, more = weights_of(key, attributes)
     nodes = list(dict.fromkeys(node for pair in pairs for node in pair))
     links = [(*pair, weight) for pair, weight in zip(pairs, weights, strict=True)]
-    made = all(map(_MADE.fullmatch, nodes))
-    return _directed(nodes, links, arcs, ForeignGraph([], [], directed=False, notes=notes + more, made_ids=made))
+    return _graph(nodes, links, arcs, notes + more, all(map(_MADE.fullmatch, nodes)))
 
 
 def _table(key: str, file: Path) -> tuple[str, list[tuple[int, list[str]]]]:
