@@ -36,7 +36,7 @@ class ClusterWorkers(Workers):
         self._stop_name = f"msg-sweep-stop-{uuid.uuid4().hex}"
 
     def __enter__(self) -> Self:
-        """Find the workers. InputError: no scheduler answers, or its workers have other software."""
+        """Find the scheduler. InputError: none answers."""
         import distributed
 
         # Silence its logs: what matters to the user is raised as an error here.
@@ -50,7 +50,6 @@ class ClusterWorkers(Workers):
             wanted = "expected the address of a Dask scheduler: for example tcp://127.0.0.1:8786"
             raise InputError(f"--scheduler {self._scheduler}: {reason}: {wanted}") from error
         self._done = distributed.as_completed()
-        self._compare_software()
         return self
 
     def close(self) -> None:
@@ -100,22 +99,9 @@ class ClusterWorkers(Workers):
         Event(self._stop_name, client=self._client).set()
         wait(list(running), timeout=timeout)
 
-    def _compare_software(self) -> None:
-        """Refuse workers with other software; those that join later refuse themselves in ``_do_on_cluster``."""
-        where, own = f"--scheduler {self._scheduler}", installed_software()
-        try:
-            found = self._client.run(installed_software)
-        except ModuleNotFoundError as error:
-            raise InputError(f"{where}: {error}: install the same software on its workers") from error
-        for worker, other in found.items():
-            if other != own:
-                raise InputError(
-                    f"{where}: worker {worker} has {other}: expected {own}: install the same software there"
-                )
-
 
 def _do_on_cluster(function: Function[T, R], batch: Sequence[T], stop_name: str, software: str) -> Answer:
-    """On a worker of a cluster: see ``do``."""
+    """On a worker of a cluster: see ``do``. InputError: it has other software."""
     if installed_software() != software:
         raise InputError(f"it has {installed_software()}: expected {software}")
     return do(function, batch, _Stopping(stop_name))
