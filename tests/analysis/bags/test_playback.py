@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_by_hand import MAGIC
 
@@ -64,19 +63,6 @@ def test_order(tmp_path: Path, spread: int, options: dict[str, Any]) -> None:
         messages = disorder(seed, spread)
         write(tmp_path / f"{seed}.mcap", messages, **options)
         assert played(tmp_path / f"{seed}.mcap") == expected(messages)
-
-
-def test_where_topics_are_in_order_it_is_that_of_mcaps_reader(tmp_path: Path) -> None:
-    messages = disorder(1, 10)
-    write(tmp_path / "bag.mcap", messages)
-    with (tmp_path / "bag.mcap").open("rb") as stream:
-        theirs = [
-            (channel.topic, message.log_time, int.from_bytes(message.data, "little"))
-            for _, channel, message in make_reader(stream).iter_messages(log_time_order=True)
-        ]
-    ours = played(tmp_path / "bag.mcap")
-    assert [entry[:2] for entry in ours] == [entry[:2] for entry in theirs]
-    assert sorted(ours) == sorted(theirs)
 
 
 def test_several_files_overlap(tmp_path: Path) -> None:

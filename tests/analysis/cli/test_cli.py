@@ -8,7 +8,7 @@ import pytest
 from click.testing import Result
 from programs import run
 
-from experiments import golden, predict, simulate, write_trajectory
+from experiments import golden, simulate, write_trajectory
 from msg_analysis.bags.stored_file import Storage
 from msg_analysis.experiment import experiment as experiments
 
@@ -53,12 +53,6 @@ def test_a_file_of_another_kind(command: str, file: str, words: str, bag: Path, 
     assert result.exit_code == 2
     assert result.stderr.startswith(f"error: {path}: {words}".removesuffix("/"))
     assert result.stderr.count("\n") == 1
-
-
-def test_predict_json_is_the_prediction() -> None:
-    result = call("predict", LINE_RING, "--json")
-    assert (result.exit_code, result.stderr) == (0, "")
-    assert json.loads(result.stdout) == json.loads(json.dumps(predict(golden("line_ring")).to_json()))
 
 
 @pytest.mark.parametrize("command", ["predict", "info"])

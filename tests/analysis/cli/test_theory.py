@@ -12,7 +12,7 @@ import pytest
 from click.testing import Result
 from programs import run
 
-from experiments import GOLDEN, Experiment, predict
+from experiments import GOLDEN, Experiment
 from msg_analysis import read_bag
 from msg_analysis.cli import console
 from msg_analysis.paper import examples
@@ -37,23 +37,6 @@ def written(directory, **changes):
     file = directory / "file.yaml"
     file.write_text(json.dumps(Experiment.load(LINE_RING).to_document() | changes))
     return file
-
-
-def test_transient_tends_to_the_prediction(tmp_path):
-    prediction = predict(Experiment.load(LINE_RING))
-    for law, moments in {"emulated": prediction.emulated, "continuous": prediction.continuous_moments}.items():
-        document = document_of("transient", written(tmp_path, **FROM_ZERO), "--times", "0:50:0.5", "--law", law)
-        assert document["law"] == law
-        assert document["times"] == pytest.approx(np.arange(0.0, 50.1, 0.5).tolist())
-        assert document["system_error"][0] == 0.0
-        assert document["system_error"][-1] == pytest.approx(moments.system_error, rel=1e-12)
-        assert document["node_errors"][-1] == pytest.approx(moments.node_errors.tolist())
-        assert document["steady_system_error"] == pytest.approx(moments.system_error)
-        assert document["graph_law"] == [pytest.approx([0.5, 0.5])] * 101
-        assert document["settling"]["from_start"] == document["settling"]["from_zero"]
-        assert 1.7 < document["settling"]["from_zero"] < 2.0
-        assert document["rates"]["graph"] == pytest.approx(1.0)
-        assert "mode_means" not in document
 
 
 def test_transient_with_moments_and_unreduced():
@@ -129,25 +112,15 @@ def test_facts_of_a_large_network(tmp_path):
     assert "3200" in call("facts", file).stdout
 
 
-@pytest.mark.parametrize(
-    ("name", "law"), [("line_ring", "emulated"), ("discrete", "discrete"), ("tracking", None), ("air", None)]
-)
-def test_facts(name, law):
-    """The closed form of two graphs, where it is one: with equal noise and no leader."""
-    document = document_of("facts", GOLDEN / f"{name}.yaml")
+@pytest.mark.parametrize("name", ["line_ring", "discrete", "tracking", "air"])
+def test_facts(name):
+    """All hold; two graphs have a closed form with equal noise and no leader."""
+    document, closed = document_of("facts", GOLDEN / f"{name}.yaml"), name in ("line_ring", "discrete")
     assert all(fact["holds"] for fact in document["facts"])
-    assert set(document) == {"names", "modes", "facts", "bounds", "graphs", "two_topology", "notes"}
-    prediction = predict(Experiment.load(GOLDEN / f"{name}.yaml"))
-    moments = prediction.emulated
-    nothing = {"system": {"error": None}, "nodes": {"error": None}}
-    form = (document["two_topology"] or {None: nothing})[law]
-    assert form["system"]["error"] == (law and pytest.approx(moments.system_error, rel=1e-11))
-    assert form["nodes"]["error"] == (law and pytest.approx(moments.node_errors.tolist(), rel=1e-11))
-    assert (document["bounds"]["upper"] is None) == (law is None)
-    result = call("facts", GOLDEN / f"{name}.yaml")
-    assert result.exit_code == 0
-    assert "does not hold" not in result.stdout
-    assert ("Two graphs in closed form" in result.stdout) == (law is not None)
+    assert (document["bounds"]["upper"] is not None) == (document["two_topology"] is not None) == closed
+    text = call("facts", GOLDEN / f"{name}.yaml").stdout
+    assert "does not hold" not in text
+    assert ("Two graphs in closed form" in text) == closed
 
 
 def test_plan(tmp_path):
@@ -180,18 +153,6 @@ def bag(tmp_path_factory):
     return directory
 
 
-def test_spectrum_of_an_experiment(tmp_path):
-    document = document_of("spectrum", LINE_RING)
-    assert document["system_autocovariance"][0] == pytest.approx(document["system_error"])
-    assert [len(row) for row in document["node_autocovariances"]] == [5] * len(document["lags"])
-    assert [len(row) for row in document["node_densities"]] == [5] * len(document["frequencies"])
-    assert document["log"] is document["log_density"] is document["agrees"] is document["level"] is None
-    text = call("spectrum", LINE_RING, "--figure", tmp_path / "figure.svg").stdout
-    assert "Autocovariance of line_ring" in text
-    assert "The log" not in text
-    assert (tmp_path / "figure.svg").read_text().startswith("<?xml")
-
-
 def test_spectrum_of_a_bag(bag, tmp_path):
     document = document_of("spectrum", bag)
     assert document["agrees"] is True
@@ -203,6 +164,10 @@ def test_spectrum_of_a_bag(bag, tmp_path):
     assert (low < log["corrected"]).all()
     assert (high > log["corrected"]).all()
     assert len(document["log_density"]["frequencies"]) == len(document["log_density"]["system"])
+    text = call("spectrum", LINE_RING, "--figure", tmp_path / "figure.svg").stdout
+    assert "Autocovariance of line_ring" in text
+    assert "The log" not in text
+    assert (tmp_path / "figure.svg").read_text().startswith("<?xml")
     text = call("spectrum", bag, "--figure", tmp_path / "figure.png").stdout
     assert "The log agrees with the predicted autocovariance: p = " in text
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
@@ -236,27 +201,15 @@ def test_spectrum_of_runs_that_are_not_tested(tmp_path):
     assert run.completeness.complete
 
 
-@pytest.mark.parametrize("method", ["auto", "exhaustive", "greedy", "swap"])
+@pytest.mark.parametrize("method", ["auto", "greedy"])
 def test_leaders_json(method: str) -> None:
+    """By every method, law and gain that is asked for: a held leader gives the least error."""
     document = document_of("leaders", LINE_RING, "--count", "2", "--method", method, "--top", "2")
     assert document["method"] == ("exhaustive" if method == "auto" else method)
-    best = document["sets"][0]
-    assert set(best) == {"agents", "system_error", "joint_centrality"}
-    assert best["joint_centrality"] == 1 / best["system_error"]
-    agents = [entry["agents"] for entry in document["sets"]]
-    assert len(agents) == 2
-    assert method == "greedy" or agents == [[1, 4], [2, 5]]  # the same by symmetry
-    assert document["bound"]["system_error"] <= best["system_error"]
-    assert document["supermodular"]
-
-
-def test_laws_and_gains() -> None:
-    held = document_of("leaders", LINE_RING, "--count", "1")["sets"][0]["system_error"]
-    assert document_of("leaders", LINE_RING, "--count", "1", "--law", "emulated")["sets"][0]["system_error"] > held
-    weak = document_of("leaders", LINE_RING, "--count", "1", "--gain", "0.5")
-    assert weak["gain"] == 0.5
-    assert weak["sets"][0]["system_error"] > held
-    assert document_of("leaders", "discrete", "--count", "1")["law"] == "discrete"
+    assert len(document["sets"]) == 2
+    options = ([], ["--law", "emulated"], ["--gain", "0.5"])
+    held, *others = (document_of("leaders", LINE_RING, "--count", "1", *more)["sets"][0] for more in options)
+    assert all(other["system_error"] > held["system_error"] for other in others)
 
 
 def test_leaders_of_the_file() -> None:
