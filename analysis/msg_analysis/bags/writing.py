@@ -83,23 +83,16 @@ class BagWriter:
             self._begin_file()
 
     def write(self, topic: str, data: bytes, time_ns: int, until: int | None = None) -> None:
-        """Append a message (CDR) of a time [ns]; later files repeat a latched one, up to the time ``until`` if any."""
-        if topic not in self._sequences or self._closed:
-            raise self._refused("is closed" if self._closed else f"has no topic {topic}")
+        """Append a message (CDR) of a latched topic; later files repeat it, up to the time ``until`` [ns] if any."""
+        if topic not in self._latched or self._closed:
+            raise self._refused("is closed" if self._closed else f"has no latched topic {topic}")
         with self._writing():
-            if topic in self._latched:
-                message = LatchedMessage(time_ns, self._sequences[topic], topic, data, until)
-                self._sequences[topic] += 1
-                if self._storage.split_size is not None and time_ns > self._now:  # it waits for its time
-                    heapq.heappush(self._held, message)
-                else:
-                    self._place(message)
-                return
-            self._release(time_ns)
-            file = self._file_of(time_ns)
-            file.add(topic, data, time_ns, self._sequences[topic])
+            message = LatchedMessage(time_ns, self._sequences[topic], topic, data, until)
             self._sequences[topic] += 1
-            self._passed(file, (topic,))
+            if self._storage.split_size is not None and time_ns > self._now:  # it waits for its time
+                heapq.heappush(self._held, message)
+            else:
+                self._place(message)
 
     def write_many(
         self, topics: Sequence[str], of: IntArray, time_ns: IntArray, data: bytes, start: IntArray, size: IntArray
@@ -109,7 +102,7 @@ class BagWriter:
             raise self._refused("is closed")
         done = 0
         with self._writing():
-            while done < len(of):  # the same as ``write`` for each, in a fraction of the time
+            while done < len(of):
                 file = self._file_of(int(time_ns[done]))
                 end = done + file.mcap.fitting(size[done : done + self._together(file, time_ns[done:])])
                 piece = slice(done, end)

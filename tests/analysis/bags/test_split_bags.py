@@ -199,7 +199,7 @@ def test_a_latched_message_that_is_late(whole: Run, arriving: list[tuple[str, by
     with BagWriter(bag, network_topics(AGENTS), record=whole.record.to_json(), storage=Storage("none", 9000)) as writer:
         for topic, data, time in states:
             if topic != "/agent_2/state":  # all files wait for this agent
-                writer.write(topic, data, time)
+                record(writer, [(topic, data, time)])
             if len(files_of(bag)) == 2:
                 break
         writer.write(*experiment)

@@ -28,35 +28,9 @@ RUN = bytes(range(16))
 def _fill(bag: BagWriter, steps: int = 50) -> None:
     bag.write("/experiment", encode_string("text"), 0)
     codec = StateCodec(RUN, 1, 2, 0.5)
-    for k in range(steps):
-        data = codec.wrap(k, min(k, 1), np.array([k, -k], dtype=float).tobytes())
-        bag.write("/agent_1/state", data, stamp_ns(data))
-
-
-@pytest.mark.parametrize("split_size", [None, 4000])
-def test_many_at_once_are_the_same_bytes_as_one_by_one(tmp_path: Path, split_size: int | None) -> None:
-    """Files, chunks, sequence numbers and metadata: of 600 messages of two topics, in any portions."""
-    storage, codecs = Storage(split_size=split_size), [StateCodec(RUN, i, 2, 0.5) for i in (1, 2)]
-    chance = np.random.default_rng(3)
-    of = chance.integers(0, 2, 600)
-    messages = [
-        codecs[i].wrap(k, 1, chance.random(2).tobytes(), [1] * int(chance.integers(0, 3))) for k, i in enumerate(of)
-    ]
-    times, names = np.arange(600) * 5, ["/agent_1/state", "/agent_2/state"]
-    with BagWriter(tmp_path / "one/bag", network_topics(2), storage=storage) as bag:
-        for topic, message, time in zip(of, messages, times.tolist(), strict=True):
-            bag.write(names[topic], message, time)
-    size = np.array([len(message) for message in messages])
-    data, start = b"".join(messages), np.cumsum(size) - size
-    with BagWriter(tmp_path / "many/bag", network_topics(2), storage=storage) as bag:
-        for first, last in ((0, 1), (1, 250), (250, 250), (250, 600)):
-            part = slice(first, last)
-            bag.write_many(names, of[part], times[part], data, start[part], size[part])
-        assert bag.messages == 600
-    one, many = ({file.name: file.read_bytes() for file in (tmp_path / n / "bag").iterdir()} for n in ("one", "many"))
-    assert one.keys() == many.keys()
-    assert (len(one) > 5) == (split_size is not None)
-    assert one == many
+    messages = [codec.wrap(k, min(k, 1), np.array([k, -k], dtype=float).tobytes()) for k in range(steps)]
+    size, times = np.full(steps, len(messages[0])), np.array([stamp_ns(data) for data in messages])
+    bag.write_many(["/agent_1/state"], np.zeros(steps, int), times, b"".join(messages), np.cumsum(size) - size, size)
 
 
 def test_metadata_is_that_of_the_channels(tmp_path: Path) -> None:
