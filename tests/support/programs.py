@@ -18,6 +18,11 @@ def run(program: str, *words: object, **environment: str) -> Result:
     return CliRunner(env=environment).invoke(PROGRAMS[program], [str(word) for word in words], prog_name=program)
 
 
+def call(*words: object) -> Result:
+    """The same of ``msg-analysis``."""
+    return run("msg-analysis", *words)
+
+
 def command_of(program: str, name: str) -> click.Command:
     return PROGRAMS[program].commands[name]
 

@@ -16,14 +16,13 @@ import numpy as np
 import pytest
 import yaml
 import zstandard
-from click.testing import CliRunner
+from programs import call
 from rosbags.highlevel import AnyReader
 
 from experiments import Run, read_bag, write_trajectory
 from msg_analysis.bags.files import stored_file
 from msg_analysis.bags.playback import Playback
 from msg_analysis.bags.salvage import salvage
-from msg_analysis.cli.main import main
 from msg_analysis.errors import BagError
 from msg_analysis.report.documents import describe_bag
 
@@ -189,52 +188,52 @@ def test_messages_compressed_one_by_one_are_salvaged_unpacked(
         assert sorted(bytes(data) for _, _, data in reader.messages()) == sorted(data for *_, data in messages)
 
 
-@pytest.mark.parametrize(
-    ("make", "expected"),
-    [
-        (lambda file: file.touch(), "empty: nothing was recorded"),
-        (lambda file: file.write_bytes(b"SQLite format 3\x00" + bytes(4000)), "cannot be read"),
-        (lambda file: file.write_text("name: line_ring\n" * 300), "cannot be read"),
-        (lambda file: _made(file, "CREATE TABLE topics(id)"), "not a bag: expected the tables"),
+NUMBERED = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i{} FROM n{})"
+NO_BAGS: list[tuple[bytes | tuple[str, ...], str]] = [  # of these bytes, or made by these statements
+    (b"", "empty: nothing was recorded"),
+    (b"SQLite format 3\0" + bytes(4000), "cannot be read"),
+    (b"name: line_ring\n" * 300, "cannot be read"),
+    (("CREATE TABLE topics(id)",), "not a bag: expected the tables"),
+    (
         (
-            lambda file: _made(
-                file,
-                f"CREATE TABLE topics({TOPICS[1]})",
-                "CREATE VIEW messages AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n) "
-                "SELECT i AS rowid, i AS topic_id, i AS timestamp, x'00' AS data FROM n",
-            ),
-            "not a bag: expected the tables",
+            f"CREATE TABLE topics({TOPICS[1]})",
+            f"CREATE VIEW messages AS {NUMBERED.format('', '')} "
+            "SELECT i AS rowid, i AS topic_id, i AS timestamp, x'00' AS data FROM n",
         ),
+        "not a bag: expected the tables",
+    ),
+    (
         (
-            lambda file: _made(
-                file,
-                f"CREATE TABLE topics({TOPICS[1]})",
-                f"CREATE TABLE messages({MESSAGES})",
-                "INSERT INTO topics WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT 9000) "
-                "SELECT i, 'a', 'b', 'cdr' FROM n",
-            ),
-            "more than 8192 topics",
+            f"CREATE TABLE topics({TOPICS[1]})",
+            f"CREATE TABLE messages({MESSAGES})",
+            f"INSERT INTO topics {NUMBERED.format(' + 1', ' LIMIT 9000')} SELECT i, 'a', 'b', 'cdr' FROM n",
         ),
+        "more than 8192 topics",
+    ),
+    (
         (
-            lambda file: _made(
-                file,
-                f"CREATE TABLE topics({TOPICS[1]})",
-                "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, "
-                "data GENERATED ALWAYS AS (zeroblob(200000000)) VIRTUAL)",
-                "INSERT INTO messages VALUES (1, 1, 1), (2, 1, 1), (3, 1, 1), (4, 1, 1)",
-            ),
-            "made to fill the memory",
+            f"CREATE TABLE topics({TOPICS[1]})",
+            "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, "
+            "data GENERATED ALWAYS AS (zeroblob(200000000)) VIRTUAL)",
+            "INSERT INTO messages VALUES (1, 1, 1), (2, 1, 1), (3, 1, 1), (4, 1, 1)",
         ),
-    ],
-)
-def test_files_that_are_no_bags(make: Callable[[Path], Any], expected: str, tmp_path: Path) -> None:
+        "made to fill the memory",
+    ),
+]
+
+
+@pytest.mark.parametrize(("content", "expected"), NO_BAGS)
+def test_files_that_are_no_bags(content: bytes | tuple[str, ...], expected: str, tmp_path: Path) -> None:
     """One error each; as a bag of a command, with exit code 2 and without a traceback."""
     file = tmp_path / "x.db3"
-    make(file)
+    if isinstance(content, bytes):
+        file.write_bytes(content)
+    else:
+        _made(file, *content)
     for function in (read_bag, Playback):
         with pytest.raises(BagError, match=expected):
             function(file)
-    result = CliRunner().invoke(main, ["info", str(file)])
+    result = call("info", file)
     assert result.exit_code == 2
     assert "Traceback" not in result.output
 

@@ -5,8 +5,7 @@ import math
 from pathlib import Path
 
 import pytest
-from click.testing import Result
-from programs import run
+from programs import call
 
 from experiments import golden, simulate, write_trajectory
 from msg_analysis.bags.stored_file import Storage
@@ -15,10 +14,6 @@ from msg_analysis.experiment import experiment as experiments
 ROOT = Path(__file__).parents[3]
 GOLDEN = ROOT / "tests/data/golden"
 LINE_RING = str(GOLDEN / "line_ring.yaml")
-
-
-def call(*arguments: str | Path) -> Result:
-    return run("msg-analysis", *arguments)
 
 
 @pytest.fixture(scope="module")

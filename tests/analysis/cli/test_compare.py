@@ -9,17 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from click.testing import Result
-from programs import run
+from programs import call
 from rich.console import Console
 
 from experiments import changed, claimed, golden, simulate, write_trajectory
 from msg_analysis.report.saved_results import print_results
 from msg_analysis.runs import read_result
-
-
-def call(*arguments: object) -> Result:
-    return run("msg-analysis", *arguments)
 
 
 @pytest.fixture(scope="module")

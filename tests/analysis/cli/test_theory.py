@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import Result
-from programs import run
+from programs import call
 
 from experiments import GOLDEN, Experiment
 from msg_analysis import read_bag
@@ -20,10 +19,6 @@ from msg_analysis.paper import examples
 LINE_RING = str(GOLDEN / "line_ring.yaml")
 FROM_ZERO = {"run": {"start": "zero"}}
 NO_TIMES = ["soon", "0:1", "1:0:0.5", "0,nan"]
-
-
-def call(*arguments: str | Path) -> Result:
-    return run("msg-analysis", *arguments)
 
 
 def document_of(*arguments):
