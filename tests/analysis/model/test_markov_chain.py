@@ -124,6 +124,15 @@ def test_very_fast_switching_has_the_same_law(rate: float) -> None:
         assert scipy.stats.chisquare(counts, expected[i] * len(following)).pvalue > 1e-5
 
 
+@pytest.mark.parametrize("rate", [1.0, 1e3, 1e6, 1e12])
+def test_transition_of_two_graphs(rate: float) -> None:
+    """In closed form: pi + (1 - pi) exp(-3 r dt), also where the least version of scipy has NaN."""
+    chain = MarkovChain("continuous", np.array([[-rate, rate], [2 * rate, -2 * rate]]))
+    left = np.exp(-0.3 * rate)
+    expected = [[2 / 3 + left / 3, (1 - left) / 3], [2 * (1 - left) / 3, 1 / 3 + 2 * left / 3]]
+    np.testing.assert_allclose(chain.transition(0.1), expected, rtol=1e-12)
+
+
 def test_holding_times_are_exponential() -> None:
     """Kolmogorov-Smirnov on 5,000 holding times, p > 1e-4: the false-alarm rate."""
     chain = MarkovChain("continuous", generator_of(2, 2))
