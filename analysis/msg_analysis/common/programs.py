@@ -31,15 +31,8 @@ def run(
     command: Sequence[str], environment: Mapping[str, str], timeout: float | None = None
 ) -> subprocess.CompletedProcess[str]:
     """Exit code and output of a program; TimeoutExpired after ``timeout`` seconds."""
-    process = start(command, environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    with process:
-        try:
-            stdout, stderr = process.communicate(timeout=timeout)
-        except BaseException:
-            process.kill()
-            raise
-    texts = (text.decode(errors="replace") for text in (stdout, stderr))
-    return subprocess.CompletedProcess(command, process.returncode, *texts)
+    how: dict[str, Any] = {"stdin": subprocess.DEVNULL, "env": {**environment, **SAFE_PATH}, "timeout": timeout}
+    return subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", check=False, **how)
 
 
 PR_SET_PDEATHSIG = 1
