@@ -295,11 +295,7 @@ class WrittenFile:
         self._stream: BinaryIO = path.open("xb")
 
     def write_head(
-        self,
-        topics: Sequence[Topic],
-        record: str | None,
-        custom: Mapping[str, str],
-        latched: Iterable[LatchedMessage],
+        self, topics: Sequence[Topic], record: str | None, custom: Mapping[str, str], latched: Iterable[LatchedMessage]
     ) -> None:
         """Write the run record, the topics, and what is in force of the latched ones; the first thing to be written."""
         storage, self._custom = self._storage, custom

@@ -249,10 +249,7 @@ def recording_pid(directory: Path) -> int | None:
 
 
 def write_trajectory(
-    trajectory: Run,
-    directory: str | Path,
-    storage: Storage = DEFAULT_STORAGE,
-    block_numbers: int = BLOCK_NUMBERS,
+    trajectory: Run, directory: str | Path, storage: Storage = DEFAULT_STORAGE, block_numbers: int = BLOCK_NUMBERS
 ) -> None:
     """Write a bag, whole or not at all; InputError: the directory exists, cannot be written, or is not UTF-8."""
     directory = Path(directory).absolute()
