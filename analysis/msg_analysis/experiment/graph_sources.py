@@ -166,13 +166,8 @@ def with_numbers(spec: GraphSpec, numbers: Mapping[int | str, int]) -> GraphSpec
 
 def largest_label(spec: GraphSpec) -> int:
     """Largest agent number that the graph mentions; 0 where it mentions none."""
-    if spec.path or spec.cycle:
-        return max(map(int, spec.path or spec.cycle or [0]))
-    if spec.star:
-        return spec.star.center
-    if spec.grid:
-        return spec.grid[0] * spec.grid[1]
-    return max((int(end) for link in spec.edges or spec.arcs or [] for end in link[:2]), default=0)
+    grid = spec.grid[0] * spec.grid[1] if spec.grid else 0
+    return max([grid, *(agent for agent in written_agents(spec) if isinstance(agent, int))])
 
 
 def links(spec: GraphSpec, agents: int) -> list[Link]:

@@ -410,52 +410,58 @@ class Sections:
             words = "the nodes have no names that are all different: nodes with the same id are the same agent"
             self.notes.append(f"{listed(made)}: {words}")
 
-    def _name(self, agent: int | str) -> int | str:
-        """An agent as the document has it; a number is a name where the nodes of files are numbers that are names."""
-        return str(agent) if self._numbers_are_names else agent
+    def _number(self, key: str, agent: int | str, *others: str) -> int | None:
+        """The number of an agent that is given by number or name; None, and a mistake: an unknown name."""
+        names = self.values["names"] or []
+        written = str(agent) if self._numbers_are_names else agent  # of the nodes in files
+        if written in names:
+            return int(names.index(written)) + 1
+        if not isinstance(written, str):
+            return written
+        if self.agents is not None:
+            self.problems.append(validation.unknown_name(key, written, names, *others))
+        return None
 
     def _name_leaders(self) -> None:
         """Numbers instead of names in ``leaders``; what is not a name of an agent is a mistake."""
-        leaders, names = self.values["leaders"], self.values["names"] or []
+        leaders = self.values["leaders"]
         if leaders is None:
             return
-        written = [self._name(agent) for agent in leaders.agents]
-        numbers = [names.index(str(agent)) + 1 if agent in names else agent for agent in written]
-        unknown = [agent for agent in numbers if isinstance(agent, str)]
-        if self.agents is not None:
-            self.problems += [validation.unknown_name("leaders.agents", agent, names) for agent in unknown]
-        self.values["leaders"] = leaders.model_copy(update={"agents": [a for a in numbers if a not in unknown]})
-        if unknown:
+        numbers = [self._number("leaders.agents", agent) for agent in leaders.agents]
+        self.values["leaders"] = leaders.model_copy(update={"agents": [n for n in numbers if n is not None]})
+        if None in numbers:
             self.known.discard("leaders")
 
     def _name_start(self) -> None:
         """One number for each agent in ``run.start`` in place of numbers by agent; 0 for those that are not there."""
-        run, names = self.values["run"], self.values["names"] or []
+        run = self.values["run"]
         if self.agents is None or run is None or not isinstance(run.start, dict):
             return
-        values = [0.0] * self.agents
-        for agent, value in ((self._name(agent), value) for agent, value in run.start.items()):
-            number = names.index(agent) + 1 if agent in names else agent
-            if isinstance(number, str) or number > self.agents:
-                others = f"expected agents 1 to {self.agents}"
-                self.problems.append(validation.unknown_name("run.start", agent, names, others))
-            else:
+        values, others = [0.0] * self.agents, f"expected agents 1 to {self.agents}"
+        for agent, value in run.start.items():
+            number = self._number("run.start", agent, others)
+            if number is not None and number > self.agents:
+                self.problems.append(validation.unknown_name("run.start", number, self.values["names"] or [], others))
+            elif number is not None:
                 values[number - 1] = value
         self.values["run"] = run.model_copy(update={"start": values})
 
     def _resolve_losses(self, noise: NoiseSpec, time: Time) -> None:
         """Numbers instead of names in ``noise.loss``, and the probability of every link."""
-        names: list[str] | None = self.values["names"]
+        before = len(self.problems)
         links = {
-            k: [(self._name(i), self._name(j), p) for i, j, p in getattr(noise.loss, k)] for k in ("edges", "arcs")
+            kind: [(*(self._number(f"noise.loss.{kind}", agent) for agent in (i, j)), p) for i, j, p in given]
+            for kind in ("edges", "arcs")
+            if (given := getattr(noise.loss, kind))
         }
-        loss, found = validation.numbered_losses(noise.loss.model_copy(update=links), names or [])
-        if not found:
-            self.values["noise"] = noise.model_copy(update={"loss": loss})
-            self.loss, found = validation.loss_matrix(loss, self.graphs, time, names)
-        self.problems += found
+        if len(self.problems) > before:
+            return
+        loss = noise.loss.model_copy(update=links)
+        self.values["noise"] = noise.model_copy(update={"loss": loss})
+        self.loss, found = validation.loss_matrix(loss, self.graphs, time, self.values["names"])
         if noise.burst is not None and not found:
-            self.problems += validation.burst_problems(noise.burst, loss)
+            found = validation.burst_problems(noise.burst, loss)
+        self.problems += found
 
     def _fits(self, run: RunSpec | None) -> bool:
         assert self.agents is not None

@@ -342,24 +342,6 @@ def unknown_name(
     return problem(key, show(agent), f"expected one of the names {listed(names)}" if names else others, "correct it")
 
 
-def numbered_losses(loss: LossSpec, names: Sequence[str]) -> tuple[LossSpec, list[str]]:
-    """The same with numbers instead of names of agents, and the names that are unknown."""
-    found: list[str] = []
-
-    def number(key: str, agent: int | str) -> int | str:
-        if agent in names:
-            return names.index(str(agent)) + 1
-        if isinstance(agent, str):
-            found.append(unknown_name(key, agent, names))
-        return agent
-
-    numbers = {
-        kind: [(number(f"noise.loss.{kind}", i), number(f"noise.loss.{kind}", j), p) for i, j, p in getattr(loss, kind)]
-        for kind in ("edges", "arcs")
-    }
-    return loss.model_copy(update=numbers), found
-
-
 def loss_matrix(
     loss: LossSpec, graphs: Sequence[Graph], time: Time, names: Sequence[str] | None
 ) -> tuple[FloatArray, list[str]]:
