@@ -15,7 +15,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import click
@@ -251,7 +250,9 @@ _REFRESH = 0.1  # s between two updates of a bar
 class _Progress:
     """Progress display, a context manager."""
 
-    def __init__(self, title: str, *, time_left: bool, clock: Callable[[], float]) -> None:
+    time_left = False  # whether to show it beside the time so far
+
+    def __init__(self, title: str = "", clock: Callable[[], float] = time.monotonic) -> None:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, TextColumn, TimeElapsedColumn
         from rich.text import Text
 
@@ -269,7 +270,7 @@ class _Progress:
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[words]}"),
-            TimesColumn() if time_left else TimeElapsedColumn(),
+            TimesColumn() if self.time_left else TimeElapsedColumn(),
             console=console,
             disable=not console.is_terminal,
             transient=True,
@@ -277,7 +278,6 @@ class _Progress:
         self._console = console
         self._title = title
         self._task = self._bar.add_task(title, total=None, words="")
-        self._time_left = time_left
         self._clock = clock
         self._begun = self._told = clock()
         self._first: int | None = None  # done when the work began, by an earlier call for example
@@ -285,7 +285,6 @@ class _Progress:
         self._shown = 0.0
 
     def __enter__(self) -> Self:
-        self._bar.start()
         return self
 
     def _times(self) -> str:
@@ -305,14 +304,13 @@ class _Progress:
         if self._first is None:
             self._first = done
         self._newest = done, total, self._clock()
+        self._bar.start()
         self._bar.update(self._task, completed=done, total=total, description=title, words=in_short)
         if not self._console.is_terminal and self._clock() - self._told >= _LINE_PERIOD:
             self._told = self._clock()
-            self._console.print(f"{title}: {text}" + (f", {self._times()}" if self._time_left else ""))
+            self._console.print(f"{title}: {text}" + (f", {self._times()}" if self.time_left else ""))
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._console.is_terminal:  # elsewhere, older versions of rich would print an empty line
             self._bar.stop()
 
@@ -320,8 +318,7 @@ class _Progress:
 class SweepProgress(_Progress):
     """Progress of a sweep, a context manager."""
 
-    def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__(title, time_left=True, clock=clock)
+    time_left = True
 
     def done(self, done: int, total: int, failed: int = 0) -> None:
         """Show how many points are done, and how many of these failed; a ``SweepProgress`` of ``run_jobs``."""
@@ -331,9 +328,6 @@ class SweepProgress(_Progress):
 
 class SolveProgress(_Progress):
     """Progress of a search: a ``SearchProgress`` of ``theory.leaders.search``, and a context manager."""
-
-    def __init__(self, title: str, clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__(title, time_left=False, clock=clock)
 
     def __call__(self, stage: str, done: int, total: int, best: float) -> None:
         """Show stage, evaluations done and to do, and the smallest system error so far; see ``SearchProgress``."""
@@ -345,18 +339,11 @@ class SolveProgress(_Progress):
 class WorkProgress(_Progress):
     """How far long work is, in percent: a ``common.long_work.Watch``, and a context manager; nothing in short work."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        super().__init__("", time_left=False, clock=clock)
-
-    def __enter__(self) -> Self:
-        return self
-
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show what is being done, and how much of it is done."""
         now = self._clock()
         if now - self._begun < _SHORT or now - self._shown < _REFRESH:
             return
         self._shown = now
-        self._bar.start()
         percent = 100 * done // max(total, 1)
         self._show(what, percent, 100, f"{percent} %", "%")

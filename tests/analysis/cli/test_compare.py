@@ -164,23 +164,3 @@ def test_tabulate_of_a_directory_and_of_nothing(results: list[Path], tmp_path: P
     assert call("tabulate", tmp_path, "--format", "csv").stdout.splitlines()[1].startswith(str(tmp_path))
     assert call("tabulate").exit_code == 2
     assert "No such file" in call("tabulate", tmp_path / "nope.json").stderr
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("", "not JSON"),
-        ("[]", "not a JSON object"),
-        ("{}", "system_error: None"),
-        ('{"system_error": {"interval": 3}}', "system_error.interval: 3"),
-        ('{"system_error": {"interval": [1, "x"]}, "experiment": "a", "verdict": "agrees"}', "interval: 'x'"),
-        ('{"system_error": {"interval": [1, 2]}, "verdict": "agrees"}', "experiment: None"),
-    ],
-)
-def test_files_that_are_no_results(text: str, expected: str, tmp_path: Path) -> None:
-    path = tmp_path / "result.json"
-    path.write_text(text, encoding="utf-8")
-    result = call("tabulate", path)
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert expected in result.stderr
-    assert str(path) in result.stderr

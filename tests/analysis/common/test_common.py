@@ -156,7 +156,7 @@ def test_short_work_shows_nothing(capfd: pytest.CaptureFixture[str]) -> None:
 def test_long_work_says_how_far_it_is(capfd: pytest.CaptureFixture[str]) -> None:
     """A line every ten seconds where there is no terminal."""
     now = [100.0]
-    with WorkProgress(lambda: now[0]) as progress, watched(progress):
+    with WorkProgress(clock=lambda: now[0]) as progress, watched(progress):
         for second in range(25):
             now[0] = 100.0 + second
             tell("reading x.mcap", second, 25)

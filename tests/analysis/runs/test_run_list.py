@@ -249,9 +249,12 @@ def test_what_is_not_a_moment(text: str) -> None:
         ("names", 100_000 * "["),
         ("experiment", '"\\ud800"'),
         ("bags", "7"),
+        ("experiment", "null"),
+        ("system_error", '{"interval": 3}'),
+        ("system_error", '{"interval": [1, "x"]}'),
         ("", ""),  # a FIFO instead of the file
     ],
-    ids=range(9),
+    ids=range(12),
 )
 def test_one_broken_result(tmp_path: Path, key: str, text: str) -> None:
     """It is one line; the list, the table and the page have the other run."""
