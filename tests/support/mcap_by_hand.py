@@ -1,10 +1,13 @@
-"""Records of MCAP files by hand, as https://mcap.dev/spec has them."""
+"""Records of MCAP files by hand, as https://mcap.dev/spec has them, and files by its own library."""
 
 import struct
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import zstandard
+from mcap.writer import Writer
 
 MAGIC = b"\x89MCAP0\r\n"
 
@@ -63,4 +66,24 @@ def attachment(name: str, data: bytes, log_time: int, create_time: int) -> bytes
 def write(path: Path, *records: bytes) -> Path:
     """A file without an end."""
     path.write_bytes(MAGIC + b"".join(records))
+    return path
+
+
+def by_library(
+    path: Path, messages: Iterable[tuple[Any, ...]], *, library: str = "theirs", qos: str = "", **options: Any
+) -> Path:
+    """A file by mcap's own writer, of messages: topic, type (empty: none), data, log time and perhaps publish time."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start("ros2", library)
+        schemas, channels = {"": 0}, {}
+        for topic, kind, data, time, *published in messages:
+            if kind not in schemas:
+                schemas[kind] = writer.register_schema(kind, "ros2msg", b"string data")
+            if (topic, kind) not in channels:
+                metadata = {"offered_qos_profiles": qos}
+                channels[topic, kind] = writer.register_channel(topic, "cdr", schemas[kind], metadata)
+            writer.add_message(channels[topic, kind], time, data, *(published or [time]))
+        writer.finish()
     return path

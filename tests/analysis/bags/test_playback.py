@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.writer import CompressionType, IndexType, Writer
-from mcap_by_hand import MAGIC
+from mcap.writer import CompressionType, IndexType
+from mcap_by_hand import MAGIC, by_library
 
 from msg_analysis.bags.playback import Playback
 from msg_analysis.errors import BagError
@@ -14,18 +14,13 @@ from msg_analysis.errors import BagError
 QOS = "- history: keep_all\n  reliability: reliable\n  durability: {}\n"
 
 
-def write(path: Path, messages: list[tuple[str, int]], *, qos: str = "", **options: Any) -> None:
+STRING = "std_msgs/msg/String"
+
+
+def write(path: Path, messages: list[tuple[str, int]], **options: Any) -> None:
     """A file with these messages: topic and log time; their data are their numbers."""
-    with path.open("wb") as stream:
-        writer = Writer(stream, **({"chunk_size": 200, "compression": CompressionType.ZSTD} | options))
-        writer.start(profile="ros2")
-        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
-        channels: dict[str, int] = {}
-        for number, (topic, time) in enumerate(messages):
-            if topic not in channels:
-                channels[topic] = writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": qos})
-            writer.add_message(channels[topic], time, number.to_bytes(20, "little"), time)
-        writer.finish()
+    numbered = [(topic, STRING, number.to_bytes(20, "little"), time) for number, (topic, time) in enumerate(messages)]
+    by_library(path, numbered, **{"chunk_size": 200, "compression": CompressionType.ZSTD} | options)
 
 
 def played(path: Path, *topics: str, until: int = 2**63, **options: int) -> list[tuple[str, int, int]]:
@@ -154,13 +149,7 @@ def test_nothing_to_play(tmp_path: Path) -> None:
 
 
 def test_two_types_on_a_topic(tmp_path: Path) -> None:
-    with (tmp_path / "bag.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        for name in ("one/msg/A", "two/msg/B"):
-            schema = writer.register_schema(name, "ros2msg", b"")
-            writer.add_message(writer.register_channel("/a", "cdr", schema), 1, b"", 1)
-        writer.finish()
+    by_library(tmp_path / "bag.mcap", [("/a", "one/msg/A", b"", 1), ("/a", "two/msg/B", b"", 1)])
     with pytest.raises(BagError, match="topic /a: its messages are one/msg/A and two/msg/B"):
         Playback(tmp_path / "bag.mcap")
 
@@ -168,13 +157,8 @@ def test_two_types_on_a_topic(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["std_msgs::msg::dds_::String_", "std_msgs/msg/dds_/String_", "std_msgs/String"])
 def test_names_of_dds(tmp_path: Path, kind: str) -> None:
     """Topics and types have the names that ROS 2 gives them; a channel without a type has that of its topic."""
-    with (tmp_path / "bag.mcap").open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        schema = writer.register_schema(kind, "", b"")
-        for number, (name, of) in enumerate([("rt/a/b", 0), ("/a/b", schema), ("rt/a/b", schema), ("a/c", 0)]):
-            writer.add_message(writer.register_channel(name, "cdr", of), number, bytes([number]), number)
-        writer.finish()
+    names = [("rt/a/b", ""), ("/a/b", kind), ("rt/a/b", kind), ("a/c", "")]
+    by_library(tmp_path / "bag.mcap", [(*name, bytes([number]), number) for number, name in enumerate(names)])
     bag = Playback(tmp_path)
     assert {name: topic.type_name for name, topic in bag.topics.items()} == {"/a/b": "std_msgs/msg/String", "/a/c": ""}
     found = [(message.topic, message.data[0]) for message in bag.messages(["/a/b"])]

@@ -1,13 +1,13 @@
 """The reader against bags that other libraries wrote, from hand-made bytes; also of runs that ended early."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import Writer
+from mcap_by_hand import by_library
 
 from experiments import Run, check, compare, line_ring, read_bag, simulate, write_trajectory
 from msg_analysis.bags.salvage import salvage
@@ -17,7 +17,6 @@ from msg_analysis.messages.messages import (
     ACTIVE_GRAPH,
     AGENT_STATE,
     PROGRESS,
-    STRING,
     ActiveGraph,
     AgentState,
     Progress,
@@ -54,26 +53,6 @@ def _messages(run: Run, namespace: str = "") -> list[Message]:
     return out
 
 
-def _mcap(path: Path, messages: Iterable[Message]) -> Path:
-    """A bare MCAP file, written by the mcap library."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    types = {kind.full_name: kind for kind in (AGENT_STATE, ACTIVE_GRAPH, PROGRESS, STRING)}
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start("ros2", "test")
-        schemas: dict[str, int] = {}
-        channels: dict[str, int] = {}
-        for topic, kind, data, time in messages:
-            if kind not in schemas:
-                text = types[kind].schema if kind in types else "uint8 data"
-                schemas[kind] = writer.register_schema(kind, "ros2msg", text.encode())
-            if topic not in channels:
-                channels[topic] = writer.register_channel(topic, "cdr", schemas[kind])
-            writer.add_message(channels[topic], time, data, time)
-        writer.finish()
-    return path
-
-
 def _same(found: Run, run: Run) -> None:
     assert found.record.run == run.record.run
     assert np.array_equal(found.states, run.states)
@@ -87,7 +66,7 @@ def test_what_is_missing(tmp_path: Path, make_run: MakeRun) -> None:
     run = make_run()
     lost = [_state(run, k, i).encode() for k, i in ((5, 1), (40, 2))]
     kept = [message for message in _messages(run) if message[2] not in lost]
-    found = read_bag(_mcap(tmp_path / "x.mcap", [*kept, ("/graph", ACTIVE_GRAPH.full_name, b"rubbish", 1)]))
+    found = read_bag(by_library(tmp_path / "x.mcap", [*kept, ("/graph", ACTIVE_GRAPH.full_name, b"rubbish", 1)]))
     count = found.completeness
     assert (count.expected, count.received, count.missing, count.missing_modes) == (123, 121, 2, 0)
     assert count.refused == {"undecodable": 1}
@@ -102,7 +81,7 @@ def test_stamps_in_lockstep(tmp_path: Path) -> None:
     run = simulate(line_ring(3, 1e-9, run={"duration": 10}))
     wrong = {_state(run, k, i).encode(): _state(run, k, i, stamp=k * STEP + 1).encode() for k, i in ((30, 0), (7, 1))}
     messages = [(topic, kind, wrong.get(data, data), time) for topic, kind, data, time in _messages(run)]
-    found = read_bag(_mcap(tmp_path / "x.mcap", messages))
+    found = read_bag(by_library(tmp_path / "x.mcap", messages))
     words = "agent 2 at step 7: stamped 0.350000001 s of simulated time, expected 0.35 s"
     assert (found.wrong_stamp, check(found).difference) == ((7, 1, 7 * STEP + 1), words)
     result = compare(found)
@@ -121,7 +100,7 @@ def test_gaps_and_overlaps_of_sojourns(tmp_path: Path, make_run: MakeRun) -> Non
     outside = ActiveGraph(0, run.record.run.bytes, 100, 1, "line", 39, 40)
     for graph in (overlap, outside):
         messages.append(("/graph", ACTIVE_GRAPH.full_name, graph.encode(), 0))
-    found = read_bag(_mcap(tmp_path / "x.mcap", messages))
+    found = read_bag(by_library(tmp_path / "x.mcap", messages))
     unknown = [8, 9, 10, 11, 22, 23, 24]
     assert found.completeness.missing_modes == len(unknown)
     assert np.flatnonzero(found.modes < 0).tolist() == unknown
@@ -138,12 +117,14 @@ def test_a_graph_that_the_states_contradict(tmp_path: Path, make_run: MakeRun) -
             graph = ActiveGraph.decode(data)
             data = dataclasses.replace(graph, mode=3 - graph.mode).encode()
         changed.append((topic, kind, data, time))
-    found = read_bag(_mcap(tmp_path / "other.mcap", changed))
+    found = read_bag(by_library(tmp_path / "other.mcap", changed))
     assert found.completeness.missing_modes == len(run.modes)
     assert found.completeness.refused == {"graph of a step that its states contradict": len(run.modes)}
     assert compare(found).verdict == "incomplete"
     assert check(found).missing == len(run.modes)
-    none = read_bag(_mcap(tmp_path / "none.mcap", [message for message in _messages(run) if message[0] != "/graph"]))
+    none = read_bag(
+        by_library(tmp_path / "none.mcap", [message for message in _messages(run) if message[0] != "/graph"])
+    )
     assert compare(none).verdict == "incomplete"
     assert check(none).missing == len(run.modes)
 
@@ -156,17 +137,17 @@ def test_two_records_of_one_run(tmp_path: Path, make_run: MakeRun) -> None:
         texts = [run.record.to_json(), dataclasses.replace(run.record, start=run.record.start + 1).to_json()][::order]
         both = [(topic, kind, encode_string(text), 0) for text in [*texts, texts[0]]]
         with pytest.raises(BagError, match=f"two records of run {run.record.run} contradict each other"):
-            read_bag(_mcap(tmp_path / "bag.mcap", [*both, *rest]))
+            read_bag(by_library(tmp_path / "bag.mcap", [*both, *rest]))
 
 
 def test_two_runs(tmp_path: Path, make_run: MakeRun) -> None:
     one, two = make_run(seed=1), make_run(seed=2, name="second")
     with pytest.raises(BagError, match="2 runs in one bag") as error:
-        read_bag(_mcap(tmp_path / "two.mcap", _messages(one) + _messages(two)))
+        read_bag(by_library(tmp_path / "two.mcap", _messages(one) + _messages(two)))
     assert str(one.record.run) in str(error.value)
     assert "second, 123 states" in str(error.value)
     latched = _messages(two)[:1]  # the topic of a run that was over before the recording began
-    found = read_bag(_mcap(tmp_path / "one.mcap", latched + _messages(one)))
+    found = read_bag(by_library(tmp_path / "one.mcap", latched + _messages(one)))
     _same(found, one)
 
 
@@ -189,10 +170,10 @@ def test_no_bag(tmp_path: Path, make_run: MakeRun) -> None:
     with pytest.raises(BagError, match="not an MCAP file"):
         read_bag(tmp_path / "text.mcap")
     with pytest.raises(BagError, match="latched topic `experiment` is missing"):
-        read_bag(_mcap(tmp_path / "x.mcap", _messages(run)[1:]))
+        read_bag(by_library(tmp_path / "x.mcap", _messages(run)[1:]))
     bad = [("/experiment", "std_msgs/msg/String", encode_string("{}"), 0), *_messages(run)[1:]]
     with pytest.raises(InputError, match="not a run record"):
-        read_bag(_mcap(tmp_path / "y.mcap", bad))
+        read_bag(by_library(tmp_path / "y.mcap", bad))
 
 
 @pytest.mark.parametrize(
@@ -219,7 +200,7 @@ def bag(path: Path, run: Run, ends: Sequence[int], last: Sequence[int]) -> Path:
     """The states of every agent up to its ``last`` step, and messages of these early ends."""
     kept = [m for m in _messages(run) if m[1] != AGENT_STATE.full_name or m[3] <= last[int(m[0][7]) - 1] * STEP]
     stops = [("/stop", PROGRESS.full_name, Progress(k * STEP, run.record.run.bytes, 0, k).encode(), k) for k in ends]
-    return _mcap(path, kept + stops)
+    return by_library(path, kept + stops)
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ import yaml
 import zstandard
 from full_disk import full_disk
 from mcap.reader import make_reader
-from mcap.writer import CompressionType, Writer
-from mcap_by_hand import attachment, channel, chunk, header, message, metadata, schema, write
+from mcap.writer import CompressionType
+from mcap_by_hand import attachment, by_library, channel, chunk, header, message, metadata, schema, write
 
 from msg_analysis.bags.salvage import SalvageReport, salvage, salvage_in_place
 from msg_analysis.bags.writing import BagWriter
@@ -89,16 +89,10 @@ def described(file: str) -> dict[str, Any]:
     }
 
 
-def whole(file: Path, **options: Any) -> bytes:
+def whole(file: Path) -> bytes:
     """Nine messages in chunks of three, written by mcap."""
-    with file.open("wb") as stream:
-        writer = Writer(stream, chunk_size=150, compression=CompressionType.NONE, **options)
-        writer.start("ros2", "theirs")
-        number = writer.register_channel("/a", "cdr", 0)
-        for time in range(9):
-            writer.add_message(number, 100 + time, bytes([time]) * 40, time)
-        writer.finish()
-    return file.read_bytes()
+    messages = [("/a", "", bytes([time]) * 40, 100 + time, time) for time in range(9)]
+    return by_library(file, messages, chunk_size=150, compression=CompressionType.NONE).read_bytes()
 
 
 @pytest.mark.parametrize("in_place", [False, True])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap_by_hand import by_library
 
 from experiments import Run, read_bag, write_trajectory
 from msg_analysis.bags.playback import Playback
@@ -229,18 +229,10 @@ def test_torn_in_two_files(whole: Run, arriving: list[tuple[str, bytes, int]], t
 
 def _theirs(folder: Path, files: list[list[tuple[bytes, int]]], latched: bool = True) -> Iterator[bytes]:
     """What is played of a bag of another recorder: on one topic, data and time of publication; logged 5 ns later."""
-    folder.mkdir()
-    durability = "transient_local" if latched else "volatile"
+    qos = f"- durability: {'transient_local' if latched else 'volatile'}\n"
     for number, messages in enumerate(files):
-        with (folder / f"theirs_{number}.mcap").open("wb") as stream:
-            writer = Writer(stream)
-            writer.start(profile="ros2")
-            schema = writer.register_schema("std_msgs/msg/Bool", "ros2msg", b"bool data")
-            qos = {"offered_qos_profiles": f"- durability: {durability}\n"}
-            channel = writer.register_channel("/switch", "cdr", schema, qos)
-            for data, time in messages:
-                writer.add_message(channel, time + 5, data, time)
-            writer.finish()
+        logged = [("/switch", "std_msgs/msg/Bool", data, time + 5, time) for data, time in messages]
+        by_library(folder / f"theirs_{number}.mcap", logged, qos=qos)
     return (message.data for message in Playback(folder).messages(["/switch"]))
 
 
