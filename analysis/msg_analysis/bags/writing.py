@@ -129,7 +129,7 @@ class BagWriter:
         last = self._open[-1]
         if last.bound is None:
             if not last.full:
-                return last if len(self._open) == 1 else self._first_with(time_ns) or last
+                return self._first_with(time_ns) or last
             last.bound, last.behind = last.count.end, set(self._streams)
         return self._first_with(time_ns) or self._begin_file(last.bound + 1)
 
