@@ -77,7 +77,7 @@ class EvidenceSums:
             rounding=rounding / np.sqrt(np.where(noisy, variances.min(axis=0), np.inf)),
             apart=bool(usable.any()) and not correlated,
             links=np.argwhere(step.listens() & usable[:, None]),
-            plain=self.plain,
+            lockstep=not real_time,
             gains=np.argwhere((step.listens() | np.diag(pull)) & usable[:, None]),
             pairs=np.column_stack([first[paired], second[paired]]),
             lossy=np.argwhere(step.listens() & (step.losses > 0.0) & independent_losses),

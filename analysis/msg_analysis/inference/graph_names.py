@@ -15,6 +15,8 @@ import numpy as np
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.inference.e_values import WindowEvidence, Windows, log_mean
 from msg_analysis.inference.question import Block, Diagnostic, Finding, Largest, Law, Place
+from msg_analysis.inference.received_values import ReceivedValues
+from msg_analysis.inference.residuals import received_residuals
 
 MOST_GRAPHS = 20  # of a law for which this is tested
 MOST_PERMUTED = 6  # graphs of which all permutations are tried; of more, only those of two
@@ -33,9 +35,9 @@ class SwappedGraphs(Diagnostic):
     def __init__(self, law: Law) -> None:
         super().__init__(law)
         self._step = step = law.step
-        tested = law.plain and law.apart and law.noisy.all() and step.modes <= MOST_GRAPHS
+        tested = law.lockstep and law.apart and law.noisy.all() and step.modes <= MOST_GRAPHS
         self._pairs: IntArray = np.column_stack(np.triu_indices(step.modes if tested else 0, 1))  # (P, 2)
-        self._deviation = np.sqrt(np.einsum("gik,gik->gi", step.noise_gain, step.noise_gain))  # (n, m)
+        self._variance = np.square(step.noise_gain).sum(axis=2)  # (n, m) of process noise
         self._windows = Windows(law.planned, len(self._pairs))
         self._evidence = WindowEvidence(self._windows, len(self._pairs))
         self._best = Largest(-np.inf, (0, 0))
@@ -50,10 +52,7 @@ class SwappedGraphs(Diagnostic):
             return np.empty((block.analyses.count, 0, 1))
         # The product over the steps of a window is evidence, so is the mean over windows and pairs; 1 / it is the p.
         logged, modes = _log_density(block.white, block.scale), block.reception.modes
-        density = np.empty((len(logged), self._step.modes))
-        for graph, deviation in enumerate(self._deviation):
-            mean = self._step.weights[graph] @ block.reception.states + self._step.offsets[graph][:, None]
-            density[:, graph] = _log_density((block.after - mean) / deviation[:, None], deviation)
+        density = self._densities(block, logged)
         between = np.zeros((block.analyses.count, *self._likelihood.shape))
         np.add.at(between, (block.analyses.after(np.arange(len(modes))), modes), density - logged[:, None])
         likelihood = self._likelihood + between.cumsum(axis=0)
@@ -70,6 +69,24 @@ class SwappedGraphs(Diagnostic):
         place = Place(start, start + (1 << int(level[at])) - 1)
         self._best.take(float(values[at, pair]), tuple(self._pairs[pair].tolist()), place)
         return np.append(evidence, log_mean(self._renamed(likelihood), axis=1)[:, None], axis=1)[:, :, None]
+
+    def _densities(self, block: Block, logged: FloatArray) -> FloatArray:
+        """(b, n) log density of each step if its graph were another, given the values that were received."""
+        # The log says of the d-th neighbour what was used, whichever agent that is.
+        step, known = self._step, block.reception
+        steps = block.first + np.arange(len(logged))
+        newest = np.broadcast_to(np.maximum(steps - step.delay, 0)[:, None, None], known.used.shape)
+        used = known.used if step.loss else newest
+        density = np.empty((len(logged), step.modes))
+        for graph, variance in enumerate(self._variance):
+            graphs = np.full(known.graphs.shape, graph)
+            other = ReceivedValues.by(step, graphs[:, 0], graphs, used, known.states, known.published)
+            deviation = np.sqrt(variance + other.link_variance)
+            white = received_residuals(step, other, block.after) / deviation[:, :, None]
+            density[:, graph] = _log_density(white, deviation)
+        # With a delay the message with x(0), and the noise in it, is used in several steps.
+        again = steps <= step.delay if step.link and step.delay else steps < 0
+        return np.where(again[:, None], logged[:, None], density)
 
     def _renamed(self, likelihood: FloatArray) -> FloatArray:
         """(..., P): of the permutations, from log likelihood ratios (..., n, n)."""

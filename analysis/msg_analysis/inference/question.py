@@ -270,7 +270,7 @@ class Law:
     rounding: FloatArray  # (m,) largest rounding of these residuals, over their standard deviation
     apart: bool  # whether those of different agents are independent of each other, given what they received
     links: IntArray  # (L, 2) receiver and sender, where residuals are independent of all that the receiver received
-    plain: bool  # whether all agents receive the states themselves, in lockstep
+    lockstep: bool
     gains: IntArray  # (G, 2) receivers and senders whose gains are asked about; the same agent twice: pull of a leader
     pairs: IntArray  # (P, 2) agents whose noises may be common
     lossy: IntArray  # (l, 2) receivers and senders whose losses are

@@ -107,7 +107,7 @@ class ReceivedValues:
         """(b, m, R): the next states without noise and without the term of the reference, as if ``centre`` were 0."""
         total = self.own[:, :, None] * (self.states - centre)
         every, agents = np.arange(len(self.modes)), np.arange(self.states.shape[1])
-        for d in range(self.weights.shape[2]):
+        for d in np.flatnonzero(self.weights.any(axis=(0, 1))).tolist():
             received = self.received(every, agents, np.full(len(agents), d))
             total += self.weights[:, :, d, None] * (received - centre)
         return np.asarray(total)

@@ -161,6 +161,34 @@ def test_names_of_the_graphs_in_the_whole_run(claimed, means, names):
     assert "in the whole run" in cause.words
 
 
+RINGS = THREE | {
+    "graphs": {
+        name: {"edges": list(zip(ring, ring[1:] + ring[:1], strict=True))}
+        for name, ring in {"a": [1, 2, 3, 4], "b": [1, 3, 2, 4], "c": [1, 2, 4, 3]}.items()
+    }
+}
+
+
+@pytest.mark.parametrize(
+    "messages",
+    [
+        {"broadcast": 0.3, "link": 0.3},
+        {"loss": 0.3, "link": 0.3},
+        {"loss": 0.3, "on_loss": "hold", "delay": 1},
+        {"loss": 0.2, "broadcast": 0.2, "link": 0.2, "delay": 2},
+    ],
+    ids=" ".join,
+)
+def test_names_of_the_graphs_with_noise_loss_and_delay_of_messages(messages):
+    """Three rings, so that the log says of each neighbour what was received, whichever it is."""
+    claimed = RINGS | noise(**messages) | {"run": BASE["run"] | {"replicas": 2, "duration": 50}}
+    run = simulate(Experiment.parse(claimed))
+    assert "residuals: swapped graphs" not in {test.name for test in compare(run).tests if test.rejected}
+    (cause,) = compare(dataclasses.replace(run, modes=np.argsort([1, 2, 0])[run.modes])).causes
+    assert (cause.kind, cause.graph) == ("graph", ["a", "b", "c"])
+    assert cause.words.endswith("in the whole run: a means b, b means c, c means a")
+
+
 @pytest.mark.parametrize("alike", [range(32), [2, 5]])
 def test_replicas_that_are_alike(alike):
     run = misrecorded(BASE)

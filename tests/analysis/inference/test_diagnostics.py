@@ -284,13 +284,24 @@ def test_stale_values(changes: dict[str, Any]) -> None:
     assert np.exp(sums.finding().log_p) == pytest.approx(min(1.0, common, *p))
 
 
-def test_swapped_graphs() -> None:
-    observation = seen(duration=5.0)
-    sums, step = summed(observation, SwappedGraphs), observation.step
-    now, after = observation.states[:-1], observation.states[1:]
-    density = np.array(
-        [stats.norm.logpdf(after, step.weights[g] @ now, np.sqrt(0.05)).sum(axis=(1, 2)) for g in range(2)]
-    )
+@pytest.mark.parametrize("noise", [{"process": 1.0}, AIR, AIR | {"delay": 2}], ids=["plain", "on the air", "delay"])
+def test_swapped_graphs(noise: dict[str, Any]) -> None:
+    """Densities by a loop; with a delay and link noise, the steps that use x(0) say nothing."""
+    observation = seen(duration=5.0, noise=noise)
+    sums, step, states = summed(observation, SwappedGraphs), observation.step, observation.states
+    heard = states if observation.published is None else observation.published
+    delay = noise.get("delay", 0)
+    density = np.zeros((2, 100))
+    for g, k, i in np.ndindex(2, 100, 5):
+        mean, variance = states[k, i].copy(), 0.05
+        for d, j in enumerate(step.neighbours(g, i).tolist()):
+            lost = (observation.used is not None and observation.used[k, i, d] < 0) or (
+                observation.lost is not None and observation.lost[k, i, d]
+            )
+            if not lost:
+                mean += step.nominal[g, i, j] * (heard[max(k - delay, 0), j] - states[k, i])
+                variance += (step.link * step.nominal[g, i, j]) ** 2
+        density[g, k] += stats.norm.logpdf(states[k + 1, i], mean, np.sqrt(variance)).sum() * (not delay or k > delay)
     every = np.arange(100)
     ratios = density[1 - observation.modes, every] - density[observation.modes, every]
     counts = Counter(level for level, _ in windows_of(100))
@@ -298,8 +309,11 @@ def test_swapped_graphs() -> None:
     assert np.exp(sums.logarithms()[0, 0]) == pytest.approx(mean)
     assert np.exp(sums.logarithms()[1, 0]) == pytest.approx(whole := np.exp(ratios.sum()))
     assert np.exp(sums.finding().log_p) == pytest.approx(min(1.0, 2.0 / (mean + whole)))
-    with_losses = summed(seen(noise=AIR), SwappedGraphs)
-    assert (with_losses.finding(), with_losses.logarithms().size) == (None, 0)
+
+
+def test_graphs_are_not_swapped_in_real_time() -> None:
+    sums = summed(seen(run={"pace": "realtime"}), SwappedGraphs)
+    assert (sums.finding(), sums.logarithms().size) == (None, 0)
 
 
 def second_order(path: np.ndarray, size: int = 10**6) -> SecondOrder:
