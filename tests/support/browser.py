@@ -103,7 +103,7 @@ class Tab:
         self._log.end()
         page.goto("about:blank")  # nothing more comes from the page before
         page.set_viewport_size({"width": width, "height": height})
-        page.emulate_media(color_scheme=scheme)
+        page.emulate_media(color_scheme=scheme, media="screen")
         page.mouse.move(0, 0)
         self._log = Log(page)
         page.goto(address)

@@ -82,6 +82,16 @@ def test_nothing_is_cut_or_pale(tab: Tab, file: Path, width: int, scheme: str) -
     assert (log.complaints, log.requests) == ([], [file.as_uri()])
 
 
+def test_runs_on_paper(tab: Tab, file: Path) -> None:
+    """A table, not the cards of a phone, and nothing that asks for a click."""
+    page, _ = tab.open(file.as_uri(), width=672)  # A4 within its margins
+    page.emulate_media(media="print")
+    assert page.locator("#runs thead").bounding_box()["height"] > 10
+    assert page.evaluate("getComputedStyle(document.querySelector('#runs tbody tr')).display") == "table-row"
+    assert page.locator("#point:visible, .pair:visible, .filters:visible").count() == 0
+    assert page.evaluate(CUT) == []
+
+
 def test_filters_order_and_difference(tab: Tab, file: Path) -> None:
     page, log = opened(tab, file, 1280, "light")
     rows = page.locator("#runs tbody tr:visible")

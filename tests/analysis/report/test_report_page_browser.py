@@ -136,6 +136,14 @@ def test_small_and_large(tab: Tab, reports: Callable[..., tuple[Path, Run]], age
     assert page.locator(".plot.pictured").count() == 0  # as before
     assert page.locator("details[open]").count() == 1
     assert page.evaluate("window.pictured") == figures
+    page.emulate_media(media="print")
+    sizes = page.evaluate(
+        """() => ["p", "td", "figcaption", ".facts dd"].map(
+            (one) => 0.75 * parseFloat(getComputedStyle(document.querySelector(`main ${one}, ${one}`)).fontSize))"""
+    )  # [pt]
+    assert all(8.0 <= size <= 10.0 for size in sizes), sizes
+    assert page.evaluate("getComputedStyle(document.querySelector('.bar i')).printColorAdjust") == "exact"
+    page.emulate_media(media="screen")
     _check(page, log, path)
 
 
