@@ -28,7 +28,7 @@ from msg_analysis.inference.messages import CommonGain, Gains
 from msg_analysis.inference.noise import Noise
 from msg_analysis.inference.question import Diagnostic
 from msg_analysis.inference.received_values import Correlations
-from msg_analysis.inference.regression import MAX_REGRESSORS, regressors
+from msg_analysis.inference.regression import MAX_REGRESSORS, terms_of
 from msg_analysis.inference.statistics import chi2_quantile
 from msg_analysis.model.step_model import StepModel
 from msg_analysis.theory.prediction import Prediction
@@ -203,7 +203,7 @@ def _gain(prediction: Prediction, factor: float, replicas: int) -> _Informations
     step, system = prediction.step, prediction.system
     covariances = system.lifted(system.by_graph(prediction.steady))  # (n, m, m), times pi
     reception = step.link**2 + step.broadcast**2
-    _, _, terms = regressors(step, MAX_REGRESSORS)
+    terms = terms_of(step, MAX_REGRESSORS)
     links: dict[tuple[int, int], tuple[float, float]] = {}
     total = 0.0
     for mode, covariance in enumerate(covariances):

@@ -16,7 +16,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.statistics import add_sums
 from msg_analysis.model.reception import neighbour_tables
@@ -127,20 +127,17 @@ class ReceivedValues:
 
     def patterns(self, order: IntArray | None = None) -> Iterator[tuple[IntArray, IntArray | None, IntArray]]:
         """Groups of like steps: graphs (m,) and order (m,) of the agents, by ``order`` (b, m), and steps (a,)."""
-        if order is None and (self.graphs == self.modes[:, None]).all():
-            for mode in np.unique(self.modes):
-                at = np.flatnonzero(self.modes == mode)
-                yield self.graphs[at[0]], None, at
-            return
-        keys = self.graphs if order is None else np.column_stack([self.graphs, order])
-        found, owner = np.unique(keys, axis=0, return_inverse=True)
-        owner = owner.reshape(-1)
-        steps = np.argsort(owner, kind="stable")
-        ends = np.searchsorted(owner[steps], np.arange(len(found) + 1))
         m = self.graphs.shape[1]
-        for number, pattern in enumerate(found):
-            at = steps[ends[number] : ends[number + 1]]
+        for pattern, at in _like_rows(self.graphs if order is None else np.column_stack([self.graphs, order])):
             yield pattern[:m], None if order is None else pattern[m:], at
+
+
+def _like_rows(keys: AnyArray) -> Iterator[tuple[AnyArray, IntArray]]:
+    """Each row that there is, and where, ascending."""
+    found, owner = np.unique(keys, axis=0, return_inverse=True)
+    owner = owner.reshape(-1)
+    order = np.argsort(owner, kind="stable")
+    yield from zip(found, np.split(order, np.cumsum(np.bincount(owner))[:-1]), strict=True)
 
 
 def mode_links(step: Wiring, mode: int) -> tuple[IntArray, IntArray, IntArray]:
@@ -226,8 +223,6 @@ class Correlations:
 
         ``sizes``: (b, m) of the terms of the steps.
         """
-        if self.rank == len(self.scale) or not len(residuals):
-            return 0.0
         quiet = self.scale[:, None] * (np.eye(len(self.scale)) - self._vectors @ self._vectors.T) / self.scale
         allowed = QUIET_ROUNDING * sizes @ np.abs(quiet).T + self._hidden
         moved = np.abs(quiet @ residuals).max(axis=2)
@@ -252,20 +247,18 @@ class Equalizer:
         """(b, m, R): transformed residuals (b, m, R) of the steps of a block."""
         m = residuals.shape[1]
         keys = np.column_stack([reception.modes, reception.graphs, reception.link_variance])
-        patterns, owner = np.unique(keys, axis=0, return_inverse=True)
-        owner = owner.reshape(-1)
-        equal, sizes = np.empty_like(residuals), reception.size()
-        order = np.argsort(owner, kind="stable")
-        ends = np.searchsorted(owner[order], np.arange(len(patterns) + 1))
-        for number, pattern in enumerate(patterns):
-            at = order[ends[number] : ends[number + 1]]
+        equal = np.empty_like(residuals)
+        sizes: FloatArray | None = None
+        for pattern, at in _like_rows(keys):
             mode, graphs, e = int(pattern[0]), pattern[1 : m + 1].astype(np.int64), residuals[at]
             noise = Correlations(process_noise(self._step, graphs) + np.diag(pattern[m + 1 :]), self._floor)
             white, rank = noise.inverse() @ e, noise.rank
             self.possible &= rank == self._ranks[mode]
             self.chi2 += float((white**2).sum())
             self.dof += rank * e.shape[0] * e.shape[2]
-            self.quiet = max(self.quiet, noise.excess(e, sizes[at]))
+            if rank < m:
+                sizes = reception.size() if sizes is None else sizes
+                self.quiet = max(self.quiet, noise.excess(e, sizes[at]))
             equal[at] = self._roots[mode][0] @ white
         return equal
 

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.received_values import ReceivedValues, mode_links, process_noise
 from msg_analysis.model.reception import neighbour_tables
@@ -32,62 +32,14 @@ class Term:
     weight: float = 1.0  # its factor in the law; a gain wrong by a share s has the coefficient s * weight
 
 
-class StateRegression:
-    """Score test: the residuals of row i do not depend on what row i of W_g uses; at most ``most`` terms K.
-
-    The scores U_a = sum_k e_i(a)(k) phi_a(k) are martingales, and Cov(U_a, U_b) = sum_k (N_g)_i(a)i(b) phi_a phi_b
-    given the inputs; so U^T Cov^+ U is chi-square with rank(Cov) degrees of freedom, for correlated noise too. All
-    regressors are linear in z, the deviations of the agents and a constant 1.
-    """
-
-    def __init__(self, observation: Observation, most: int = MAX_REGRESSORS) -> None:
-        self._step = step = observation.step
-        self._rows, self._regressors, self.terms = regressors(step, most)
-        self._centred = observation.prediction.experiment.problem == "consensus"
-        size = step.agents + 1
-        self._scores = np.zeros((step.modes, step.agents, size))  # sum of e z^T
-        self._inputs = np.zeros((step.modes, size, size))  # sum of z z^T
-        self.numbers_per_step = 0  # size of the largest temporary array, per step: not limiting
-
-    def add(self, modes: IntArray, states: FloatArray, residuals: FloatArray) -> None:
-        """Add a block of steps: graphs (b,) from 0, states x(k) and residuals (b, m, R)."""
-        m = self._step.agents
-        z = np.ones((len(modes), m + 1, states.shape[2]))
-        z[:, :m] = states - (states.mean(axis=1, keepdims=True) if self._centred else self._step.reference)
-        for mode in range(self._step.modes):
-            at = np.flatnonzero(modes == mode)
-            flat_e = residuals[at].transpose(1, 0, 2).reshape(m, -1)
-            flat_z = z[at].transpose(1, 0, 2).reshape(m + 1, -1)
-            self._scores[mode] += flat_e @ flat_z.T
-            self._inputs[mode] += flat_z @ flat_z.T
-
-    def statistic(self) -> tuple[FloatArray, FloatArray]:
-        """U (K,) and Cov (K, K)."""
-        rows = self._rows
-        score = np.einsum("gac,gac->a", self._scores[:, rows], self._regressors)
-        return score, self._sum(self._step.noise[:, rows[:, None], rows])
-
-    def gram(self) -> FloatArray:
-        """(K, K): sum of phi_a phi_b of regressors of the same agent; E[U] is that times the coefficients."""
-        same = self._rows[:, None] == self._rows
-        return self._sum(np.broadcast_to(same, (self._step.modes, *same.shape)))
-
-    def _sum(self, factors: FloatArray | BoolArray) -> FloatArray:
-        """(K, K): sum over the steps of phi_a phi_b times a factor (n, K, K) that depends on the graph."""
-        total = np.zeros((len(self._rows),) * 2)
-        for factor, inputs, products in zip(factors, self._regressors, self._inputs, strict=True):
-            total += factor * (inputs @ products @ inputs.T)
-        return total
-
-
-def terms_of(step: StepModel, weights: FloatArray, most: int) -> list[Term]:
-    """Regressors of the residuals, at most so many, with ``weights`` (n, m, m).
+def terms_of(step: StepModel, most: int) -> list[Term]:
+    """Regressors of the residuals, at most so many.
 
     One for every graph and difference x_j - x_i that row i uses, for every graph and leader (x_i - reference), and for
     every agent (1, which finds a wrong reference or offset). Where these are more than ``most``: the whole pull (W_g x
     - x)_i of a row instead of each of its terms; where that is still too many, without distinguishing graphs.
     """
-    n, m = step.modes, step.agents
+    n, m, weights = step.modes, step.agents, step.nominal
     pull, links = weights.sum(axis=2) - 1.0, [mode_links(step, mode) for mode in range(n)]
     leads = np.abs(pull) > WEIGHT_ROUNDING
     terms = [Term("constant", i) for i in range(m)]
@@ -101,36 +53,22 @@ def terms_of(step: StepModel, weights: FloatArray, most: int) -> list[Term]:
     return terms
 
 
-def regressors(step: StepModel, most: int) -> tuple[IntArray, FloatArray, list[Term]]:
-    """Of the states themselves: phi_a(k) = inputs[g, a] . z(k) for row rows[a]; (K,), (n, K, m + 1), ``terms_of``."""
-    n, m = step.modes, step.agents
-    terms, unit = terms_of(step, step.weights, most), np.eye(m + 1)
-    inputs = np.zeros((n, len(terms), m + 1))
-    for a, term in enumerate(terms):
-        modes = slice(None) if term.graph is None else term.graph
-        if term.kind == "pull":
-            inputs[modes, a, :m] = step.weights[modes, term.agent] - unit[term.agent, :m]
-        elif term.kind == "link":
-            inputs[modes, a] = unit[term.sender] - unit[term.agent]
-        else:
-            inputs[modes, a] = unit[m if term.kind == "constant" else term.agent]
-    return np.array([term.agent for term in terms]), inputs, terms
-
-
-class ReceivedRegression:
+class Regression:
     """Score test: residuals do not depend on what the agents received, with the weights it was used with.
 
-    As ``StateRegression``, but row i uses the differences y_j - x_i of the received values, y_j as published, and the
-    covariance of the residuals is that of each step. In real time the agents make a step one after the other, in the
-    order ``position`` (N, m). With correlated noise, a value that is used may contain a part of the noise of the same
-    step; so each residual is first freed of what those made earlier in the step say about it.
+    Row i uses the differences y_j - x_i of the received values, y_j as published. The scores U_a = sum_k e_i(a)(k)
+    phi_a(k) are martingales, and Cov(U_a, U_b) = sum_k (N_k)_i(a)i(b) phi_a phi_b given the inputs, N_k being the
+    covariance of the residuals; so U^T Cov^+ U is chi-square with rank(Cov) degrees of freedom, for any correlation.
+    In real time the agents make a step one after the other, in the order ``position`` (N, m). With correlated noise, a
+    value that is used may contain a part of the noise of the same step; so each residual is first freed of what those
+    made earlier in the step say about it.
     """
 
     def __init__(self, observation: Observation, most: int, position: IntArray | None = None) -> None:
         self._step = step = observation.step
         self._position = position
         self._pull = step.nominal.sum(axis=2) - 1.0  # of the leaders: weight of the own deviation from the reference
-        self.terms = terms_of(step, step.nominal, most)  # (K)
+        self.terms = terms_of(step, most)  # (K)
         self._each = self.terms[-1].kind != "pull"
         # Place of the regressor by graph, receiver and sender; of a leader or a whole pull, by the agent twice.
         self._place = np.full((step.modes, step.agents, step.agents), -1)
@@ -148,7 +86,10 @@ class ReceivedRegression:
         return self._score, self._covariance
 
     def gram(self) -> FloatArray | None:
-        """See ``StateRegression.gram``; None where residuals are freed of earlier ones."""
+        """(K, K): sum of phi_a phi_b of regressors of the same agent; E[U] is that times the coefficients.
+
+        None where residuals are freed of earlier ones.
+        """
         return None if self._position is not None else self._gram
 
     def add(self, reception: ReceivedValues, residuals: FloatArray, first: int = 0) -> None:

@@ -27,7 +27,7 @@ from msg_analysis.inference.received_values import (
     full_reception_noise,
     state_rounding,
 )
-from msg_analysis.inference.regression import MAX_REGRESSORS, ReceivedRegression, StateRegression
+from msg_analysis.inference.regression import MAX_REGRESSORS, Regression
 from msg_analysis.inference.statistics import (
     add_sums,
     chi2_below,
@@ -68,32 +68,24 @@ class ResidualSums:
         follower: WatchedEvidence | None = None,
         most_regressors: int = MAX_REGRESSORS,
     ) -> None:
-        step, noise = observation.step, observation.prediction.experiment.noise
+        step = observation.step
         n, m = step.modes, step.agents
         # (n, m, m) nominal covariances
-        self.noises: FloatArray = full_reception_noise(step) if noise.on_air else step.noise
+        self.noises: FloatArray = full_reception_noise(step)
         self.floor = (DIGITS * state_rounding(observation.prediction)) ** 2  # variances up to this are rounding
         self.replicas = observation.replicas
         # Number of residuals, replicas counted, and sum of e e^T, by graph.
         self.samples, self.scatter = np.zeros(n, np.int64), np.zeros((n, m, m))
         self.still = np.zeros((n, m), np.int64)  # steps in which no replica of an agent changed
-        self.quiet = self.largest = 0.0  # largest of ``Correlations.excess``; largest |x|
-        self._directions = [Correlations(matrix, self.floor) for matrix in self.noises]
-        self._whiteners = [each.whitener() for each in self._directions]
+        self.largest = 0.0  # |x|
+        self._whiteners = [Correlations(matrix, self.floor).whitener() for matrix in self.noises]
         # Graphs may differ in the number of noisy directions; the strongest ones that all graphs have are iid N(0, I).
         self._whiteness = WhitenessSums(min(len(whitener) for whitener in self._whiteners))
         self._repeated = RepeatedNoise.of(observation)
         # False where residuals depend on each other in a way that is not followed here.
         self.independent = self._repeated is None or not _correlated(step)
-        varies = self._repeated is not None or (step.loss > 0.0 and noise.link > 0.0)
-        if observation.timers and not varies:
-            varies = bool((step.noise_gain != step.noise_gain[0]).any())
-        self._equalizer = Equalizer(step, self.noises, self.floor) if varies else None
-        regression: StateRegression | ReceivedRegression = (
-            ReceivedRegression(observation, most_regressors, position if _correlated(step) else None)
-            if noise.steps_only or observation.timers
-            else StateRegression(observation, most_regressors)
-        )
+        self._equalizer = Equalizer(step, self.noises, self.floor)
+        regression = Regression(observation, most_regressors, position if _correlated(step) else None)
         if self.independent:
             self._add(observation, regression, follower)
         elif follower:
@@ -105,7 +97,7 @@ class ResidualSums:
         rounded = np.asarray(((noises > 0.0) & (noises <= self.floor)).any(axis=0))
         told = ~rounded[[term.agent for term in self.terms]]  # not of agents whose noise is rounding
         self.score, self.covariance = score * told, covariance * np.outer(told, told)  # (K,), (K, K)
-        self.gram = regression.gram()  # (K, K), see ``StateRegression.gram``; None where it is not available
+        self.gram = regression.gram()  # (K, K), see ``Regression.gram``; None where it is not available
 
     @property
     def steps(self) -> IntArray:
@@ -115,10 +107,9 @@ class ResidualSums:
     def merge(self, other: ResidualSums) -> None:
         """Add the sums of another run of the same experiment, with another seed."""
         add_sums(self, other, "samples", "scatter", "still", "score", "covariance")
-        self.quiet, self.largest = max(self.quiet, other.quiet), max(self.largest, other.largest)
+        self.largest = max(self.largest, other.largest)
         self._whiteness.merge(other._whiteness)
-        if self._equalizer and other._equalizer:
-            self._equalizer.merge(other._equalizer)
+        self._equalizer.merge(other._equalizer)
         self.gram = None if self.gram is None or other.gram is None else self.gram + other.gram
 
     def tests(self) -> ResidualTests:
@@ -127,12 +118,12 @@ class ResidualSums:
             return ResidualTests()
         ratios: tuple[float, ...] | None = None
         p_whiteness = self._whiteness.p_value()
-        if self._equalizer and not self._equalizer.possible:
+        if not self._equalizer.possible:
             chi2, dof, p_whiteness = self._equalizer.chi2, self._equalizer.dof, None  # two-sided, of the total size
             p_covariance = min(1.0, 2.0 * float(min(chi2_tail(chi2, dof), chi2_below(chi2, dof)))) if dof else None
         else:
             p_covariance, ratios = self._covariance_p(), self._ratios()
-        if self.quiet > 1.0:
+        if self._equalizer.quiet > 1.0:
             p_covariance = 0.0
         chi2, dof = quadratic_form(self.score, self.covariance)
         p_gain = float(chi2_tail(chi2, dof)) if dof else None
@@ -156,40 +147,25 @@ class ResidualSums:
         weights = np.divide(weights, size, out=np.zeros_like(weights), where=size > self.floor)
         return direction_p(weights, self.score, self.covariance)
 
-    def _add(
-        self,
-        observation: Observation,
-        regression: StateRegression | ReceivedRegression,
-        follower: WatchedEvidence | None,
-    ) -> None:
+    def _add(self, observation: Observation, regression: Regression, follower: WatchedEvidence | None) -> None:
         """One pass over the run."""
         m = observation.step.agents
         numbers = max(observation.states[0].size, regression.numbers_per_step)
         if follower:
             numbers = max(numbers, follower.sums.numbers_per_step)
         for first, last in observation.blocks(numbers, "residuals"):
-            modes = observation.modes[first:last]
-            if isinstance(regression, ReceivedRegression):
-                reception = ReceivedValues.of(observation, first, last)
-                e = residuals(observation, first, last, reception)
-                if follower:
-                    follower.add(observation, first, last, (reception, e))
-                if self._repeated:
-                    e, reception = self._repeated.free(first, e, reception)
-                regression.add(reception, e, first)
-                if self._equalizer:
-                    e = self._equalizer.equalize(e, reception)
-                    self.quiet = max(self.quiet, self._equalizer.quiet)
-            else:
-                e = residuals(observation, first, last)
-                if follower:
-                    follower.add(observation, first, last, (ReceivedValues.of(observation, first, last), e))
-                regression.add(modes, observation.states[first:last], e)
+            modes, reception = observation.modes[first:last], ReceivedValues.of(observation, first, last)
+            e = residuals(observation, first, last, reception)
+            if follower:
+                follower.add(observation, first, last, (reception, e))
+            if self._repeated:
+                e, reception = self._repeated.free(first, e, reception)
+            regression.add(reception, e, first)
+            e = self._equalizer.equalize(e, reception)
             states = observation.states[first : last + 1]
             self.largest = max(self.largest, float(np.abs(states[:-1]).max()))
             unmoved = (states[1:] == states[:-1]).all(axis=2)
             white = np.empty((last - first, self._whiteness.rank, observation.replicas))
-            sizes = np.abs(observation.states[first:last]).max(axis=2)
             for mode, whitener in enumerate(self._whiteners):
                 at = np.flatnonzero(modes == mode)
                 if not at.size:
@@ -198,9 +174,6 @@ class ResidualSums:
                 self.samples[mode] += flat.shape[1]
                 self.scatter[mode] += flat @ flat.T
                 self.still[mode] += unmoved[at].sum(axis=0)
-                if not self._equalizer:
-                    terms = sizes[at] @ np.abs(observation.step.nominal[mode]).T
-                    self.quiet = max(self.quiet, self._directions[mode].excess(e[at], terms))
                 white[at] = whitener[: self._whiteness.rank] @ e[at]
             self._whiteness.add(white)
 
@@ -220,16 +193,9 @@ class ResidualSums:
 
 
 def residuals(observation: Observation, first: int, last: int, reception: ReceivedValues | None = None) -> FloatArray:
-    """(last - first, m, R): residuals e(k) of steps first..last-1; without ``reception``, states were received."""
-    step, now = observation.step, observation.states[first:last]
-    if reception is not None:
-        return received_residuals(step, reception, observation.states[first + 1 : last + 1])
-    centre, offsets = _centred(step, now)
-    now, after = now - centre, observation.states[first + 1 : last + 1] - centre
-    for mode in range(step.modes):
-        at = np.flatnonzero(observation.modes[first:last] == mode)
-        after[at] -= step.weights[mode] @ now[at] + offsets[mode][:, None]
-    return np.asarray(after)
+    """(last - first, m, R): residuals e(k) of steps first..last-1; ``reception``: in these, where it is known."""
+    reception = reception or ReceivedValues.of(observation, first, last)
+    return received_residuals(observation.step, reception, observation.states[first + 1 : last + 1])
 
 
 def _centred(step: StepModel, now: FloatArray) -> tuple[FloatArray | float, FloatArray]:

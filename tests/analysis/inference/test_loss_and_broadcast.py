@@ -13,7 +13,7 @@ from msg_analysis.inference.counts import loss_test
 from msg_analysis.inference.estimates import covariance_test
 from msg_analysis.inference.given_path import means_given_path
 from msg_analysis.inference.received_values import ReceivedValues
-from msg_analysis.inference.regression import ReceivedRegression
+from msg_analysis.inference.regression import Regression
 from msg_analysis.inference.residuals import BroadcastSums, ResidualSums, residuals
 
 AIR = {"broadcast": 0.3, "link": 0.2, "loss": 0.2}
@@ -67,7 +67,7 @@ def test_regression_against_a_loop(most):
     """Each difference of each graph; the pull of each agent in each graph; in both graphs together."""
     what = CASES["correlated"]
     observation, trajectory, weights = observed(what), simulate(what), nominal(what)
-    regression = ReceivedRegression(observation, most)
+    regression = Regression(observation, most)
     for first, last in ((0, 150), (150, 400)):
         reception = ReceivedValues.of(observation, first, last)
         regression.add(reception, residuals(observation, first, last, reception))

@@ -15,7 +15,7 @@ from msg_analysis.common.text import percent
 from msg_analysis.errors import InputError
 from msg_analysis.inference.event_order import order_events
 from msg_analysis.inference.received_values import ReceivedValues, process_noise
-from msg_analysis.inference.regression import ReceivedRegression
+from msg_analysis.inference.regression import Regression
 from msg_analysis.inference.residuals import ResidualSums, residuals
 from msg_analysis.inference.timing import measure_timing
 from msg_analysis.model.step_model import phases
@@ -67,20 +67,12 @@ def test_timing_does_not_change_what_is_tested_of_the_noise(case):
     assert late.p_whiteness == pytest.approx(on_time.p_whiteness)
 
 
-def test_lockstep_is_the_same_with_or_without_a_log_of_it():
-    """A log that says that all of step k was used gives what is tested in lockstep."""
-    observation = observed(real_time({"process": CORRELATED}, pace="lockstep"))
-    found, plain = (dataclasses.asdict(ResidualSums(one).tests()) for one in (observation.as_timed(), observation))
-    assert found.pop("ratios") == pytest.approx(plain.pop("ratios"), rel=1e-6)
-    assert found == pytest.approx(plain, rel=1e-6)
-
-
 def test_regression_frees_innovations_of_those_made_before():
     """Against a loop: within a step, each less its regression on those that were made earlier."""
     what = CASES["noise by graph"]
     observation = observed(late_timers.run(what, **LATENESS))
     position, timers, step = order_events(observation).position, observation.timers, observation.step
-    regression = ReceivedRegression(observation, 400, position)
+    regression = Regression(observation, 400, position)
     for first, last in ((0, 150), (150, 400)):
         reception = ReceivedValues.of(observation, first, last)
         regression.add(reception, residuals(observation, first, last, reception), first)
