@@ -66,7 +66,7 @@ def variance_evidence(
     known = variance_constant(samples) if constant is None else constant
     strengths, near = (_first(each, max(half.ndim, s.ndim)) for each in (_STRENGTHS, _NEAR))
     # (a + n/2) log(b / (b + s)) instead of two large terms that cancel.
-    return _to_back(known - (strengths + half) * np.log1p(s / near) + s)
+    return np.moveaxis(known - (strengths + half) * np.log1p(s / near) + s, 0, -1)
 
 
 def variance_constant(samples: FloatArray | IntArray) -> FloatArray:
@@ -81,11 +81,6 @@ def _first(alternatives: FloatArray, dimensions: int) -> FloatArray:
     return alternatives.reshape(-1, *(1,) * dimensions)
 
 
-def _to_back(found: FloatArray) -> FloatArray:
-    """(..., K) of (K, ...); numpy's ``moveaxis`` takes ten times as long."""
-    return found.transpose(*range(1, found.ndim), 0)
-
-
 def coefficient_evidence(score: FloatArray, information: FloatArray) -> FloatArray:
     """(..., K) for each tau of ``SHARES``, against coefficient 0 of a regressor of normal samples of known variance.
 
@@ -95,7 +90,7 @@ def coefficient_evidence(score: FloatArray, information: FloatArray) -> FloatArr
     u, j = np.asarray(score), np.asarray(information)
     tau2 = _first(np.array(SHARES) ** 2, max(u.ndim, j.ndim))
     spread = 1.0 + tau2 * j
-    return _to_back(0.5 * (tau2 * u**2 / spread - np.log(spread)))
+    return np.moveaxis(0.5 * (tau2 * u**2 / spread - np.log(spread)), 0, -1)
 
 
 def row_evidence(counts: FloatArray | IntArray, law: FloatArray) -> FloatArray:
@@ -120,30 +115,17 @@ def row_evidence(counts: FloatArray | IntArray, law: FloatArray) -> FloatArray:
     return found
 
 
-def proportion_evidence(
-    successes: IntArray, trials: IntArray, probability: FloatArray | float, constant: FloatArray | None = None
-) -> FloatArray:
+def proportion_evidence(successes: IntArray, trials: IntArray, probability: FloatArray | float) -> FloatArray:
     """(..., K) for each of ``PROPORTION_STRENGTHS``, against a known probability p (...) of independent successes.
 
     log of B(a + s, b + t - s) / (B(a, b) p^s (1 - p)^(t - s)) for s of t (...), the mixture over probabilities ~
-    beta(a, b) of mean p. ``constant``: ``proportion_constant(probability)``, where it is known.
+    beta(a, b) of mean p.
     """
     p = np.asarray(probability, dtype=float)[..., None]
     hit, miss = np.asarray(successes)[..., None], (np.asarray(trials) - np.asarray(successes))[..., None]
-    a, b = _beta_law(p)
-    known = proportion_constant(probability) if constant is None else constant
-    return np.asarray(betaln(a + hit, b + miss) - known - hit * np.log(p) - miss * np.log1p(-p))
-
-
-def proportion_constant(probability: FloatArray | float) -> FloatArray:
-    """(..., K): log B(a, b), what ``proportion_evidence`` has of the probabilities (..., ) alone."""
-    return np.asarray(betaln(*_beta_law(np.asarray(probability, dtype=float)[..., None])))
-
-
-def _beta_law(p: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Its numbers a (K,) and b (..., K), for probabilities (..., 1)."""
-    strength = np.array(PROPORTION_STRENGTHS)
-    return strength, strength * (1.0 - p) / p
+    a = np.array(PROPORTION_STRENGTHS)
+    b = a * (1.0 - p) / p
+    return np.asarray(betaln(a + hit, b + miss) - betaln(a, b) - hit * np.log(p) - miss * np.log1p(-p))
 
 
 def log_mean(logarithms: FloatArray, axis: int = 0) -> FloatArray:
@@ -152,10 +134,8 @@ def log_mean(logarithms: FloatArray, axis: int = 0) -> FloatArray:
 
 
 def log_means(parts: Sequence[FloatArray]) -> FloatArray:
-    """(T, P): logs of the means of P parts (T, ...), each over all but its first axis, none empty; all in one go."""
-    sizes = np.array([part[0].size for part in parts])
-    joined = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1)
-    return np.asarray(log_sums(joined.T, np.cumsum(sizes) - sizes).T - np.log(sizes))
+    """(T, P): logs of the means of P parts (T, ...), each over all but its first axis, none empty."""
+    return np.stack([log_mean(part.reshape(len(part), -1), axis=1) for part in parts], axis=1)
 
 
 def log_sums(logarithms: FloatArray, begins: IntArray) -> FloatArray:

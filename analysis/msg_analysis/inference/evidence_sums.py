@@ -34,8 +34,6 @@ from msg_analysis.model.reception import neighbour_tables
 from msg_analysis.theory.prediction import Prediction
 
 MOST_PAIRS = 5_000  # of agents whose noises are compared; beyond, none are
-FARTHEST = 1e4
-"""Standard deviations of the noise: the squares of larger numbers, 1e8, would lose more than 8 of 16 digits."""
 
 
 class EvidenceSums:
@@ -61,8 +59,6 @@ class EvidenceSums:
         # In real time a value that is used may contain a part of the noise of the same step.
         usable = noisy if not (real_time and correlated) else np.zeros(m, dtype=bool)
         pull = np.abs(step.nominal.sum(axis=2) - 1.0).max(axis=0) > PULLED
-        self._pulled = pull
-        self._quadratic = self.plain and bool((variances > self._floor).all())
         first, second = np.triu_indices(m, 1)
         paired = usable[first] & usable[second] & (len(first) <= MOST_PAIRS) & (not correlated)
         independent_losses = step.burst is None and not real_time
@@ -105,17 +101,11 @@ class EvidenceSums:
         analyses = analyses or Analyses(np.array([last - first]))
         # One analysis needs no copies of what may be large.
         parts = self.total if analyses.count == 1 else self._zeros(analyses.count)
-        found: dict[str, FloatArray] = {}
-        quadratic = self._quadratic and self._near(observation.states[first : last + 1])
-        if quadratic:
-            self._add_quadratic(parts, analyses, observation, first, last)
-        if self.diagnostics or not quadratic:
-            block = self._block(parts, analyses, observation, first, last, received)
-            if not quadratic:
-                lost = None if observation.lost is None else observation.lost[first:last]
-                decided = np.arange(first, last) >= self._noise.sure_messages
-                self._add_received(parts, analyses, block.reception, block.white, block.scale, lost, decided)
-            found = {each.name: each.add(block) for each in self.diagnostics}
+        block = self._block(parts, analyses, observation, first, last, received)
+        lost = None if observation.lost is None else observation.lost[first:last]
+        decided = np.arange(first, last) >= self._noise.sure_messages
+        self._add_received(parts, analyses, block.reception, block.white, block.scale, lost, decided)
+        found = {each.name: each.add(block) for each in self.diagnostics}
         graphs = observation.modes[first : last + 1]
         now, following = graphs[:-1], graphs[1:]
         self.add_transitions(now, following, parts, analyses.after(np.arange(len(now))))
@@ -162,61 +152,6 @@ class EvidenceSums:
         analyses = Analyses(np.array([len(e)]))
         scale = self._scales(self.total, analyses, reception, e)
         self._add_received(self.total, analyses, reception, e / scale[:, :, None], scale, lost, decided)
-
-    def _near(self, states: FloatArray) -> bool:
-        """Whether states are so near to each other, or to the reference, that squares lose nothing that counts."""
-        centre = self._step.reference if self._pulled.any() else states.mean(axis=1, keepdims=True)
-        smallest = math.sqrt(float(np.diagonal(self._process, axis1=1, axis2=2).min()))
-        return float(np.abs(states - centre).max()) <= FARTHEST * smallest
-
-    def _add_quadratic(
-        self, parts: RunningSums, analyses: Analyses, observation: Observation, first: int, last: int
-    ) -> None:
-        """Noise, gains and pairs where all agents receive the states themselves, and all have noise.
-
-        Every sum is then a quadratic form in z = (x(k) - c, x(k+1) - c, 1), so that for each graph the sum of z z^T is
-        enough; c, the reference or the mean of x(k), keeps the numbers small.
-        """
-        step, m = self._step, self._step.agents
-        states, modes = observation.states[first : last + 1], observation.modes[first:last]
-        pull = step.nominal.sum(axis=2) - 1.0  # (n, m)
-        pulled = bool(self._pulled.any())
-        parts.samples += observation.replicas * analyses.lengths[:, None]
-        diagonal = np.arange(m)
-        for mode in np.unique(modes).tolist():
-            at = np.flatnonzero(modes == mode)
-            now, after = states[at], states[at + 1]
-            centre = step.reference if pulled else now.mean(axis=1, keepdims=True)
-            z = np.ones((2 * m + 1, len(at), observation.replicas))
-            z[:m], z[m:-1] = (now - centre).transpose(1, 0, 2), (after - centre).transpose(1, 0, 2)
-            flat = z.reshape(2 * m + 1, -1)
-            bounds = np.searchsorted(at, np.append(0, analyses.ends)) * observation.replicas
-            there = np.flatnonzero(np.diff(bounds))  # analyses before which steps have this graph
-            between = [flat[:, bounds[analysis] : bounds[analysis + 1]] for analysis in there.tolist()]
-            gram = np.array([each @ each.T for each in between])
-            deviation = np.sqrt(np.diagonal(self._process[mode]))[:, None]
-            # White residuals and the effects of links, as rows that are multiplied with z.
-            offset = step.offsets[mode] + (pull[mode] * step.reference if pulled else 0.0)
-            white = np.column_stack([-step.nominal[mode], np.eye(m), -offset]) / deviation
-            weights = step.nominal[mode] * ~np.eye(m, dtype=bool) / deviation
-            own = pull[mode] / deviation[:, 0] if pulled else np.zeros(m)
-            seen, now_now = white @ gram, gram[:, :m, :m]
-            products, size = seen @ white.T, now_now[:, diagonal, diagonal]
-            seen, squares = seen[:, :, :m], products[:, diagonal, diagonal]
-            parts.squares[there] += squares
-            score = weights * (seen - seen[:, diagonal, diagonal, None])
-            score[:, diagonal, diagonal] += own * seen[:, diagonal, diagonal]
-            information = weights**2 * (size[:, None, :] + size[:, :, None] - 2.0 * now_now)
-            information[:, diagonal, diagonal] += own**2 * size
-            parts.link_score[there] += score
-            parts.link_information[there] += information
-            if len(self._law.pairs):
-                parts.pair_score[there] += products
-                parts.pair_information[there] += squares[:, None, :]
-            if self._law.apart:
-                common = weights + np.diag(own - weights.sum(axis=1))
-                parts.common_score[there] += (common * seen).sum(axis=(1, 2))
-                parts.common_information[there] += ((common @ now_now) * common).sum(axis=(1, 2))
 
     def _block(
         self,

@@ -17,20 +17,8 @@ from msg_analysis.common.arrays import AnyArray, FloatArray, IntArray
 from msg_analysis.experiment.markov_chain import MarkovChain, stationary_law
 from msg_analysis.inference.candidates import Cause, Rate, find_rates, numbers_text
 from msg_analysis.inference.counts import likelihood_ratio
-from msg_analysis.inference.e_values import (
-    proportion_constant,
-    proportion_evidence,
-    row_evidence,
-)
-from msg_analysis.inference.question import (
-    Block,
-    Finding,
-    Law,
-    Question,
-    RunningSums,
-    Search,
-    SummedDiagnostic,
-)
+from msg_analysis.inference.e_values import proportion_evidence, row_evidence
+from msg_analysis.inference.question import Block, Finding, Law, Question, RunningSums, Search, SummedDiagnostic
 from msg_analysis.inference.statistics import binomial_interval, log_chi2_tail
 
 
@@ -137,7 +125,6 @@ class HoldingTimes(SummedDiagnostic):
         self._left = np.flatnonzero((self._leaving > 0.0) & (self._leaving < 1.0))  # graphs that are asked about
         self._edges = [_edges(float(p)) for p in self._leaving]  # ages at which the parts 1, 2, ... begin
         self.sums = list(np.zeros((2, law.step.modes, PARTS), np.int64))  # steps, and those that left their graph
-        self._known = proportion_constant(self._leaving[self._left, None])  # (G, 1, K)
         self._age = 0  # of the holding time at the step that comes next
 
     def between(self, block: Block) -> list[AnyArray]:
@@ -196,7 +183,7 @@ class HoldingTimes(SummedDiagnostic):
             np.concatenate([each.reshape(*each.shape[:-1], -1, joined).sum(axis=-1) for joined in JOINED], axis=-1)
             for each in (counts[..., self._left, :] for counts in sums)
         )  # (..., G, 8 + 4 + 2)
-        each = proportion_evidence(left, steps, self._leaving[self._left, None], self._known)
+        each = proportion_evidence(left, steps, self._leaving[self._left, None])
         ends = np.cumsum([PARTS // joined for joined in JOINED])
         parts = np.concatenate([group.sum(axis=-2) for group in np.split(each, ends[:-1], axis=-2)], axis=-1)
         return np.concatenate([parts, parts.sum(axis=-2, keepdims=True)], axis=-2)

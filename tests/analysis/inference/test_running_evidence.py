@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import Experiment, Observation, Run, compare, five, new_record, observed, predict, simulate
+from experiments import Experiment, Observation, Run, compare, five, new_record, predict, simulate
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.online_errors import (
@@ -144,27 +144,3 @@ def test_when_a_run_may_end() -> None:
     assert words == "evidence against the prediction passed 100 at step 1000"
     assert precision_words(report(0.11)) == "precision 5.5 % at step 1000"
     assert precision_words(report(None)) == "the precision is not known"
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {"problem": "tracking", "leaders": {"agents": [2, 4], "gain": 1.5, "reference": 1e6}},
-        {"run": {"start": "zero", "replicas": 1}},
-        {"time": "discrete", "switching": {"transition": [[0.9, 0.1], [0.2, 0.8]]}, "run": {"dt": 1.0}},
-    ],
-    ids=["consensus", "tracking", "one replica", "discrete"],
-)
-def test_quadratic_forms_are_the_sums_by_what_was_heard(changes: dict[str, Any]) -> None:
-    """The sums of runs in which all agents hear the states themselves, in both ways."""
-    observation = observed(two_replicas(**changes))
-    fast, slow = (EvidenceSums(observation.prediction, observation.replicas) for _ in range(2))
-    assert fast._quadratic
-    slow._quadratic = False
-    for sums in (fast, slow):
-        sums.add(observation, 0, 37)
-        sums.add(observation, 37, observation.steps)
-    for kind, logarithms in slow.families().items():
-        assert fast.families()[kind] == pytest.approx(logarithms, rel=1e-7, abs=1e-7), kind
-    assert fast.evidence() == pytest.approx(slow.evidence(), abs=1e-7)
