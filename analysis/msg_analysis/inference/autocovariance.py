@@ -22,8 +22,8 @@ import numpy as np
 
 from msg_analysis.common.arrays import SMALL_BLOCK, FloatArray, IntArray
 from msg_analysis.common.text import HALF_WIDTH_95
-from msg_analysis.inference.given_path import steps_of_path
-from msg_analysis.inference.observation import Observation
+from msg_analysis.inference.given_path import moments_of_path, steps_of_path
+from msg_analysis.inference.observation import Observation, deviations
 from msg_analysis.inference.statistics import chi2_tail, quadratic_form
 from msg_analysis.inference.time_means import without_rounding
 from msg_analysis.theory.spectrum import Spectrum, spectrum
@@ -88,13 +88,9 @@ class LoggedDensity:
         """Mean over windows of a sixteenth of the run, which overlap by a half."""
         from scipy.signal import welch  # here, since it takes long to import
 
-        deviations = observation.states - observation.step.reference
-        if observation.prediction.experiment.problem == "consensus":
-            deviations = deviations - deviations.mean(axis=1, keepdims=True)
-        window = max(8, min(len(deviations) // 16, MOST_WINDOW))
-        frequencies, found = welch(
-            deviations, fs=1.0 / observation.step.dt, nperseg=min(window, len(deviations)), detrend=False, axis=0
-        )
+        found = deviations(observation.states, observation.prediction.experiment)
+        window = min(max(8, min(len(found) // 16, MOST_WINDOW)), len(found))
+        frequencies, found = welch(found, fs=1.0 / observation.step.dt, nperseg=window, detrend=False, axis=0)
         return cls(frequencies, found.sum(axis=1).mean(axis=1))
 
 
@@ -153,7 +149,9 @@ def logged_autocovariance(
         form = window if product is None else product @ window
         forms[: len(window), :, place] = (form + form.transpose(0, 2, 1)) / 2.0
         measured[place] = (seen[: len(window)] * y[lag:]).sum() / replicas
-    moments = _moments(which, matrices, noise, y[0].T @ y[0] / replicas)
+    moments = np.empty((steps + 1, d, d))
+    for kept, moment in zip(moments, moments_of_path(which, matrices, noise, y[0].T @ y[0] / replicas), strict=True):
+        kept[:] = moment
     expected = np.einsum("kalb,kab->l", forms, moments)
     felt = np.zeros_like(left)  # a_j + 1: at first what enters it
     for place, lag in enumerate(chosen.tolist()):
@@ -176,9 +174,9 @@ def logged_autocovariance(
 def _coordinates(observation: Observation, first: int, steps: int) -> tuple[FloatArray, FloatArray | None]:
     """(N + 1, R, d) y from a step on, and (d, d) C^T C of the errors e = C y; None where that is the identity."""
     system, delay = observation.prediction.system, observation.step.delay
-    deviations = observation.states[: first + steps + 1] - observation.step.reference
+    away = observation.states[: first + steps + 1] - observation.step.reference
     times = np.arange(first, first + steps + 1)[:, None] - np.arange(delay + 1)
-    stacked = deviations[np.maximum(times, 0)]  # (N + 1, delay + 1, m, R): what was before the start is as the start
+    stacked = away[np.maximum(times, 0)]  # (N + 1, delay + 1, m, R): what was before the start is as the start
     y = np.einsum("ksr,sd->krd", stacked.reshape(steps + 1, -1, observation.replicas), system.lift)
     product = None if system.readout is None else system.readout.T @ system.readout
     return without_rounding(y, system, observation.largest), product
@@ -209,20 +207,6 @@ def _windows(along: FloatArray, lag: int) -> FloatArray:
         late[:, -1 - place] = late[:, -place] @ parts[:, -1 - place]
     products = (early[1:] @ late[:-1]).reshape(-1, d, d)
     return np.asarray(products[: steps - lag + 1])
-
-
-def _moments(which: IntArray, matrices: FloatArray, noise: FloatArray, start: FloatArray) -> FloatArray:
-    """(N + 1, d, d) M(0..N) given the path."""
-    found = np.empty((len(which) + 1, *start.shape))
-    found[0] = start
-    room = np.empty_like(start)
-    steps = [(matrix, matrix.T, added) for matrix, added in zip(matrices, noise, strict=True)]
-    for kind, before, after in zip(which.tolist(), found, found[1:], strict=False):
-        matrix, transposed, added = steps[kind]
-        matrix.dot(before, out=room)
-        room.dot(transposed, out=after)
-        after += added
-    return found
 
 
 def _covariance(

@@ -15,7 +15,6 @@ from scipy import special
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.markov_chain import stationary_law
 from msg_analysis.inference.observation import Measurement, Observation
-from msg_analysis.inference.received_values import mode_links
 from msg_analysis.inference.statistics import add_sums, chi2_quantile, chi2_tail
 from msg_analysis.model.reception import neighbour_tables
 
@@ -171,7 +170,7 @@ class LossTally:
         # Correlation of the losses of two successive messages of a link.
         self.persistence = after_lost - after_kept
         self._bursts = step.burst is not None
-        self._products = observation.timers is None if isinstance(observation, Observation) else True
+        self._products = observation.timers is None
         self.messages, self.lost = np.zeros(links, np.int64), np.zeros(links, np.int64)
         self.repeated = np.zeros(links, np.int64)  # in real time: uses of a message that was used before
         # Of messages after a lost one, after one that was not, and without one just before: chance, number, lost ones.
@@ -180,21 +179,16 @@ class LossTally:
         # Sums of products of standardised losses, of successive messages of a link and of pairs in one step: number of
         # products, and how many are expected to be of two rare events.
         self._successive, self._same_step = np.zeros(3), np.zeros(3)
-        numbers = np.cumsum(step.listens().ravel()).reshape(step.agents, step.agents) - 1
-        graphs = []
-        for mode in range(step.modes):
-            receiver, sender, which = mode_links(step, mode)
-            graphs.append((numbers[receiver, sender], receiver, which))
         before = np.zeros((1, links), np.bool_), np.zeros((1, links), np.bool_)
         for first, last in observation.blocks(4 * links, "loss"):
-            before = self._add(*_block(observation, graphs, links, first, last), before)
+            before = self._add(*_uses(observation, links, first, last), before)
 
     @classmethod
     def of(cls, observation: Observation | Measurement) -> LossTally | None:
         """Tally of a run; None where no message can be lost, or no loss was logged."""
         if not observation.step.loss:
             return None
-        if isinstance(observation, Observation) and observation.timers is not None:
+        if observation.timers is not None:
             # With the last value received in place of a lost one, the log does not tell lost messages from late ones.
             return None if observation.step.holds or observation.step.burst is not None else cls(observation)
         return cls(observation) if observation.lost is not None else None
@@ -294,44 +288,30 @@ class LossTally:
         return sent[-1:], lost[-1:]
 
 
-def _block(
-    observation: Observation | Measurement,
-    graphs: list[tuple[IntArray, IntArray, IntArray]],
-    links: int,
-    first: int,
-    last: int,
+def _uses(
+    observation: Observation | Measurement, links: int, first: int, last: int
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
     """(b, links) of the steps first..last-1: whether there was a message, whether it was lost, or used before."""
-    if isinstance(observation, Observation) and observation.timers is not None:
-        return _uses(observation, links, first, last)
-    assert observation.lost is not None
-    modes, logged = observation.modes[first:last], observation.lost[first:last]
-    sent, lost = np.zeros((len(modes), links), np.bool_), np.zeros((len(modes), links), np.bool_)
-    for mode, (number, receiver, which) in enumerate(graphs):
-        at = np.flatnonzero(modes == mode)[:, None]
-        sent[at, number] = True
-        lost[at, number] = logged[at, receiver, which]
-    # The message with x(0) is used several times where there is a delay, and never lost where values are held.
-    early = np.arange(first, last) < observation.sure_messages
-    sent[early], lost[early] = False, False
-    return sent, lost, np.zeros_like(sent)
-
-
-def _uses(observation: Observation, links: int, first: int, last: int) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """The same of a run in real time."""
-    # A message that is used again counts again: the share of the lost ones stays right, but not its variance.
-    step, timers = observation.step, observation.timed
-    tables, agents = neighbour_tables(step), np.arange(step.agents)
-    graphs, used = timers.graphs[first:last], timers.used[first:last]
+    # In real time a message that is used again counts again: the share of the lost ones stays right, not its variance.
+    step, timers, agents = observation.step, observation.timers, np.arange(observation.step.agents)
+    tables = neighbour_tables(step)
+    if timers is not None:
+        graphs, used = timers.graphs[first:last], timers.used[first:last]
+    else:
+        assert observation.lost is not None
+        graphs = np.repeat(observation.modes[first:last, None], step.agents, axis=1)
+        used = np.where(observation.lost[first:last], -1, 0)
     numbers = (np.cumsum(step.listens().ravel()) - 1).reshape(step.agents, step.agents)
     number = numbers[agents[:, None], tables.senders[graphs, agents]]
     there = np.arange(step.most_neighbours) < tables.count[graphs, agents][:, :, None]
+    # The message with x(0) is used several times where there is a delay, and never lost where values are held.
     there &= np.arange(first, last)[:, None, None] >= observation.sure_messages
     sent, lost, again = (np.zeros((len(used), links), np.bool_) for _ in range(3))
     k, i, d = np.nonzero(there)
     sent[k, number[k, i, d]] = True
     lost[k, number[k, i, d]] = used[k, i, d] < 0
-    newest = np.full((len(used), links), -1)
-    newest[k, number[k, i, d]] = used[k, i, d]
-    again[1:] = (newest[1:] >= 0) & (newest[1:] == newest[:-1])
+    if timers is not None:
+        newest = np.full((len(used), links), -1)
+        newest[k, number[k, i, d]] = used[k, i, d]
+        again[1:] = (newest[1:] >= 0) & (newest[1:] == newest[:-1])
     return sent, lost, again

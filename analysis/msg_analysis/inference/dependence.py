@@ -308,7 +308,25 @@ ROUNDINGS = 4.0  # of the largest state, in the computation of a state, at most
 EPSILON = float(np.finfo(np.float64).eps)
 
 
-class ConstantState(Diagnostic):
+class SingleEvents(Diagnostic):
+    """A diagnostic of which each event by itself is evidence; ``events``: in a step."""
+
+    def __init__(self, law: Law, events: int, largest: Largest) -> None:
+        super().__init__(law)
+        self.seen = EventEvidence(law.planned * events)
+        self.largest = largest
+
+    def merge(self, other: Self) -> None:
+        """The larger one."""
+        self.seen.merge(other.seen)
+        self.largest.merge(other.largest)
+
+    def logarithms(self) -> FloatArray:
+        """(1, 1)."""
+        return self.seen.logarithms()
+
+
+class ConstantState(SingleEvents):
     """Steps in which no replica of an agent moves; the less probable, the more evidence, of which 1 / it is the p."""
 
     name = "residuals: constant state"
@@ -317,10 +335,9 @@ class ConstantState(Diagnostic):
     kind = "frozen"
 
     def __init__(self, law: Law) -> None:
-        super().__init__(law)
-        self._evidence = EventEvidence(law.planned * len(self.agents))
-        self._since = np.full(len(self.agents), -1)  # first step of what may go on, from 0; -1: moved
-        self._longest = Largest()  # steps of an agent
+        agents = int(law.noisy.sum())
+        super().__init__(law, agents, Largest())  # steps of an agent
+        self._since = np.full(agents, -1)  # first step of what may go on, from 0; -1: moved
 
     def add(self, block: Block) -> FloatArray:
         """Add the steps of a block."""
@@ -337,7 +354,7 @@ class ConstantState(Diagnostic):
         for column in np.unique(which).tolist():
             self._stretches(column, block.first, block.first + at[which == column])
         self._since[~still[-1]] = -1
-        return self._evidence.add(seen, logarithms, analyses.after(at))[:, None, None]
+        return self.seen.add(seen, logarithms, analyses.after(at))[:, None, None]
 
     def _stretches(self, column: int, first: int, steps: IntArray) -> None:
         """The longest stretch of an agent that did not move in ``steps`` from ``first`` on, ascending."""
@@ -347,26 +364,17 @@ class ConstantState(Diagnostic):
             begins[0] = self._since[column]
         longest = int(np.argmax(ends - begins))
         place = Place(int(begins[longest]) + 1, int(ends[longest]) + 1)
-        self._longest.take(place.last - place.first + 1.0, (self.agents[column],), place)
+        self.largest.take(place.last - place.first + 1.0, (self.agents[column],), place)
         self._since[column] = begins[-1]
-
-    def merge(self, other: Self) -> None:
-        """The longer stretch."""
-        self._evidence.merge(other._evidence)
-        self._longest.merge(other._longest)
 
     def finding(self) -> Finding | None:
         """The longest stretch."""
         if not len(self.agents):
             return None
-        log_p, longest = min(0.0, -float(self._evidence.logarithms()[0, 0])), self._longest
+        log_p, longest = min(0.0, -float(self.logarithms()[0, 0])), self.largest
         if not longest.of:
             return Finding(log_p)
         return Finding(log_p, agent=int(longest.of[0]), place=longest.place, estimate=longest.value, expected=0.0)
-
-    def logarithms(self) -> FloatArray:
-        """(1, 1)."""
-        return self._evidence.logarithms()
 
     @classmethod
     def words(cls, found: Finding, names: Sequence[str]) -> str:

@@ -19,6 +19,7 @@ the law over all paths is far from normal; this ratio is not.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -111,24 +112,29 @@ def means_given_path(
     which, matrices, noise = kinds
     y = system.reduced((observation.start - observation.step.reference).T)
     y = without_rounding(y, system, observation.largest)
-    expected = _expected_sum(which, matrices, noise, y.T @ y / len(y)) / steps
+    expected = np.zeros((d, d))
+    for moment in moments_of_path(which[:-1], matrices, noise, y.T @ y / len(y)):
+        expected += moment
+    expected /= steps
     seen, covariance, series, variances = _backwards(observation, kinds, forms, trace)
     return TimeMeans.of(
         (forms, nodes, trace), seen / steps, expected, covariance / steps**2, (series, variances), joint=kind == "joint"
     )
 
 
-def _expected_sum(which: IntArray, matrices: FloatArray, noise: FloatArray, start: FloatArray) -> FloatArray:
-    """(d, d): sum of M(0..N-1)."""
-    moment, total, room = start.copy(), np.zeros_like(start), np.empty_like(start)
+def moments_of_path(
+    which: IntArray, matrices: FloatArray, noise: FloatArray, start: FloatArray
+) -> Iterator[FloatArray]:
+    """(d, d): M(0..N) given the path, each in the place of the one before."""
+    moment, room = start.copy(), np.empty_like(start)
     steps = [(matrix, matrix.T, added) for matrix, added in zip(matrices, noise, strict=True)]
     for kind in which.tolist():
-        total += moment
+        yield moment
         matrix, transposed, added = steps[kind]
         matrix.dot(moment, out=room)  # of small matrices half as long as matmul
         room.dot(transposed, out=moment)
         moment += added
-    return total
+    yield moment
 
 
 def _backwards(

@@ -15,10 +15,9 @@ import numpy as np
 
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.inference.candidates import Cause, Selected, numbers_text
-from msg_analysis.inference.dependence import LagSums, lag_evidence
+from msg_analysis.inference.dependence import LagSums, SingleEvents, lag_evidence
 from msg_analysis.inference.e_values import (
     EndedWindows,
-    EventEvidence,
     WindowEvidence,
     Windows,
     log_mean,
@@ -292,7 +291,7 @@ def _mean_over_lags(evidence: FloatArray) -> FloatArray:
 LARGE = 4.0  # standard deviations; smaller residuals have the evidence 0
 
 
-class LargestResidual(Diagnostic):
+class LargestResidual(SingleEvents):
     """Every residual by itself, N(0, 1) over its standard deviation; the test is that of the largest."""
 
     name = "residuals: largest"
@@ -301,10 +300,8 @@ class LargestResidual(Diagnostic):
     kind = "outlier"
 
     def __init__(self, law: Law) -> None:
-        super().__init__(law)
-        self._evidence = EventEvidence(law.planned * law.replicas * len(self.agents))
+        super().__init__(law, law.replicas * int(law.noisy.sum()), Largest(of=(0, 0.0)))  # agent, signed residual
         self._samples = 0
-        self._largest = Largest(of=(0, 0.0))  # agent, and the residual with its sign
 
     def add(self, block: Block) -> FloatArray:
         """Add the residuals of a block."""
@@ -318,26 +315,21 @@ class LargestResidual(Diagnostic):
         seen, when = analyses.lengths * white[0].size, analyses.after(np.nonzero(large)[0])
         step, column, replica = np.unravel_index(int(np.argmax(sizes)), white.shape)
         at, number = (step, column, replica), block.first + int(step) + 1
-        self._largest.take(float(sizes[at]), (self.agents[column], float(white[at])), Place(number, number))
-        return self._evidence.add(seen, logarithms, when)[:, None, None]
+        self.largest.take(float(sizes[at]), (self.agents[column], float(white[at])), Place(number, number))
+        return self.seen.add(seen, logarithms, when)[:, None, None]
 
     def merge(self, other: Self) -> None:
         """The larger one."""
-        self._evidence.merge(other._evidence)
+        super().merge(other)
         self._samples += other._samples
-        self._largest.merge(other._largest)
 
     def finding(self) -> Finding | None:
         """The largest."""
         if not self._samples:
             return None
-        log_p = math.log(2.0 * self._samples) + float(log_normal_tail(self._largest.value))
-        agent, residual = self._largest.of
-        return Finding(min(0.0, log_p), int(agent), place=self._largest.place, estimate=residual, expected=0.0)
-
-    def logarithms(self) -> FloatArray:
-        """(1, 1)."""
-        return self._evidence.logarithms()
+        log_p = math.log(2.0 * self._samples) + float(log_normal_tail(self.largest.value))
+        agent, residual = self.largest.of
+        return Finding(min(0.0, log_p), int(agent), place=self.largest.place, estimate=residual, expected=0.0)
 
     @classmethod
     def words(cls, found: Finding, names: Sequence[str]) -> str:

@@ -16,6 +16,7 @@ from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, Int
 from msg_analysis.common.resources import tell
 from msg_analysis.common.text import agent_text
 from msg_analysis.errors import InputError
+from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run import Run
 from msg_analysis.model.step_model import StepModel, Wiring
 from msg_analysis.theory.prediction import Prediction
@@ -35,6 +36,7 @@ class Measurement:
     lost: BoolArray | None  # (N, m, D) see ``Run.lost``
     sure_messages: int  # see ``NoiseSpec.sure_messages``
     block_numbers: int = BLOCK_NUMBERS  # see ``Observation.block_numbers``
+    timers: None = None  # in lockstep, or not used
 
     @classmethod
     def of(cls, trajectory: Run, block_numbers: int = BLOCK_NUMBERS) -> Measurement:
@@ -43,12 +45,13 @@ class Measurement:
         series = np.empty(steps)
         numbers = int(trajectory.states[:1].size)
         for begin, end in _blocks(0, steps, numbers, "errors", block_numbers):
-            series[begin:end] = (_deviations(trajectory, begin, end) ** 2).sum(axis=1).mean(axis=1)
+            series[begin:end] = (deviations(trajectory.values[begin:end], experiment) ** 2).sum(axis=1).mean(axis=1)
             trajectory.release()
         first = transient_length(series)
         products = np.zeros((experiment.agents, experiment.agents))
         for begin, end in _blocks(first, steps, numbers, "covariance", block_numbers):
-            flat = _deviations(trajectory, begin, end).transpose(1, 0, 2).reshape(experiment.agents, -1)
+            found = deviations(trajectory.values[begin:end], experiment)
+            flat = found.transpose(1, 0, 2).reshape(experiment.agents, -1)
             products += flat @ flat.T
             trajectory.release()
         lost = trajectory.lost
@@ -97,9 +100,8 @@ def _blocks(first: int, end: int, numbers_per_step: int, what: str, most: int) -
         yield begin, min(begin + length, end)
 
 
-def _deviations(trajectory: Run, first: int, end: int) -> FloatArray:
-    """(end - first, m, R) from the reference, or in consensus from the agents' mean."""
-    experiment, values = trajectory.record.experiment, trajectory.values[first:end]
+def deviations(values: FloatArray, experiment: Experiment) -> FloatArray:
+    """(b, m, R) from the reference, or in consensus from the agents' mean."""
     consensus = experiment.problem == "consensus"
     return np.asarray(values - (values.mean(axis=1, keepdims=True) if consensus else experiment.reference))
 

@@ -17,7 +17,7 @@ from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, Int
 from msg_analysis.common.text import number_text
 from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.inference.estimates import Estimate, beside
-from msg_analysis.inference.observation import bounded
+from msg_analysis.inference.observation import bounded, deviations
 from msg_analysis.inference.online_evidence import AnyTime, ReceivedEvidence, RunningEvidence, needs_log, supports
 from msg_analysis.inference.online_steps import Lateness, LoggedStates, Recent, RecentSteps, StateLog, StepCollector
 from msg_analysis.inference.statistics import RunningBatches, simultaneous_half_width, steps_to_half_width
@@ -224,12 +224,12 @@ class RunningErrors:
         if self._expected is not None:
             known = np.flatnonzero(steps == 0)
             self._expected.add(steps, self._record, int(modes[known[0]]) if len(known) else None)
-        deviations = self._deviations(states)
-        later = self._deviations(after) if self._variances is not None and self._variances.needs_later else deviations
-        squares = (deviations**2).mean(axis=2)
+        here = self._deviations(states)
+        later = self._deviations(after) if self._variances is not None and self._variances.needs_later else here
+        squares = (here**2).mean(axis=2)
         self._squares += squares.sum(axis=0)
         if self._variances is not None:
-            self._variances.add(steps, modes, deviations, later)
+            self._variances.add(steps, modes, here, later)
         return np.asarray(squares.sum(axis=1))
 
     def estimates(self) -> tuple[Estimate, list[Estimate]]:
@@ -252,10 +252,7 @@ class RunningErrors:
 
     def _deviations(self, states: FloatArray) -> FloatArray:
         """(b, m, R): deviations of the agents from the reference, or in consensus from their mean."""
-        values = bounded(states[:, :, : self._replicas])
-        if self._record.experiment.problem == "consensus":
-            return np.asarray(values - values.mean(axis=1, keepdims=True))
-        return np.asarray(values - self._record.experiment.reference)
+        return deviations(bounded(states[:, :, : self._replicas]), self._record.experiment)
 
 
 class _ErrorVariances:
@@ -284,12 +281,12 @@ class _ErrorVariances:
         self._sampled = self._count = 0  # steps used for the nodes, and all
         self._length = max(1, BLOCK_NUMBERS // max(p, agents * replicas))
 
-    def add(self, steps: IntArray, modes: IntArray, deviations: FloatArray, later: FloatArray) -> None:
+    def add(self, steps: IntArray, modes: IntArray, here: FloatArray, later: FloatArray) -> None:
         """Arrays as in ``RunningErrors.add``, with deviations in place of states."""
         self._count += len(steps)
         for first in range(0, len(steps), self._length):
             block = slice(first, first + self._length)
-            a = self._packed(deviations[block])
+            a = self._packed(here[block])
             b = self._packed(later[block]) if self.needs_later else a
             self._add(modes[block], a, b, steps[block] % self._stride == 0)
 
@@ -303,10 +300,10 @@ class _ErrorVariances:
                 some = here & sampled
                 self._squares[1:] += self._sum_squares(mode, self._each, a[some], b[some])
 
-    def _packed(self, deviations: FloatArray) -> FloatArray:
+    def _packed(self, here: FloatArray) -> FloatArray:
         """(b, p + 1): (s, 1) of every step."""
-        self._largest = max(self._largest, float(np.abs(deviations).max(initial=0.0)))
-        packed = packed_moments(deviations, self._system, self._largest)
+        self._largest = max(self._largest, float(np.abs(here).max(initial=0.0)))
+        packed = packed_moments(here, self._system, self._largest)
         return np.concatenate([packed, np.ones((len(packed), 1))], axis=1)
 
     def _sum_squares(self, mode: int, rows: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:

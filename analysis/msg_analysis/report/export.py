@@ -25,6 +25,7 @@ from msg_analysis.common.files import require_place, written_whole
 from msg_analysis.common.resources import pyarrow_problem, require_pyarrow, tell
 from msg_analysis.common.text import agent_name
 from msg_analysis.errors import InputError, NotAvailableError
+from msg_analysis.inference.observation import deviations
 from msg_analysis.model.run import Run
 
 if TYPE_CHECKING:
@@ -132,10 +133,7 @@ _COLUMNS: dict[str, Callable[[Run, int, int], dict[str, Any]]] = {
 
 def square_errors(trajectory: Run, first: int, end: int) -> FloatArray:
     """(end - first, m) mean square over the replicas of the distances from the mean or the reference; NaN: unknown."""
-    experiment = trajectory.record.experiment
-    values = trajectory.values[first:end]
-    middle = values.mean(axis=1, keepdims=True) if experiment.problem == "consensus" else experiment.reference
-    return np.asarray(np.square(values - middle).mean(axis=2))
+    return np.asarray(np.square(deviations(trajectory.values[first:end], trajectory.record.experiment)).mean(axis=2))
 
 
 class _Names:
