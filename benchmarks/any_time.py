@@ -78,7 +78,7 @@ def first_passage(kind: str, duration: float, seed: int) -> float:
     truth = experiment(seed, duration, **(CORRECT | FAULTS)[kind])
     observation = Observation.of(simulate(truth), law(kind, duration))
     looks = np.arange(EVERY, observation.steps + 1, EVERY)
-    logarithms = WatchedEvidence.of(observation, looks).logarithms
+    logarithms = WatchedEvidence(observation, looks).follow(observation).logarithms
     assert logarithms is not None
     passed = np.flatnonzero(logarithms >= -np.log(LEVEL))
     return float(looks[passed[0]]) if len(passed) else np.inf

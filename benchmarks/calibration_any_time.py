@@ -40,7 +40,7 @@ def one_run(job: tuple[str, int], _stopping: Callable[[], bool]) -> dict[str, An
     prediction = _predictions[case]
     seed = 100_000 * (1 + list(CASES).index(case)) + number
     observation = Observation.of(simulate(experiment(seed, DURATION, **CASES[case])), prediction)
-    watched = WatchedEvidence.of(observation, np.arange(EVERY, observation.steps + 1, EVERY))
+    watched = WatchedEvidence(observation, np.arange(EVERY, observation.steps + 1, EVERY)).follow(observation)
     assert watched.steps is not None
     assert watched.logarithms is not None
     passed = np.flatnonzero(watched.logarithms >= -np.log(LEVEL))

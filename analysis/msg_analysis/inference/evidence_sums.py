@@ -294,13 +294,11 @@ class WatchedEvidence:
         self._done = 0
         self._most = max(1, BLOCK_NUMBERS // self.sums.numbers_per_analysis)  # analyses in one pass
 
-    @classmethod
-    def of(cls, observation: Observation, steps: IntArray) -> WatchedEvidence:
-        """Of a run."""
-        watched = cls(observation, steps)
-        for first, last in observation.blocks(watched.sums.numbers_per_step, "evidence"):
-            watched.add(observation, first, last)
-        return watched
+    def follow(self, observation: Observation) -> WatchedEvidence:
+        """Add all steps of the run."""
+        for first, last in observation.blocks(self.sums.numbers_per_step, "evidence"):
+            self.add(observation, first, last)
+        return self
 
     def add(
         self, observation: Observation, first: int, last: int, received: tuple[ReceivedValues, FloatArray] | None = None

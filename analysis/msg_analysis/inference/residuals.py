@@ -89,8 +89,7 @@ class ResidualSums:
         if self.independent:
             self._add(observation, regression, follower)
         elif follower:
-            for first, last in observation.blocks(follower.sums.numbers_per_step, "evidence"):
-                follower.add(observation, first, last)
+            follower.follow(observation)
         self.terms = regression.terms
         score, covariance = regression.statistic()
         noises = np.diagonal(self.noises, axis1=1, axis2=2)

@@ -28,6 +28,7 @@ from bokeh.palettes import interp_palette
 from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray, release
 from msg_analysis.common.text import HALF_WIDTH_95, agent_name
 from msg_analysis.report.comparison_text import TIMES
+from msg_analysis.report.look import column_of
 from msg_analysis.report.plot_style import (
     BLACK,
     BLUE,
@@ -103,8 +104,8 @@ def node_errors(
 ) -> UIElement:
     """Node errors with 95 % intervals next to the predicted ones; marked if p < ``level``; agents can be chosen."""
     agents = np.arange(1, len(nodes) + 1)
-    measured, predicted, error = (_column(nodes, key) for key in ("measured", "predicted", "standard_error"))
-    apart = np.nan_to_num(_column(nodes, "p_adjusted"), nan=1.0) < level
+    measured, predicted, error = (column_of(nodes, key) for key in ("measured", "predicted", "standard_error"))
+    apart = np.nan_to_num(column_of(nodes, "p_adjusted"), nan=1.0) < level
     half = HALF_WIDTH_95 * error
     data = {
         "agent": agents,
@@ -115,8 +116,8 @@ def node_errors(
         "right": agents + 0.32,
         "low": measured - half,
         "high": measured + half,
-        "z": _column(nodes, "z"),
-        "p": _column(nodes, "p_adjusted"),
+        "z": column_of(nodes, "z"),
+        "p": column_of(nodes, "p_adjusted"),
         "colour": np.where(apart, VERMILLION, BLUE),
         "marker": np.where(apart, "square", "circle"),
     }
@@ -164,7 +165,7 @@ def agent_convergence(
     nodes: Sequence[Mapping[str, Any]],
 ) -> UIElement | None:
     """Measured node errors of the chosen agents over time, relative to the predicted ones; None: there are none."""
-    predicted, error = _column(nodes, "predicted"), _column(nodes, "standard_error")
+    predicted, error = column_of(nodes, "predicted"), column_of(nodes, "standard_error")
     if len(states) < 2 or not (np.nan_to_num(predicted) > 0).any():
         return None
     ends = np.unique(np.rint(np.geomspace(1, len(states), _POINTS)).astype(np.int64))
@@ -266,10 +267,6 @@ def histogram(timing: Mapping[str, Any], key: Literal["lateness_ms", "staleness_
         plot.line([period] * 2, [0.0, top], color=BLACK, line_width=1.5, line_dash="dashed", legend_label=name)
         place_legend(plot)
     return plot
-
-
-def _column(rows: Sequence[Mapping[str, Any]], key: str) -> FloatArray:
-    return np.array([entry.get(key) for entry in rows], dtype=float)  # None: nan
 
 
 _NUMBERED = 5  # most agents with which heat maps show numbers

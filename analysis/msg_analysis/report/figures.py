@@ -38,6 +38,7 @@ from msg_analysis.report.look import (
     PALE,
     SKY,
     VERMILLION,
+    column_of,
     shorten,
 )
 from msg_analysis.theory.prediction import Prediction
@@ -207,8 +208,8 @@ def comparison_figure(comparison: Comparison) -> NotebookFigure:
         above.set_title(plain(f"{experiment.name}: {verdict_line(document)}"), loc="left")
         above.legend(loc="upper right", ncols=3, fontsize=8)
         numbers = np.arange(1, len(nodes) + 1)
-        measured, wanted, spread = (_column(nodes, key) for key in ("measured", "predicted", "standard_error"))
-        apart = np.nan_to_num(_column(nodes, "p_adjusted"), nan=1.0) < comparison.level
+        measured, wanted, spread = (column_of(nodes, key) for key in ("measured", "predicted", "standard_error"))
+        apart = np.nan_to_num(column_of(nodes, "p_adjusted"), nan=1.0) < comparison.level
         below.hlines(wanted, numbers - 0.32, numbers + 0.32, color=BLACK, lw=1.5, label="predicted")
         for which, colour, label in ((~apart, BLUE, "measured, 95 % interval"), (apart, VERMILLION, "rejected")):
             if which.any():
@@ -249,10 +250,6 @@ def _name_agents(axes: Axes, experiment: Experiment) -> None:
         turned: dict[str, Any] = {"rotation": 45, "ha": "right"} if sum(map(len, names)) > 70 else {}
         axes.set_xticks(numbers, names, **turned)
     axes.grid(visible=False, axis="x")
-
-
-def _column(rows: Sequence[dict[str, Any]], key: str) -> FloatArray:
-    return np.array([row.get(key) for row in rows], dtype=float)  # None: nan
 
 
 FORMATS = ("png", "svg", "pdf")

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,11 @@ BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
 MODE_COLOURS = ("#64788c", "#77864a", "#93709c", "#7a5c3e", "#4f8a8b", "#a0705a", "#7f8794", "#4b4f57")
 LINE_COLOURS = (BLUE, GREEN, PURPLE, ORANGE, SKY, BLACK, "#8a7d00", "#6a4fb3")  # thin lines on white: no yellow
 INK, DARK_GREY, GREY, LIGHT_GREY, PALE = "#374151", "#4b5563", "#6b7280", "#9ca3af", "#e5e7eb"
+
+
+def column_of(rows: Sequence[Mapping[str, Any]], key: str) -> FloatArray:
+    """(rows,): numbers of documents; NaN where one is None or not there."""
+    return np.array([row.get(key) for row in rows], dtype=float)
 
 
 LABELLED = 40  # most agents whose numbers are shown

@@ -88,7 +88,7 @@ def test_correct_runs_seldom_pass_at_any_time(changes: dict[str, Any]) -> None:
     passed = 0
     for seed in range(40):
         observation = observed(five(seed=100 + seed, duration=25.0, **changes))
-        watched = WatchedEvidence.of(observation, np.arange(5, observation.steps + 1, 5))
+        watched = WatchedEvidence(observation, np.arange(5, observation.steps + 1, 5)).follow(observation)
         passed += bool((watched.logarithms >= np.log(10.0)).any())
     assert passed <= 10
 
@@ -108,7 +108,7 @@ WEAK = {"line": {"arcs": ARCS}, "ring": {"arcs": [*ARCS, [5, 1, 1.0], [1, 5, 1.0
 def test_faults_are_found_and_named(changes: dict[str, Any], words: str) -> None:
     observation = observed(five(duration=600.0, **changes), five(duration=600.0))
     looks = np.arange(100, observation.steps + 1, 100)
-    found = any_time_evidence(WatchedEvidence.of(observation, looks), 0.01)
+    found = any_time_evidence(WatchedEvidence(observation, looks).follow(observation), 0.01)
     assert (found.exceeded, found.crossed is None, found.questions[0][0]) == (True, False, words)
 
 
@@ -157,7 +157,7 @@ def test_many_looks_in_one_pass_are_those_of_a_pass_each(changes: dict[str, Any]
     for first, last in pairwise([0, *looks.tolist()]):
         sums.add(observation, first, last)
         one_by_one.append(sums.evidence())
-    for watched in (WatchedEvidence.of(observation, looks), Evidence.of(observation, 0.01).watched):
+    for watched in (WatchedEvidence(observation, looks).follow(observation), Evidence.of(observation, 0.01).watched):
         np.testing.assert_array_equal(watched.steps, looks)
         np.testing.assert_allclose(watched.logarithms, one_by_one, rtol=1e-9, atol=1e-9)
         for kind, logarithms in sums.families().items():

@@ -71,7 +71,7 @@ def test_regression_against_a_loop(most):
     for first, last in ((0, 150), (150, 400)):
         reception = ReceivedValues.of(observation, first, last)
         regression.add(reception, residuals(observation, first, last, reception))
-    e = residuals(observation, 0, 400, ReceivedValues.of(observation, 0, 400))
+    e = residuals(observation, 0, 400)
     process = what.run.dt * np.array(CORRELATED) @ np.array(CORRELATED).T
     links = [(i, j) for g in (0, 1) for i in range(3) for j in range(3) if j != i and weights[g][i, j]]
     size = {400: 3 + len(links) + 2, 12: 9, 8: 6}[most]

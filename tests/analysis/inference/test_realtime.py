@@ -51,9 +51,9 @@ def test_innovations_are_the_noise_that_was_added(case):
     assert (graphs != trajectory.modes[:, None]).mean() > 0.05
     assert (trajectory.used == -1).any()
     observation = observed(trajectory)
-    found = residuals(observation, 0, 400, ReceivedValues.of(observation, 0, 400))
+    found = residuals(observation, 0, 400)
     np.testing.assert_allclose(found, drawn_noise(what, graphs), atol=1e-12)
-    part = residuals(observation, 120, 130, ReceivedValues.of(observation, 120, 130))
+    part = residuals(observation, 120, 130)
     np.testing.assert_array_equal(part, found[120:130])
 
 
@@ -76,7 +76,7 @@ def test_regression_frees_innovations_of_those_made_before():
     for first, last in ((0, 150), (150, 400)):
         reception = ReceivedValues.of(observation, first, last)
         regression.add(reception, residuals(observation, first, last, reception), first)
-    e = residuals(observation, 0, 400, ReceivedValues.of(observation, 0, 400))
+    e = residuals(observation, 0, 400)
     places = {}
     for g in range(2):
         for i in range(3):
