@@ -22,8 +22,8 @@ from msg_analysis.theory.first_steps import Start
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.solvers import MAX_ITERATIONS, DenseSolver, IterativeSolver
 
-MARGIN = 8.0  # of the estimated effect of rounding, see docs/accuracy.md
-MAX_KEPT = 1_000_000  # numbers of adjoint solutions that a solver keeps, at most
+MARGIN = 8.0  # of the estimated errors, see docs/accuracy.md
+MAX_KEPT = 10_000_000  # numbers of adjoint solutions that a solver keeps, at most
 MAX_BOUNDED = 5_000  # numbers of second moments whose error is bounded: it takes a second solve
 MAX_FALLBACK = 1000  # unknowns up to which equations that do not converge are solved densely
 
@@ -78,7 +78,7 @@ class MomentSolver:
             )
         report = self._solver.report
         assert report is not None
-        self.report = report = replace(report, error=max(report.error, self._rounding(moments)))
+        self.report = report = replace(report, error=max(MARGIN * report.error, self._rounding(moments)))
         # Not ">": NaN must be refused, too.
         if not report.error <= MAX_RELATIVE_ERROR:
             raise InputError(singular_message(f" (rounding may leave a relative error of {report.error:.1e})"))

@@ -14,6 +14,7 @@ from experiments import TRACKING, line_ring, predict
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.markov_chain import stationary_law
 from msg_analysis.theory.jump_system import JumpSystem
+from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.solvers import IterativeSolver
 
 RATES = [1e-8, 1e-4, 1.0, 1e3, 1e6]
@@ -145,6 +146,19 @@ def test_the_claimed_error_covers_the_true_one(claimed_error, steps, decades, le
         assert true <= claimed <= 1e-6, seed
         solved += 1
     assert solved >= least  # of steps with 12 decades, twelve are refused
+
+
+@pytest.mark.parametrize("seed", [111, 153, 265, 320, 359])
+def test_the_claimed_error_covers_what_the_last_correction_leaves(seed):
+    """Rates over eight decades: the correction alone, and the bound of rounding, are less than the true error."""
+    random = np.random.default_rng(seed)
+    rates = 10.0 ** random.uniform(-3, 5, (3, 3)) * (1.0 - np.eye(3))
+    chain = rates - np.diag(rates.sum(axis=1))
+    laplacians = [[[w, -w], [-w, w]] for w in 10.0 ** random.uniform(-2, 3, 3)]
+    drift, noise = np.array(laplacians) + np.diag([5.0, 0.0]), np.stack([np.eye(2)] * 3)
+    solver = MomentSolver(JumpSystem("continuous", drift, noise, chain, stationary_law(chain), np.eye(2)))
+    found = solver.steady().sum(axis=0)
+    assert worst(found, exact(laplacians, [5.0, 0.0], chain.tolist())) <= solver.report.error < 1e-11
 
 
 @pytest.mark.parametrize("seed", range(3))
