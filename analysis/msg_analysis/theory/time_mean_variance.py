@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import scipy.sparse
 
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.errors import InputError
@@ -28,6 +30,7 @@ MAX_WORK = 1e8  # multiplications of a step of T, up to which it is solved for
 SAMPLED = 2e9  # multiplications of the steps that are sampled otherwise
 PATHS, REPLICAS = 32, 8  # that are sampled, for at least so many steps:
 FEWEST = 200
+SPARSE = 0.1  # share of entries that are not 0 below which a matrix is multiplied as a sparse one
 STAGE = 2000.0  # multiplications that take as long as the rest of a stage
 HEAVY = (
     "system error: its time mean has no finite variance, because fourth moments of the states do not exist; lower the "
@@ -89,7 +92,7 @@ def mean_variance(prediction: Prediction, *, most_work: float = MAX_WORK, sample
             return _exact(steps, system, prediction.steady, form, values[0], kappa)
         except InputError:  # the equations of T are too ill-conditioned
             pass
-    return _Sampler(steps, system, prediction.steady).variance(form, values[0], kappa, sampled)
+    return _Sampler(steps, system, prediction.steady).variance(system.output, values[0], kappa, sampled)
 
 
 def _exact(
@@ -157,34 +160,34 @@ def _moments_of_path(steps: RandomSteps, system: JumpSystem, steady: FloatArray)
 
 
 class _Sampler:
-    """Paths of graphs and losses, with replicas of the states y (B, R, d)."""
+    """Paths of graphs and losses, with replicas of the states z (B R, k) that go through the stages."""
 
     def __init__(self, steps: RandomSteps, system: JumpSystem, steady: FloatArray) -> None:
-        self._steps, self._steady, self._rng = steps, steady, np.random.default_rng(0)
+        self._steady, self._rng, self._embedding = steady, np.random.default_rng(0), steps.embedding
         self._chain = system.chain.cumsum(axis=1)
-        self._roots = [[_root(_unheard(one)) for one in stages] for stages in steps.stages]
+        self._stages = [[_Drawn.of(stage) for stage in stages] for stages in steps.stages]
         self._modes = self._rng.choice(system.modes, PATHS, p=system.stationary)
-        self._states = np.empty((PATHS, REPLICAS, system.dimension))
+        self._states = np.empty((PATHS, REPLICAS, len(self._embedding)))
         for mode, at in self._groups():
-            root = _root(steady[mode] / system.stationary[mode])
-            self._states[at] = self._normal(len(at), root.shape[1]) @ root.T
+            root = self._embedding @ _root(steady[mode] / system.stationary[mode])
+            self._states[at] = (self._normal(len(at), root.shape[1]) @ root.T).reshape(len(at), REPLICAS, -1)
 
-    def variance(self, form: FloatArray, values: FloatArray, kappa: FloatArray, work: float) -> MeanVariance:
+    def variance(self, output: FloatArray, values: FloatArray, kappa: FloatArray, work: float) -> MeanVariance:
         """From the means of D^2 over about so many multiplications of steps."""
-        mean = float((self._steady * form).sum())
-        each = max(
-            sum(one.matrix.size + 2.0 * one.into.size + STAGE for one in stages) for stages in self._steps.stages
-        )
+        mean = float((self._steady * (output.T @ output)).sum())
+        output, values = output @ self._embedding.T, self._embedding @ values @ self._embedding.T
+        each = values[0].size + max(sum(stage.work for stage in stages) for stages in self._stages)
         count = max(FEWEST, round(work / (PATHS * REPLICAS * each)))
         found = np.zeros((PATHS, 2))
+        for _ in range(count // 4):  # M becomes stationary: at first it is its mean
+            self._advance()
         value = self._values(values, kappa)
-        for step in range(-(count // 4), count):  # before 0, M becomes stationary: at first it is its mean
-            expected = value - ((self._states @ form) * self._states).sum(axis=-1) + mean
+        for _ in range(count):
+            expected = value - np.square(self._states @ output.T).sum(axis=-1) + mean
             self._advance()
             value = self._values(values, kappa)
-            if step >= 0:
-                within = (value - expected).var(axis=1, ddof=1)
-                found += np.stack([(value - expected).mean(axis=1) ** 2 - within / REPLICAS, within], axis=1)
+            within = (value - expected).var(axis=1, ddof=1)
+            found += np.stack([(value - expected).mean(axis=1) ** 2 - within / REPLICAS, within], axis=1)
         found /= count
         path, replica = found.mean(axis=0).tolist()
         return MeanVariance(max(path, 0.0), replica, found)
@@ -197,35 +200,58 @@ class _Sampler:
         return found
 
     def _advance(self) -> None:
-        embedding, rng = self._steps.embedding, self._rng
         for mode, at in self._groups():
-            z = self._states[at] @ embedding.T
-            for stage, root in zip(self._steps.stages[mode], self._roots[mode], strict=True):
+            z = self._states[at].reshape(len(at) * REPLICAS, -1)
+            for stage in self._stages[mode]:
                 moved = z.copy()
-                moved[..., stage.rows] = z @ stage.matrix.T + self._normal(len(at), root.shape[1]) @ root.T
+                moved[:, stage.rows] = z @ stage.matrix.T + self._normal(len(at), stage.root.shape[1]) @ stage.root.T
                 if len(stage.losses):
-                    arrives = (rng.random((len(at), 1, len(stage.losses))) >= stage.losses).astype(float)
+                    arrives = (self._rng.random((len(at), len(stage.losses))) >= stage.losses).astype(float)
+                    arrives = arrives.repeat(REPLICAS, axis=0)
                     change = (arrives - 1.0 + stage.losses) * (z @ stage.differences.T)
                     if stage.heard:
                         change += math.sqrt(stage.heard) * arrives * self._normal(len(at), len(stage.losses))
                     moved += change @ stage.into
                 z = moved
-            self._states[at] = z @ embedding
-        drawn = rng.random((PATHS, 1))
+            self._states[at] = z.reshape(len(at), REPLICAS, -1)
+        drawn = self._rng.random((PATHS, 1))
         self._modes = np.minimum((drawn >= self._chain[self._modes]).sum(axis=1), len(self._chain) - 1)
 
     def _normal(self, paths: int, size: int) -> FloatArray:
-        return self._rng.standard_normal((paths, REPLICAS, size))
+        """(B R, size) of these paths."""
+        return self._rng.standard_normal((paths * REPLICAS, size))
 
     def _groups(self) -> list[tuple[int, IntArray]]:
         """Every mode that some path is in, and these paths."""
         return [(mode, np.flatnonzero(self._modes == mode)) for mode in np.unique(self._modes).tolist()]
 
 
-def _unheard(stage: Stage) -> FloatArray:
-    """(r, r): covariance of the noise without that in messages that may be lost."""
-    into = stage.into[:, stage.rows]
-    return stage.noise - stage.heard * (into.T * (1.0 - stage.losses)) @ into
+@dataclass(frozen=True, slots=True, eq=False)
+class _Drawn:
+    """A ``Stage`` to be drawn, in sparse matrices where most entries are 0, as those of messages one by one."""
+
+    rows: IntArray
+    matrix: Any
+    root: Any  # (r, s) B with B B^T the covariance of the noise without that in messages that may be lost
+    into: Any
+    differences: Any
+    losses: FloatArray
+    heard: float
+    work: float  # multiplications
+
+    @classmethod
+    def of(cls, stage: Stage) -> _Drawn:
+        """The same."""
+        into = stage.into[:, stage.rows]
+        unheard = stage.noise - stage.heard * (into.T * (1.0 - stage.losses)) @ into
+        parts = [_sparse(part) for part in (stage.matrix, _root(unheard), stage.into, stage.differences)]
+        work = sum(float(part.size) for part in parts) + STAGE  # of a sparse matrix, the entries that are not 0
+        return cls(stage.rows, *parts, stage.losses, stage.heard, work)
+
+
+def _sparse(matrix: FloatArray) -> Any:
+    """The matrix, sparse where that is less work."""
+    return scipy.sparse.csr_array(matrix) if np.count_nonzero(matrix) < SPARSE * matrix.size else matrix
 
 
 def _root(covariance: FloatArray) -> FloatArray:
