@@ -15,6 +15,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.inference.fault_power import FaultPower, fault_powers
 from msg_analysis.inference.statistics import simultaneous_half_width
 from msg_analysis.inference.time_means import expected_switches, few_switches
+from msg_analysis.theory.first_steps import simplification
 from msg_analysis.theory.prediction import Prediction
 from msg_analysis.theory.settling import settling_time
 from msg_analysis.theory.time_mean_variance import MeanVariance, mean_variance
@@ -228,6 +229,8 @@ class RunPlan:
         for steps in sorted({self.prediction.experiment.steps, precision.steps(self.sought, replicas)}):
             if few := few_switches(expected_switches(step, steps)):
                 notes.append(f"a run of {steps} steps {few}: its standard error is not yet that of a long run")
+        if precision.warm_up and (note := simplification(self.prediction.system)):
+            notes.append(note)
         if not precision.any_time:
             notes.append(
                 "with noise, losses or delay of messages and in real time there is no interval that holds at all times"

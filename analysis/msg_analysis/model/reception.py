@@ -22,7 +22,7 @@ from msg_analysis.arithmetic.reproducible import STEPS_PER_BLOCK, Stream, link_n
 from msg_analysis.arithmetic.update_law import Reception, from_payload, to_payload
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.model.step_model import Wiring, phases
+from msg_analysis.model.step_model import Wiring, ahead, turns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,14 +191,6 @@ class Air:
 Array = TypeVar("Array", bound=AnyArray)
 
 
-def ahead(experiment: Experiment) -> IntArray:
-    """(m, m) by receiver and sender: 1 where the sender steps first, in real time with ideal timers, else 0."""
-    if experiment.run.pace == "lockstep":
-        return np.zeros((experiment.agents, experiment.agents), dtype=np.int64)
-    phase = phases(experiment)
-    return (phase < phase[:, None]).astype(np.int64)
-
-
 class AirReception:
     """The reception of block after block of steps, from x(first) = ``start`` (m, R) on."""
 
@@ -211,7 +203,7 @@ class AirReception:
         self._agents, self._replicas = model.agents, experiment.run.replicas
         self._numbers = np.full((model.agents, model.agents), len(links))
         self._numbers[links[:, 0], links[:, 1]] = np.arange(len(links))
-        self._ahead = ahead(experiment)[links[:, 0], links[:, 1]]
+        self._ahead = ahead(turns(experiment), experiment.agents)[links[:, 0], links[:, 1]]
         self._held: FloatArray | None = None
         if air.holds:
             begin = np.array([first])
@@ -282,7 +274,8 @@ class MessagesUsed:
     """Which messages are used in a run in which all steps are made in time, block after block of steps."""
 
     def __init__(self, experiment: Experiment, model: Wiring) -> None:
-        self._air, self._lead, self._tables = Air(experiment), ahead(experiment), neighbour_tables(model)
+        self._air, self._tables = Air(experiment), neighbour_tables(model)
+        self._lead = ahead(turns(experiment), model.agents)
         self._pairs: list[tuple[int, int]] = [(i, j) for i, j in np.argwhere(model.listens()).tolist()]
         # (n, m, D) number of the link from each neighbour in each graph; L beyond the last neighbour.
         self._links = np.full(self._tables.senders.shape, len(self._pairs))

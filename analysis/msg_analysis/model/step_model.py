@@ -264,22 +264,32 @@ def phases(experiment: Experiment) -> FloatArray:
     return np.asarray((ranks + 0.5) / experiment.agents)
 
 
+def turns(experiment: Experiment) -> IntArray | None:
+    """(m,) agents in the order of their steps in a period; None: all at once."""
+    return None if step_law(experiment) == "synchronous" else np.argsort(phases(experiment))
+
+
+def ahead(order: IntArray | None, agents: int) -> IntArray:
+    """(m, m) by receiver and sender: 1 where the sender steps first, given the ``turns``, else 0."""
+    rank = np.zeros(agents) if order is None else np.argsort(order)
+    return np.asarray((rank < rank[:, None]).astype(np.int64))
+
+
 def build_run_model(experiment: Experiment, step: StepModel | None = None) -> StepModel:
     """What a step of all agents of a run does to x(k); ``step``: the model of the experiment, if it is known."""
-    step = step or build_step_model(experiment)
-    if step_law(experiment) == "synchronous":
+    step, order = step or build_step_model(experiment), turns(experiment)
+    if order is None:
         return step
-    phase = phases(experiment)
     if experiment.noise.steps_only:  # with messages that are noisy, late or lost, the micro-steps stay apart
-        return dataclasses.replace(step, turns=np.argsort(phase))
-    return sequential(step, phase)
+        return dataclasses.replace(step, turns=order)
+    return sequential(step, order)
 
 
-def sequential(step: StepModel, phase: FloatArray) -> StepModel:
-    """The agents' micro-steps of a period, in the order of their phases (m,), as one step; no noise on the air."""
+def sequential(step: StepModel, order: IntArray) -> StepModel:
+    """The agents' micro-steps of a period, in the order of their ``turns`` (m,), as one step; no noise on the air."""
     weights, offsets, gain = np.empty_like(step.weights), np.empty_like(step.offsets), np.empty_like(step.noise_gain)
     done = np.zeros(step.agents, dtype=bool)
-    for i in np.argsort(phase).tolist():
+    for i in order.tolist():
         row = step.nominal[:, i]
         new = row * done
         weights[:, i] = (row - new) + np.einsum("nj,njk->nk", new[:, done], weights[:, done])

@@ -35,6 +35,7 @@ from msg_analysis.inference.autocovariance import (
 from msg_analysis.inference.observation import Observation
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.facts import check_facts
+from msg_analysis.theory.first_steps import simplification
 from msg_analysis.theory.graph_indices import algebraic_connectivity, error_bounds, graph_indices, two_topology
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.prediction import predict
@@ -128,6 +129,8 @@ def describe_transient(
     system, nodes = _mean_squares(document)
     document |= {system: found.system_error.tolist(), nodes: found.node_errors.tolist()}
     document |= _settling(experiment, solved.system, solved.steady, solved.unit or 1.0, fraction)
+    note = simplification(solved.system)
+    document["notes"] = [note] if note else []
     if moments:
         document["mode_means"] = found.mode_means.tolist()
         document["mode_second_moments"] = found.mode_second_moments.tolist()

@@ -111,6 +111,8 @@ def print_transient(document: dict[str, Any], console: Console) -> None:
     for key, what in {"mean": "means", "second_moment": "second moments", "graph": "graph probabilities"}.items():
         facts.add_row(f"decay rate of {what}", number_text(rates[key]))
     console.print(facts)
+    for note in document["notes"]:
+        console.print(Text(f"Note: {note}", style="yellow"))
 
 
 def print_facts(document: dict[str, Any], console: Console) -> None:

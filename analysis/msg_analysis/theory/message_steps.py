@@ -12,7 +12,7 @@ together if all agents do, so in consensus one number drops out. See docs/theory
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 
@@ -78,14 +78,32 @@ _Loss = tuple[int, int, int, float, float]
 """Entry that it changes; the entries that the message brings, and that take its place; probability; weight."""
 
 
+Use = tuple[int, int, float, float]
+"""Sender, entry of z, probability that the own value takes its place, and standard deviation of the link's noise."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Move:
     """A micro-step: the entries ``rows`` of z become matrix @ z, with losses, independent of each other."""
 
-    rows: list[int]
+    rows: Sequence[int]
     matrix: FloatArray  # (r, K) mean over the losses
     noise: FloatArray  # (r, r) covariance of what is random and does not depend on z, mean over the losses
     losses: Sequence[_Loss]
+
+    def events(self) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
+        """Of every loss, the entry that it changes, those that the message brings and the loss, and the variance."""
+        entry, brings, instead = (np.array([loss[part] for loss in self.losses], dtype=np.int64) for part in range(3))
+        return entry, brings, instead, np.array([p * (1.0 - p) * weight**2 for *_, p, weight in self.losses])
+
+    def apply(self, moments: FloatArray, share: float = 1.0) -> None:
+        """Second moments (K, K) of z after the move, in place, weighted with the probability ``share``."""
+        entry, brings, instead, variance = self.events()
+        spread = moments[brings, brings] + moments[instead, instead] - 2.0 * moments[brings, instead]
+        across = self.matrix @ moments
+        moments[self.rows], moments[:, self.rows] = across, across.T
+        moments[np.ix_(self.rows, self.rows)] = across @ self.matrix.T + share * self.noise
+        np.add.at(moments, (entry, entry), variance * spread)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,30 +128,21 @@ def message_steps(step: StepModel) -> MessageSteps:
     """The period of a run with this synchronous step, message by message. InputError: too many links or channels."""
     stack = _Stack(step)
     channels = burst_channels(step)
-    states = _channel_states(step, len(channels))
-    receivers, senders = np.array(channels, dtype=np.int64).reshape(-1, 2).T
-    modes = step.modes * len(states)
-    periods = []
-    for mode in range(modes):
-        graph, state = divmod(mode, len(states))
-        probability = step.losses.copy()
-        probability[receivers, senders] = states[state]
-        periods.append(_period(step, stack, graph, probability))
-    chain, stationary = step.transition, step.stationary
-    for link in channels:
-        channel, shares = gilbert(float(step.losses[link]), step.burst or 1.0)
-        chain, stationary = np.asarray(np.kron(chain, channel)), np.asarray(np.kron(stationary, shares))
+    modes = loss_modes(step)
+    periods = [_period(step, stack, graph, probability) for graph, probability in modes]
+    burst_rates = np.array([step.losses[link] for link in channels])
+    shares = np.where(_channel_states(step) > 0.0, burst_rates, 1.0 - burst_rates).prod(axis=1)
     matrices = np.stack([period.matrix for period in periods])
     losses = _stacked(periods)
     kept = _read(matrices, losses, step.agents)
-    square = np.ix_(np.arange(modes), kept, kept)
+    square = np.ix_(np.arange(len(modes)), kept, kept)
     return MessageSteps(
         matrices=matrices[square],
         noise=np.stack([period.noise for period in periods])[square],
         losses=losses and LossEvents(losses.into[:, :, kept], losses.differences[:, :, kept], losses.chain),
-        chain=chain,
-        stationary=stationary,
-        graphs=np.repeat(np.arange(step.modes), len(states)),
+        chain=joint_chain(step, step.transition),
+        stationary=np.asarray(np.kron(step.stationary, shares)),
+        graphs=np.array([graph for graph, _ in modes]),
         origins=stack.origins[kept],
         moves=[period.moves for period in periods],
         kept=kept,
@@ -177,9 +186,10 @@ class _Stack:
         """K."""
         return len(self.origins)
 
-    def source(self, receiver: int, sender: int) -> int:
-        """The entry that a receiver uses of a sender."""
-        return self.heard[-1].get((receiver, sender), self.published[-1][sender])
+    def use(self, receiver: int, sender: int, loss: float, link: float) -> Use:
+        """What a receiver uses of a sender."""
+        held = self.heard[-1].get((receiver, sender))
+        return (sender, self.published[-1][sender], loss, link) if held is None else (sender, held, 0.0, 0.0)
 
 
 class _Period:
@@ -191,54 +201,35 @@ class _Period:
         self.acts: list[FloatArray] = []  # row by row, R of ``LossEvents``
         self.moves: list[Move] = []
 
-    def step(
-        self,
-        rows: list[int],
-        matrix: FloatArray,
-        noise: FloatArray,
-        losses: Sequence[_Loss] = (),
-        older: Sequence[tuple[int, int]] = (),
-    ) -> None:
-        """The entries ``rows`` become matrix (r, k) @ z, with this noise (r, r), and with losses.
-
-        Of ``older``, the first entry becomes what the second was.
-        """
+    def step(self, move: Move, older: Sequence[tuple[int, int]] = ()) -> None:
+        """Make a move; of ``older``, the first entry becomes what the second was."""
         if older:
-            matrix = np.concatenate([matrix, _copies([before for _, before in older], len(self.noise))])
-            noise = scipy.linalg.block_diag(noise, np.zeros((len(older), len(older))))
-            rows = rows + [entry for entry, _ in older]
-        self.moves.append(Move(rows, matrix, noise, losses))
-        entry, brings, instead = (np.array([loss[part] for loss in losses], dtype=np.int64) for part in range(3))
-        variance = np.array([p * (1.0 - p) * weight**2 for *_, p, weight in losses])
+            matrix = np.concatenate([move.matrix, _copies([before for _, before in older], len(self.noise))])
+            noise = scipy.linalg.block_diag(move.noise, np.zeros((len(older), len(older))))
+            move = Move([*move.rows, *(entry for entry, _ in older)], matrix, noise, move.losses)
+        self.moves.append(move)
+        entry, brings, instead, variance = move.events()
         differences = self.matrix[brings] - self.matrix[instead]
-        acts = (self.into[:, brings] - self.into[:, instead]).T ** 2
-        n = self.noise
-        spread = variance * (n[brings, brings] + n[instead, instead] - 2.0 * n[brings, instead])
-
-        self.matrix[rows] = matrix @ self.matrix
-        self.into[:, rows] = self.into @ matrix.T
-        across = matrix @ n
-        n[rows], n[:, rows] = across, across.T
-        n[np.ix_(rows, rows)] = across @ matrix.T + noise
-        np.add.at(n, (entry, entry), spread)
-
-        into = np.zeros((len(losses), len(n)))
-        into[range(len(losses)), entry] = np.sqrt(variance)
+        self.acts += list((self.into[:, brings] - self.into[:, instead]).T ** 2)
+        self.matrix[move.rows] = move.matrix @ self.matrix
+        self.into[:, move.rows] = self.into @ move.matrix.T
+        move.apply(self.noise)
+        into = np.zeros((len(entry), len(self.noise)))
+        into[range(len(entry)), entry] = np.sqrt(variance)
         self.into = np.concatenate([self.into, into])
         self.differences = np.concatenate([self.differences, differences])
-        self.acts += list(acts)
 
 
 def _period(step: StepModel, stack: _Stack, graph: int, probability: FloatArray) -> _Period:
     period, m = _Period(stack.size), step.agents
     if stack.sources:
-        period.step(stack.sources, np.zeros((m, stack.size)), np.eye(m))
+        period.step(Move(stack.sources, np.zeros((m, stack.size)), np.eye(m), ()))
     turns = [list(range(m))] if step.turns is None else [[i] for i in step.turns.tolist()]
     for agents in turns:
         _move(period, step, stack, graph, probability, agents)
         if step.broadcast:
             newest = [stack.published[0][j] for j in agents]
-            period.step(newest, _copies(agents, stack.size), step.broadcast**2 * np.eye(len(agents)))
+            period.step(Move(newest, _copies(agents, stack.size), step.broadcast**2 * np.eye(len(agents)), ()))
         _hear(period, step, stack, probability, agents)
     return period
 
@@ -247,44 +238,64 @@ def _move(
     period: _Period, step: StepModel, stack: _Stack, graph: int, probability: FloatArray, agents: list[int]
 ) -> None:
     """These agents make their step, all at once; what they published before gets older."""
-    weights, gain = step.nominal[graph], step.noise_gain[graph][agents]
+    gain = step.noise_gain[graph][agents]
     matrix, noise = np.zeros((len(agents), stack.size)), np.zeros((len(agents), len(agents)))
     losses: list[_Loss] = []
     for row, i in enumerate(agents):
-        matrix[row, i] += weights[i, i]
-        for j in step.neighbours(graph, i).tolist():
-            source, p, weight = stack.source(i, j), float(probability[i, j]), float(weights[i, j])
-            if (i, j) in stack.heard[-1]:
-                matrix[row, source] += weight
-                continue
-            matrix[row, source] += (1.0 - p) * weight
-            matrix[row, i] += p * weight
-            noise[row, row] += (1.0 - p) * (weight * step.link) ** 2
-            if 0.0 < p < 1.0:
-                losses.append((i, source, i, p, weight))
+        uses = [stack.use(i, j, float(probability[i, j]), step.link) for j in step.neighbours(graph, i).tolist()]
+        noise[row, row], lost = add_uses(matrix[row], step.nominal[graph, i], i, i, i, uses)
+        losses += lost
     if stack.sources:
         matrix[:, stack.sources] = gain
     else:
         noise += gain @ gain.T
     older = [(new[j], before[j]) for before, new in pairwise(stack.published) for j in agents]
-    period.step(agents, matrix, noise, losses, older)
+    period.step(Move(agents, matrix, noise, losses), older)
+
+
+def add_uses(
+    row: FloatArray, weights: FloatArray, agent: int, own: int, new: int, uses: Iterable[Use]
+) -> tuple[float, list[_Loss]]:
+    """Add to the row (K,) what an agent with weights (m,) makes of ``own`` and ``uses``; its variance and losses."""
+    row[own] += weights[agent]
+    variance, losses = 0.0, list[_Loss]()
+    for sender, source, p, link in uses:
+        weight = float(weights[sender])
+        row[source] += (1.0 - p) * weight
+        row[own] += p * weight
+        variance += (1.0 - p) * (weight * link) ** 2
+        if 0.0 < p < 1.0:
+            losses.append((new, source, own, p, weight))
+    return variance, losses
 
 
 def _hear(period: _Period, step: StepModel, stack: _Stack, probability: FloatArray, agents: list[int]) -> None:
     """What these agents publish is heard, or what was heard before is kept; and what was heard gets older."""
-    links = [(link, entry) for link, entry in stack.heard[0].items() if link[1] in agents]
-    if not links:
-        return
-    matrix, noise = np.zeros((len(links), stack.size)), np.zeros(len(links))
+    entries = {link: entry for link, entry in stack.heard[0].items() if link[1] in agents}
+    if entries:
+        move = hear(step, probability, stack.published[0], entries, entries, stack.size)
+        older = [(new[link], before[link]) for before, new in pairwise(stack.heard) for link in entries]
+        period.step(move, older)
+
+
+def hear(
+    step: StepModel,
+    probability: FloatArray,
+    published: Sequence[int],
+    before: Mapping[tuple[int, int], int],
+    after: Mapping[tuple[int, int], int],
+    size: int,
+) -> Move:
+    """Receivers hear what is published, or keep what they have heard; entries of z by link, and by sender."""
+    matrix, noise = np.zeros((len(after), size)), np.zeros(len(after))
     losses: list[_Loss] = []
-    for row, (link, entry) in enumerate(links):
-        p, newest = float(probability[link]), stack.published[0][link[1]]
-        matrix[row, newest], matrix[row, entry] = 1.0 - p, p
+    for row, (link, entry) in enumerate(after.items()):
+        p, newest = float(probability[link]), published[link[1]]
+        matrix[row, newest], matrix[row, before[link]] = 1.0 - p, p
         noise[row] = (1.0 - p) * step.link**2
         if 0.0 < p < 1.0:
-            losses.append((entry, newest, entry, p, 1.0))
-    older = [(new[link], before[link]) for before, new in pairwise(stack.heard) for link, _ in links]
-    period.step([entry for _, entry in links], matrix, np.diag(noise), losses, older)
+            losses.append((entry, newest, before[link], p, 1.0))
+    return Move(list(after.values()), matrix, np.diag(noise), losses)
 
 
 def _copies(entries: list[int], size: int) -> FloatArray:
@@ -332,15 +343,31 @@ def burst_channels(step: StepModel) -> list[tuple[int, int]]:
     return [(i, j) for i, j in np.argwhere(lossy).tolist()] if step.burst is not None else []
 
 
-def gilbert(probability: float, burst: float) -> tuple[FloatArray, FloatArray]:
-    """(2, 2) transition matrix and (2,) stationary law of a channel: state 0 delivers, state 1 loses."""
-    mends = 1.0 / burst
-    fails = mends * probability / (1.0 - probability)
-    return np.array([[1.0 - fails, fails], [mends, 1.0 - mends]]), np.array([1.0 - probability, probability])
+def joint_chain(step: StepModel, graphs: FloatArray, frozen: Sequence[bool] = ()) -> FloatArray:
+    """(n, n) chain of the graphs, which switch by ``graphs``, and of the channels; ``frozen`` ones stay as they are."""
+    # The two states of a channel (Gilbert 1960): 0 delivers, 1 loses.
+    chain, mends = graphs, 1.0 / (step.burst or 1.0)
+    for number, link in enumerate(burst_channels(step)):
+        fails = mends * float(step.losses[link]) / (1.0 - float(step.losses[link]))
+        moving = np.array([[1.0 - fails, fails], [mends, 1.0 - mends]])
+        chain = np.asarray(np.kron(chain, np.eye(2) if number < len(frozen) and frozen[number] else moving))
+    return chain
 
 
-def _channel_states(step: StepModel, channels: int) -> FloatArray:
+def loss_modes(step: StepModel) -> list[tuple[int, FloatArray]]:
+    """Graph of every mode, and (m, m) probabilities of losses, 0 or 1 on the links that lose in bursts."""
+    receivers, senders = np.array(burst_channels(step), dtype=np.int64).reshape(-1, 2).T
+    modes = []
+    for graph, lost in product(range(step.modes), _channel_states(step)):
+        probability = step.losses.copy()
+        probability[receivers, senders] = lost
+        modes.append((graph, probability))
+    return modes
+
+
+def _channel_states(step: StepModel) -> FloatArray:
     """(2^c, c): 1.0 where a channel loses, for every combination of states, in the order of Kronecker products."""
+    channels = len(burst_channels(step))
     if step.modes * 2.0**channels > MOST_STATES:
         raise InputError(
             f"noise.burst: {step.modes} graphs and {channels} links that lose messages make {step.modes} * "

@@ -26,6 +26,7 @@ from msg_analysis.experiment.graphs import hops, widest_reaching
 from msg_analysis.model.step_model import StepLaw, StepModel, build_run_model, build_step_model, step_law
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.coupled_equations import SolverReport
+from msg_analysis.theory.first_steps import simplification
 from msg_analysis.theory.fourth_moments import FourthMoment, fourth_moment
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
@@ -263,7 +264,8 @@ class Prediction:
         document["static"] = self.static_moments.to_json() if self.static_moments else None
         document["disconnected"] = self.disconnected
         document["fourth_moment"] = self.fourth_moment.to_json()
-        document["notes"] = list(self.experiment.notes)
+        start = simplification(self.system)
+        document["notes"] = [*self.experiment.notes, *([start] if start else [])]
         return document
 
 

@@ -176,7 +176,7 @@ class _Sampler:
         """From the means of D^2 over about so many multiplications of steps."""
         mean = float((self._steady * (output.T @ output)).sum())
         output, values = output @ self._embedding.T, self._embedding @ values @ self._embedding.T
-        each = values[0].size + max(sum(stage.work for stage in stages) for stages in self._stages)
+        each = max(sum(stage.work for stage in stages) for stages in self._stages)
         count = max(FEWEST, round(work / (PATHS * REPLICAS * each)))
         found = np.zeros((PATHS, 2))
         for _ in range(count // 4):  # M becomes stationary: at first it is its mean
@@ -237,16 +237,16 @@ class _Drawn:
     differences: Any
     losses: FloatArray
     heard: float
-    work: float  # multiplications
+    work: float  # multiplications, if nothing were sparse
 
     @classmethod
     def of(cls, stage: Stage) -> _Drawn:
         """The same."""
-        into = stage.into[:, stage.rows]
-        unheard = stage.noise - stage.heard * (into.T * (1.0 - stage.losses)) @ into
-        parts = [_sparse(part) for part in (stage.matrix, _root(unheard), stage.into, stage.differences)]
-        work = sum(float(part.size) for part in parts) + STAGE  # of a sparse matrix, the entries that are not 0
-        return cls(stage.rows, *parts, stage.losses, stage.heard, work)
+        heard = stage.into[:, stage.rows]
+        unheard = stage.noise - stage.heard * (heard.T * (1.0 - stage.losses)) @ heard
+        matrix, root, into, differences = map(_sparse, (stage.matrix, _root(unheard), stage.into, stage.differences))
+        work = stage.matrix.size + 2.0 * stage.into.size + STAGE
+        return cls(stage.rows, matrix, root, into, differences, stage.losses, stage.heard, work)
 
 
 def _sparse(matrix: FloatArray) -> Any:

@@ -27,10 +27,10 @@ from msg_analysis.experiment.protocols import AgentProtocol
 from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.model.agent_law import ProcessNoise, ProtocolLaw
 from msg_analysis.model.graph_path import holding_periods, mode_path, past_modes
-from msg_analysis.model.reception import Air, AirReception, MessagesUsed, add_broadcast_noise, ahead
+from msg_analysis.model.reception import Air, AirReception, MessagesUsed, add_broadcast_noise
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
-from msg_analysis.model.step_model import StepMatrices, StepModel, Wiring, build_model, phases
+from msg_analysis.model.step_model import StepMatrices, StepModel, Wiring, ahead, build_model, phases, turns
 
 
 def ideal_log(experiment: Experiment, model: Wiring, modes: IntArray) -> tuple[IntArray, IntArray, IntArray]:
@@ -58,7 +58,7 @@ def ideal_times(experiment: Experiment, modes: IntArray) -> tuple[IntArray, IntA
 
 def law_of_all(experiment: Experiment, model: StepModel) -> ManySteps:
     """The steps of all agents under every graph."""
-    lead = ahead(experiment).astype(np.bool_)
+    lead = ahead(turns(experiment), experiment.agents).astype(np.bool_)
     holds = model.listens() if experiment.noise.holds else None
     return ManySteps([_rounds(model, mode, lead, holds) for mode in range(model.modes)])
 
@@ -188,7 +188,7 @@ def _one_by_one(record: RunRecord, modes: IntArray) -> Iterator[_Values]:
     agents, replicas, count = model.agents, experiment.run.replicas, len(modes) + 1
     laws = [ProtocolLaw(record, model, i) for i in range(agents)]
     neighbours = [[law.neighbours(mode) for mode in range(model.modes)] for law in laws]
-    lead = ahead(experiment)
+    lead = ahead(turns(experiment), experiment.agents)
     order = np.argsort(lead.sum(axis=1), kind="stable").tolist()
     # All of it, since a message that is held may be of any earlier step.
     published = large_zeros((count, agents, replicas), np.float64, total=8 * count * agents * replicas)

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from experiments import Experiment, predict
+from experiments import Experiment, line_ring, predict
 from msg_analysis.model.step_model import phases
-from msg_analysis.theory.transient import solve_transient
+from msg_analysis.theory.first_steps import known_start
+from msg_analysis.theory.transient import solve_transient, transient
 
 LINE = {"a": {"edges": [[1, 2, 0.6]]}, "b": {"arcs": [[3, 2], [2, 3, 0.5]]}}
 PAIR = {"a": {"edges": [[1, 2, 0.6]]}, "b": {"arcs": [[1, 2, 0.5]]}}
@@ -137,3 +138,31 @@ def test_transients_with_a_delay_are_those_of_every_outcome(case, start):
     course = solve_transient(experiment, experiment.step_length * np.arange(steps + 1)).course
     found = course.mode_second_moments.sum(axis=1)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("agents", "noise", "words"),
+    [
+        (30, {"loss": 0.2}, "the losses of those to 30 agents"),
+        (45, {"link": 0.2}, "their noise and losses"),
+        (45, {"broadcast": 0.2}, None),  # of one message to all: few numbers
+        (6, {"loss": 0.2, "on_loss": "hold"}, None),  # the message with x(0) is not lost
+        (8, {"loss": 0.2, "delay": 0}, None),
+    ],
+)
+def test_a_prediction_says_where_the_first_steps_are_approximate(agents, noise, words):
+    run = {"dt": 0.01, "duration": 4, "start": "zero"}
+    what = line_ring(
+        agents, graphs={"all": {"complete": True}}, agents=agents, switching={}, noise={"delay": 1} | noise, run=run
+    )
+    notes = predict(what).to_json()["notes"]
+    assert [words in note for note in notes] == [True] * (words is not None)
+
+
+def test_what_is_left_out_of_the_first_steps_of_a_large_network():
+    """The largest number of the table in docs/theory.md."""
+    system = predict(line_ring(5, 0.5, noise={"delay": 20, "loss": 0.5})).system
+    place = np.arange(5.0)[None] - 2.0
+    starts = [known_start(system, place, system.stationary, most_numbers=most) for most in (2000, 0)]
+    exact, near = (transient(system, start, np.array([21.0])).system_error[0] for start in starts)
+    assert near / exact - 1.0 == pytest.approx(-0.26, abs=0.005)
