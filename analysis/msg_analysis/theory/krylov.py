@@ -1,101 +1,31 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Krylov methods for stacks of equations: each of the q right-hand sides has its own iteration, all step together.
+"""GMRES for stacks of equations: each of the q right-hand sides has its own iteration, all step together.
 
-Conjugate gradients after Hestenes and Stiefel (1952), GMRES after Saad and Schultz (1986).
+After Saad and Schultz (1986).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-import scipy.linalg
 
 from msg_analysis.common.arrays import FloatArray
 
 MAX_BASIS = 150  # most iterations of GMRES, which keeps a vector of each
 MAX_BASIS_BYTES = 1.2e9  # of these vectors together
-STRIP = 8192  # entries of every graph that are worked on together, to stay in the caches
 
 
-class Preconditioned(Protocol):
+class Equations(Protocol):
     """A X = B with a preconditioner; stacks are (q, n, d, d)."""
 
     def precondition(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(Z, A Z) for Z near A^-1 R."""
 
 
-class Equations(Preconditioned, Protocol):
-    """The same with the inner product in which A may be self-adjoint."""
-
-    weights: FloatArray
-    definite: bool
-
-    def average(self, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(Z, A Z) for a start Z from which the preconditioner acts as a symmetric one."""
-
-
-def conjugate_gradients(
-    equations: Equations, right: FloatArray, goal: FloatArray, tolerance: float, most: int
-) -> tuple[FloatArray, int]:
-    """(X, iterations) for A X = B (q, n, d, d), ``definite``, with conjugate gradients in the product with the weights.
-
-    It ends when the norms of the preconditioned residuals are at most ``goal`` (q,), or ``tolerance`` relative to X.
-    """
-    weights = equations.weights
-    x, moved = equations.average(right)  # the preconditioner is symmetric where the residual has mean zero
-    residual = right - moved
-    p, ap, buffer, before = np.zeros_like(x), np.zeros_like(x), np.empty_like(x), np.ones(len(x))
-    for iteration in range(1, most + 1):
-        z, az = equations.precondition(residual)
-        now = _product(residual, z, weights)
-        if (weighted_norm(z, weights) <= np.maximum(goal, tolerance * weighted_norm(x, weights))).all():
-            return x + z, iteration
-        ratio = _broadcast(now / before, x)
-        p *= ratio
-        p += z
-        ap *= ratio
-        ap += az
-        before = np.where(now > 0.0, now, 1.0)
-        curvature = _product(p, ap, weights)
-        step = _broadcast(np.divide(now, curvature, out=np.zeros_like(now), where=curvature > 0.0), x)
-        x += np.multiply(step, p, out=buffer)
-        residual -= np.multiply(step, ap, out=buffer)
-    return x, most
-
-
-def plain_conjugate_gradients(
-    apply: Callable[[FloatArray, float], FloatArray], right: FloatArray, tolerance: FloatArray, most: int
-) -> tuple[FloatArray, int]:
-    """(X, iterations) for A X = B (q, n, d, d) with conjugate gradients, without preconditioner; overwrites ``right``.
-
-    ``apply`` maps X and the relative error that is allowed to A X, for a positive definite A: products may become less
-    accurate as the residual gets smaller (van den Eshof and Sleijpen 2004). ``tolerance``: (q,), relative to B.
-    """
-    x, residual, p = np.zeros_like(right), right, right.copy()
-    axpy = scipy.linalg.blas.get_blas_funcs("axpy", (right,))  # in place, in one pass
-    now = _squares(right, right)
-    small = tolerance**2 * now
-    for iteration in range(1, most + 1):
-        accuracy = np.sqrt(np.divide(small, now, out=np.ones_like(now), where=now > 0.0))
-        moved = apply(p, float(accuracy.min()))
-        curvature = _squares(p, moved)
-        steps = np.divide(now, curvature, out=np.zeros_like(now), where=curvature > 0.0)
-        for k, step in enumerate(steps):
-            axpy(p[k].ravel(), x[k].ravel(), a=step)
-            axpy(moved[k].ravel(), residual[k].ravel(), a=-step)
-        before, now = now, _squares(residual, residual)
-        if (now <= small).all():
-            return x, iteration
-        p *= _broadcast(np.divide(now, before, out=np.zeros_like(now), where=before > 0.0), p)
-        p += residual
-    return x, most
-
-
-def gmres(equations: Preconditioned, right: FloatArray, tolerance: FloatArray, most: int) -> tuple[FloatArray, int]:
+def gmres(equations: Equations, right: FloatArray, tolerance: FloatArray, most: int) -> tuple[FloatArray, int]:
     """(X, iterations) for A X = B (q, n, d, d) with GMRES, preconditioned from the right, without restart.
 
     ``tolerance``: (q,) norms of the residual, relative to B; ``MAX_BASIS`` and ``MAX_BASIS_BYTES`` limit ``most``, too.
@@ -146,37 +76,6 @@ def gmres(equations: Preconditioned, right: FloatArray, tolerance: FloatArray, m
     return x, used
 
 
-def flat(stack: FloatArray) -> FloatArray:
-    """The (q, n, d^2) view of a stack (q, n, d, d)."""
-    return stack.reshape(*stack.shape[:2], -1)
-
-
-def strips(length: int) -> list[slice]:
-    """Slices of the rows of a flat stack, each of which stays in the caches while it is worked on."""
-    return [slice(first, first + STRIP) for first in range(0, length, STRIP)]
-
-
 def norms(a: FloatArray) -> FloatArray:
     """(q, n) Frobenius norms of (q, n, d, d) matrices."""
     return np.asarray(np.sqrt(np.einsum("qnab,qnab->qn", a, a)))
-
-
-def _product(a: FloatArray, b: FloatArray, weights: FloatArray) -> FloatArray:
-    """(q,): sum_i pi_i tr(A_i^T B_i)."""
-    if len(a) == 1:  # BLAS is faster than einsum
-        return np.array([sum(w * float(np.vdot(x, y)) for w, x, y in zip(weights, a[0], b[0], strict=True))])
-    return np.asarray(np.einsum("qnab,qnab->qn", a, b) @ weights)
-
-
-def weighted_norm(a: FloatArray, weights: FloatArray) -> FloatArray:
-    """(q,): sqrt(sum_i pi_i |A_i|^2), from (q, n, d, d) matrices A and the weights pi (n,)."""
-    return np.asarray(np.sqrt(_product(a, a, weights)))
-
-
-def _squares(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(q,): sum_i tr(A_i^T B_i)."""
-    return np.array([float(np.vdot(x, y)) for x, y in zip(a, b, strict=True)])
-
-
-def _broadcast(factors: FloatArray, like: FloatArray) -> FloatArray:
-    return np.asarray(factors[:, None, None, None], dtype=like.dtype)

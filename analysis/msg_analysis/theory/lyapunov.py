@@ -76,8 +76,6 @@ class LocalSolves:
         else:
             self._numerator = (1.0 - row) * (1.0 - column)
             divisor = row + column - row * column + rate * self._numerator
-        # Whether every X -> F is symmetric and positive definite.
-        self.definite = self.symmetric and bool((divisor > 0.0).all())
         self._divisor = np.where(divisor == 0.0, 1.0, divisor)  # such a solve is wrong, which the residual shows
         # Whether single precision gives useful solutions.
         self.mild = self.symmetric and bool((np.abs(divisor).min(axis=(1, 2)) >= MILD * size[:, 0]).all())

@@ -27,23 +27,14 @@ from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.coupled_equations import (
     MAX_RELATIVE_ERROR,
     SINGLE_FROM,
-    AveragedEquations,
     CoupledEquations,
     Method,
     Preconditioner,
     SolverReport,
-    averaged_equations,
     singular_message,
 )
 from msg_analysis.theory.jump_system import JumpSystem
-from msg_analysis.theory.krylov import (
-    Equations,
-    conjugate_gradients,
-    gmres,
-    norms,
-    plain_conjugate_gradients,
-    weighted_norm,
-)
+from msg_analysis.theory.krylov import gmres, norms
 from msg_analysis.theory.propagator import Propagator
 
 
@@ -165,8 +156,6 @@ class DenseSolver:
 
 TOLERANCE = 1e-12  # estimated relative error at which a solve stops
 MAX_ITERATIONS = 600
-MAX_CHEAP = 30  # most iterations of one cycle with the averaged preconditioner
-FINEST = 5e-7  # least relative residual asked of such a cycle, in single precision: two cycles suffice
 MAX_AMPLIFICATION = 1e14  # largest ratio of (averaged decay * solution) to right-hand side: a condition number
 CHUNK = 1_000_000  # numbers in a stack of right-hand sides that are solved together: small enough for the caches
 
@@ -185,9 +174,7 @@ class IterativeSolver:
     ) -> None:
         self._chunk, self._equations = chunk, CoupledEquations(system, single_from=single_from)
         self._most_iterations = most_iterations
-        self._averaged = averaged_equations(self._equations)
         self._adjoint: CoupledEquations | None = None
-        self._averaged_adjoint: AveragedEquations | None = None
         self._guess = guess
         self.report: SolverReport | None = None
 
@@ -199,7 +186,7 @@ class IterativeSolver:
             right = self._equations.after_jump(right)
         weights = system.stationary[:, None, None]
         guess = None if self._guess is None else self._guess[None] / weights
-        x, self.report = _solve(self._equations, self._averaged, right, guess, self._most_iterations)
+        x, self.report = _solve(self._equations, right, guess, self._most_iterations)
         return np.asarray(np.multiply(weights, x[0], out=x[0]))
 
     def dual(self, forms: FloatArray) -> FloatArray:
@@ -207,13 +194,12 @@ class IterativeSolver:
         system = self._equations.system
         if self._adjoint is None:
             self._adjoint = CoupledEquations(system, self._equations)
-            self._averaged_adjoint = averaged_equations(self._adjoint)
         result = np.empty((len(forms), *system.matrices.shape))
         together = max(1, self._chunk // system.matrices.size)
         for first in range(0, len(forms), together):
             chunk = forms[first : first + together, None]
             right = np.broadcast_to(chunk, (len(chunk), *system.matrices.shape)).copy()
-            y, _ = _solve(self._adjoint, self._averaged_adjoint, right, None, self._most_iterations)
+            y, _ = _solve(self._adjoint, right, None, self._most_iterations)
             if system.time == "discrete":
                 y = right + self._adjoint.moved(y)
             result[first : first + together] = y
@@ -221,20 +207,10 @@ class IterativeSolver:
 
 
 def _solve(
-    equations: CoupledEquations,
-    averaged: AveragedEquations | None,
-    right: FloatArray,
-    guess: FloatArray | None,
-    most: int,
+    equations: CoupledEquations, right: FloatArray, guess: FloatArray | None, most: int
 ) -> tuple[FloatArray, SolverReport]:
     """Solve A X = B for (q, n, d, d) right-hand sides, in about so many iterations at most."""
-    x = None if guess is None or not guess.any() else 0.5 * (guess + guess.swapaxes(-1, -2))
-    if averaged is not None:
-        x, report = _by_average(equations, averaged, right, x)
-        if not report.error <= TOLERANCE:
-            x, report = _by_graphs(equations, right, x if np.isfinite(x).all() else None, report.iterations, most)
-    else:
-        x, report = _by_graphs(equations, right, x, 0, most)
+    x, report = _refined(equations, right, guess, most)
     # Not ">": NaN must be refused, too.
     if not report.error <= MAX_RELATIVE_ERROR:
         raise InputError(singular_message(f", or too ill-conditioned ({report.iterations} iterations do not converge)"))
@@ -246,42 +222,14 @@ def _solve(
     return x, report
 
 
-def _by_average(
-    equations: CoupledEquations, averaged: AveragedEquations, right: FloatArray, guess: FloatArray | None
+def _refined(
+    equations: CoupledEquations, right: FloatArray, guess: FloatArray | None, most: int
 ) -> tuple[FloatArray, SolverReport]:
-    """With the averaged preconditioner, until the error is small or a cycle gains less than three digits."""
-    method: Method = "cg" if averaged.definite else "gmres"
-    iterations, before = 0, np.inf
-    x, known = np.zeros_like(right) if guess is None else guess, guess is not None
-    while True:
-        residual, left, backward = _residual(equations, right, x) if known else (right, 1.0, 1.0)
-        scale = _scale(residual)
-        inside, error = averaged.enter(residual, scale), np.ones(len(x))
-        del residual  # its memory is used again, and fresh memory would have to be cleared
-        if known:
-            error = _error(averaged.solution(inside), x, scale)
-            iterations += 1
-        worst = float(error.max(initial=0.0))
-        if worst <= TOLERANCE or not worst <= 1e-3 * before:
-            return x, SolverReport(method, "averaged", iterations, left, backward, worst)
-        enough = np.clip(0.5 * TOLERANCE / np.maximum(error, TOLERANCE), FINEST, 0.1)
-        if averaged.definite:
-            change, used = plain_conjugate_gradients(averaged.apply, inside, enough, MAX_CHEAP)
-        else:
-            change, used = gmres(averaged, inside, enough, MAX_CHEAP)
-        averaged.leave(change, scale, x)
-        iterations, before, known = iterations + used, worst, True
-
-
-def _by_graphs(
-    equations: CoupledEquations, right: FloatArray, x: FloatArray | None, iterations: int, most: int
-) -> tuple[FloatArray, SolverReport]:
-    """With the two-level preconditioner, until the error is small, a cycle hardly reduces it, or iterations run out."""
-    inner = equations.inner
-    method: Method = "direct" if equations.direct else "cg" if inner.definite else "gmres"
-    preconditioner: Preconditioner = "none" if equations.direct else "two-level"
-    known = x is not None
-    x = np.zeros_like(right) if x is None else x
+    """Refine until the error is small, a cycle hardly reduces it, or iterations run out."""
+    inner, iterations = equations.inner, 0
+    how: tuple[Method, Preconditioner] = ("direct", "none") if equations.direct else ("gmres", "two-level")
+    known = guess is not None and bool(guess.any())
+    x = np.zeros_like(right) if guess is None else 0.5 * (guess + guess.swapaxes(-1, -2))
     residual, error, before = right, np.ones(len(right)), np.inf
     while True:
         if known:
@@ -293,7 +241,7 @@ def _by_graphs(
             worst = float(error.max(initial=0.0))
             iterations += 1
             if worst <= TOLERANCE or iterations >= most or not worst <= 0.7 * before:
-                return x, SolverReport(method, preconditioner, iterations, left, backward, worst)
+                return x, SolverReport(*how, iterations, left, backward, worst)
             before = worst
         known = True
         scaled, scale = _scaled(residual)
@@ -301,20 +249,10 @@ def _by_graphs(
         if equations.direct:
             change, used = inner.precondition(scaled)[0], 1
         else:
-            size = weighted_norm(x, equations.weights) / scale[:, 0, 0, 0]
-            change, used = _improved(inner, scaled, size, error, most)
-        x, iterations = x + change * scale, iterations + used
-
-
-def _improved(
-    equations: Equations, right: FloatArray, size: FloatArray, error: FloatArray, most: int
-) -> tuple[FloatArray, int]:
-    """(X, iterations) for A X = B, as accurate as the precision allows and the error requires."""
-    finest = 1e-6 if right.dtype == np.float32 else 1e-14
-    if equations.definite:
-        small = 0.3 * TOLERANCE
-        return conjugate_gradients(equations, right, small * size, max(small, finest), most)
-    return gmres(equations, right, np.clip(0.1 * TOLERANCE / np.maximum(error, TOLERANCE), finest, 0.1), most)
+            finest = 1e-6 if scaled.dtype == np.float32 else 1e-14
+            enough = np.clip(0.1 * TOLERANCE / np.maximum(error, TOLERANCE), finest, 0.1)
+            change, used = gmres(inner, scaled, enough, most)
+        x, iterations = x + 0.5 * scale * (change + change.swapaxes(-1, -2)), iterations + used
 
 
 def _residual(equations: CoupledEquations, right: FloatArray, x: FloatArray) -> tuple[FloatArray, float, float]:
@@ -325,25 +263,19 @@ def _residual(equations: CoupledEquations, right: FloatArray, x: FloatArray) -> 
     return residual, float(_ratio(left, given).max(initial=0.0)), float(_ratio(left, terms + given).max(initial=0.0))
 
 
-def _error(step: FloatArray, x: FloatArray, scale: FloatArray | float = 1.0) -> FloatArray:
-    """(q,): norm of the step (times the scale) relative to X, in the graph where it is largest."""
+def _error(step: FloatArray, x: FloatArray) -> FloatArray:
+    """(q,): norm of the step relative to X, in the graph where it is largest."""
     size = norms(x)
     size = np.maximum(size, 1e-6 * size.max(axis=1, keepdims=True))
-    return np.asarray(_ratio(norms(step), size).max(axis=1) * scale)
-
-
-def _scale(residual: FloatArray) -> FloatArray:
-    """(q,): largest absolute entries; 1 where all are 0."""
-    axes = (1, 2, 3)
-    scale = np.maximum(residual.max(axis=axes, initial=0.0), -residual.min(axis=axes, initial=0.0))
-    scale[scale == 0.0] = 1.0
-    return np.asarray(scale)
+    return np.asarray(_ratio(norms(step), size).max(axis=1))
 
 
 def _scaled(residual: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Right-hand sides with largest entry 1, and their (q, 1, 1, 1) scales."""
-    scale = _scale(residual)[:, None, None, None]
-    return residual / scale, scale
+    axes = (1, 2, 3)
+    scale = np.maximum(residual.max(axis=axes, initial=0.0), -residual.min(axis=axes, initial=0.0))
+    scale[scale == 0.0] = 1.0
+    return residual / scale[:, None, None, None], scale[:, None, None, None]
 
 
 def _ratio(part: FloatArray, whole: FloatArray) -> FloatArray:
