@@ -158,9 +158,6 @@ class CoupledEquations:
         rest = self._mixed(moved)  # R - A Z
         if self.system.lossy:
             rest += self.after_jump(self._lost(z))
-        return self._averaged(z, rest, right)
-
-    def _averaged(self, z: FloatArray, rest: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
         for level in self._levels:
             correction, _ = level.solves(_combined(level.average, rest))
             spread = _combined(level.members.T, correction)

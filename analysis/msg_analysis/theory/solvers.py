@@ -71,24 +71,15 @@ def mean_propagator(system: JumpSystem) -> Propagator:
     return Propagator(system.time, system.chain, system.stationary, local)
 
 
-MAX_UNKNOWNS = 10_000  # largest system that is tried: 2.4 GB and about a minute
-
-
 class DenseSolver:
-    """The coupled equations of ``MomentSolver``, factorised. InputError: too large, singular or too ill-conditioned."""
+    """The coupled equations of ``MomentSolver``, factorised. InputError: singular or too ill-conditioned."""
 
     # The last block row is replaced by the sum of all of them, in which the chain cancels exactly, and rows are scaled
     # to largest entry 1: so the equations stay well conditioned however fast the graphs switch.
 
-    def __init__(self, system: JumpSystem, *, most_unknowns: int = MAX_UNKNOWNS) -> None:
+    def __init__(self, system: JumpSystem) -> None:
         self._system = system
         n, p = system.modes, packed_symmetric.size(system.dimension)
-        if n * p > most_unknowns:
-            raise InputError(
-                f"second moments: {n} graphs of {len(system.lift)} agents give {n * p} coupled unknowns, for "
-                f"which a dense solve needs about {24e-9 * (n * p) ** 2:.1f} GB; at most {most_unknowns} are "
-                "solved: leave the choice of the method to the program, or use fewer agents or graphs"
-            )
         local, flow = mode_operators(system), system.chain.T
         matrix = np.zeros((n, p, n, p))
         for j in range(n):

@@ -13,7 +13,6 @@ from msg_analysis.errors import InputError
 from msg_analysis.theory.first_steps import MomentsAt
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver, mode_potential, transient_mean
-from msg_analysis.theory.solvers import DenseSolver
 
 MODELS = settings(max_examples=25, deadline=None, derandomize=True)
 seeds = st.integers(0, 10_000)
@@ -144,13 +143,6 @@ def test_systems_without_coordinates():
     solver = MomentSolver(JumpSystem("continuous", empty, empty, np.zeros((1, 1)), np.ones(1), np.zeros((2, 0))))
     assert solver.steady().shape == (1, 0, 0)
     assert solver.report.method == "dense"
-
-
-def test_too_large_says_the_size():
-    system = switching(np.random.default_rng(8), 4, generator(np.random.default_rng(9), 2))
-    with pytest.raises(InputError, match=r"2 graphs of 4 agents give 12 coupled unknowns.* at most 11 are"):
-        DenseSolver(system, most_unknowns=11)
-    DenseSolver(system, most_unknowns=12)
 
 
 def test_adjoint_solutions_are_kept_while_they_are_small():
