@@ -43,6 +43,7 @@ from msg_agents.stepping.monitoring import (
 from msg_agents.terminal import Interruption
 from msg_agents.watch.observer import EarlyEnd
 from msg_agents.watch.panel import View
+from msg_agents.watch.snapshot import due_rate
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.stored_file import DEFAULT_STORAGE, Storage
@@ -256,7 +257,7 @@ def _watch(
     """Watch until all have done their part, one has failed for good, or a signal has ended the run."""
     began: float | None = None
     stall, steps, run = StallDetector(), result.experiment.steps, result.experiment.run
-    due = run.speed / result.experiment.step_length  # steps per second in real time
+    due = due_rate(result.experiment)  # steps per second in real time
     lag, clock = (LagDetector(due), ClockDetector()) if run.pace == "realtime" and follow_clock else (None, None)
     events, warned = EventLog(result.events), None
     will_begin = SWITCHER in supervisor.by_node  # with several hosts, one has it; the others do not know
@@ -291,10 +292,10 @@ def _watch(
             return
         if reached < 0:
             continue
-        if lag and reached < steps and (late := lag.update(supervisor.steps)):
-            others = len(supervisor.steps) - len(late.silent)
+        if lag and reached < steps and (late := lag.update(supervisor.steps, steps)):
+            others, names = len(supervisor.steps) - len(late.silent), result.experiment.names
             view.note(
-                silence_text(late.silent, late.quiet, others, supervisor.pids, result.experiment.names)
+                silence_text(late.silent, late.quiet, others, supervisor.pids, names, late=lag.late(late))
                 if late.silent
                 else f"the network cannot keep up: it is {late.behind:.1f} s behind the {due:g} steps/s of real time: "
                 f"lower `run: speed: {run.speed:g}`, or give several agents to one process (`run: processes`)"

@@ -14,7 +14,7 @@ from typing import Any
 from msg_analysis.common.text import agent_name
 
 STALL_TIME = 5.0  # s without a step, after which an agent counts as stalled
-LAG_TIME = 2.0  # s behind its clock after which a run in real time counts as too slow; agents report every 0.2 s
+SILENT = 1.0  # s without a step after which an agent counts as silent in real time; agents report every 0.2 s
 CLOCK_STEP = 0.5  # s by which the clock must have been set to be noted
 
 
@@ -64,30 +64,51 @@ class StuckDetector:
 
 
 def silence_text(
-    agents: Sequence[int], seconds: float, others: int, pids: Mapping[int, int], names: Sequence[str] | None
+    agents: Sequence[int],
+    seconds: float,
+    others: int,
+    pids: Mapping[int, int],
+    names: Sequence[str] | None,
+    *,
+    late: bool = False,
 ) -> str:
-    """That these agents (from 0) have made no step for so long, while ``others`` have; ``pids`` of those known."""
+    """That these agents (from 0) have made no step for so long, while ``others``, perhaps late, have made some."""
     shown = [agent_name(i + 1, names) + (f" (PID {pids[i]})" if i in pids else "") for i in agents]
     who = f"agent {shown[0]} has" if len(shown) == 1 else f"agents {', '.join(shown)} have"
-    return f"{who} made no step for {seconds:.1f} s; the other {others} {'is' if others == 1 else 'are'} on time"
+    go_on = ("goes on" if late else "is on time") if others == 1 else "go on" if late else "are on time"
+    return f"{who} made no step for {seconds:.1f} s; the other {others} {go_on}"
+
+
+def silent_after(rate: float) -> float:
+    """Seconds without a step after which an agent counts as silent; ``rate``: steps that are due per second."""
+    return max(SILENT, 5.0 / rate)
 
 
 class StepAges:
-    """Since when each agent has made its newest step."""
+    """Since when each agent has made its newest step, and which are silent: without one for ``after`` s."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(self, after: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._after, self._clock, self._looked = after, clock, clock()
         self._steps: list[int] = []
         self._moved: list[float] = []  # s
+        self._last = inf
+        # Since when any agent has made steps [s], and the newest step then; None: all stand still, or wait for the
+        # epoch, so that nobody is silent.
+        self.going: tuple[float, int] | None = None
 
-    def update(self, steps: Sequence[int]) -> list[int]:
-        """Take the newest step of every agent (from 0); which have made one since the last call."""
-        now = self._clock()
+    def update(self, steps: Sequence[int], last: float = inf) -> list[int]:
+        """Take the newest step of every agent (from 0), and the last of the run; which have moved since then."""
+        now, self._last = self._clock(), last
         if len(steps) != len(self._steps):
             self._steps, self._moved = list(steps), [now] * len(steps)
         moved = [agent for agent, (old, new) in enumerate(zip(self._steps, steps, strict=True)) if new > old]
+        if now - max(self._moved, default=now) > self._after and max(self._steps) < last:
+            self.going = None
+        if moved and self.going is None:
+            self.going = self._looked, max(self._steps)
         for agent in moved:
             self._steps[agent], self._moved[agent] = steps[agent], now
+        self._looked = now
         return moved
 
     def ages(self) -> list[float]:
@@ -95,13 +116,21 @@ class StepAges:
         now = self._clock()
         return [now - moved for moved in self._moved]
 
+    def silent(self) -> dict[int, float]:
+        """Seconds without a step of those agents (from 0) that have made none for a while, although others have."""
+        if self.going is None:
+            return {}
+        now, (since, _) = self._clock(), self.going
+        quiet = [now - max(moved, since) for moved in self._moved]
+        return {i: s for i, s in enumerate(quiet) if s > self._after and -1 < self._steps[i] < self._last}
+
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """A run in real time is behind its clock."""
+    """What to warn of in a run in real time: silent agents, or that the others are behind their clock."""
 
-    behind: float  # s
-    silent: tuple[int, ...]  # agents (from 0) without a step for a while, where all others are on time; else empty
+    behind: float  # s, of those that are not silent
+    silent: tuple[int, ...] = ()  # agents (from 0); empty: all are late
     quiet: float = 0.0  # s without a step of these
 
 
@@ -110,29 +139,34 @@ class LagDetector:
 
     def __init__(self, rate: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._rate, self._clock = rate, clock
-        self._began: float | None = None
-        self._first = 0
-        self._next_warning = LAG_TIME
-        self._ages = StepAges(clock)
+        self._ages = StepAges(silent_after(rate), clock)
+        self._limit = self._next_warning = 2.0 * silent_after(rate)  # s
+        self._next: dict[int, float] = {}  # s without a step at which a silent agent is told again
 
-    def update(self, steps: Sequence[int]) -> Lag | None:
+    def update(self, steps: Sequence[int], last: float = inf) -> Lag | None:
         """After each look at the newest step of every agent: what to warn of now, and again when it has doubled."""
-        now, step = self._clock(), min(steps)
-        self._ages.update(steps)
-        if self._began is None or step == self._first:  # waiting for the epoch
-            self._began, self._first = now, step
+        self._ages.update(steps, last)
+        silent = self._ages.silent()
+        self._next = {agent: at for agent, at in self._next.items() if agent in silent}
+        if self._ages.going is None:
             return None
-        due = self._first + (now - self._began) * self._rate
-        behind = (due - step) / self._rate
+        since, first = self._ages.going
+        slowest = min((step for agent, step in enumerate(steps) if agent not in silent), default=first)
+        due = min(first + (self._clock() - since) * self._rate, last)
+        behind = (due - slowest) / self._rate
+        if any(quiet >= self._next.get(agent, self._limit) for agent, quiet in silent.items()):
+            self._next = dict.fromkeys(silent, 2.0 * max(silent.values()))
+            return Lag(behind, tuple(silent), min(silent.values()))
+        if behind < self._limit / 2.0:
+            self._next_warning = self._limit
         if behind < self._next_warning:
             return None
         self._next_warning = 2.0 * behind
-        ages = self._ages.ages()
-        silent = tuple(agent for agent, age in enumerate(ages) if age > LAG_TIME / 2.0)
-        others = [step for agent, step in enumerate(steps) if agent not in silent]
-        if not silent or not others or due - min(others) >= LAG_TIME * self._rate:
-            return Lag(behind, ())
-        return Lag(behind, silent, min(ages[agent] for agent in silent))
+        return Lag(behind)
+
+    def late(self, lag: Lag) -> bool:
+        """Whether the agents that are not silent are behind, too."""
+        return lag.behind >= self._limit
 
 
 class ClockDetector:

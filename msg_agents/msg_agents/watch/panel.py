@@ -375,7 +375,7 @@ class RunView(View):
             return
         self._shown = now
         report, note = (observer.report, observer.note) if observer else (None, None)
-        if observer and self._source.silent(steps):
+        if observer and self._source.silent():
             report = observer.beside(steps)
         pids = {i: process.pid for i, process in enumerate(self._processes) if process is not None}
         snapshot = self._source.snapshot(steps, report, note or self._note, self._ended(), pids)

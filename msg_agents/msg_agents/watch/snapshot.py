@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from msg_agents.stepping.monitoring import StepAges, silence_text
+from msg_agents.stepping.monitoring import SILENT, StepAges, silence_text, silent_after
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.text import agent_text, finite
 from msg_analysis.model.graph_path import HoldingPeriod, holding_periods
@@ -31,7 +31,6 @@ GRAIN = 0.25  # s; least time between two measurements
 MOST_HOLDING_PERIODS = 500  # that are shown beside the states
 MOST_EVENTS = 50  # the newest, which a page gets
 MOST_TRACED = 20  # agents whose states a page gets
-SILENT = 1.0  # s without a new step after which a page shows an agent as silent; five periods where that is longer
 
 
 class StepRates:
@@ -63,14 +62,14 @@ class StepRates:
 class Presence:
     """Which agents make no new steps, and since when."""
 
-    def __init__(self, names: Sequence[str] | None, clock: Callable[[], float]) -> None:
-        self._names, self._steps = names, StepAges(clock)
-        self.ages = self._steps.ages
+    def __init__(self, names: Sequence[str] | None, after: float, clock: Callable[[], float]) -> None:
+        self._names, self._steps = names, StepAges(after, clock)
+        self.ages, self.silent = self._steps.ages, self._steps.silent
         self.gone: set[int] = set()  # agents (from 0) whose process has ended, until a new one makes a step
 
-    def add(self, steps: Sequence[int], ended: Iterable[int]) -> list[str]:
+    def add(self, steps: Sequence[int], ended: Iterable[int], last: int) -> list[str]:
         """Take the newest step of every agent, by index, and the agents whose process has ended; what is new."""
-        back = self._steps.update(steps)
+        back = self._steps.update(steps, last)
         returned = sorted(self.gone.intersection(back))
         self.gone = self.gone.difference(back).union(ended)
         return [f"{agent_text(agent + 1, self._names)} is back" for agent in returned if agent not in self.gone]
@@ -132,10 +131,10 @@ class SnapshotSource:
 
     def __init__(self, experiment: Experiment, clock: Callable[[], float] = time.monotonic) -> None:
         self._steps, self._names = experiment.steps, experiment.names
-        self._silent_after = silent_after(experiment) if experiment.run.pace == "realtime" else math.inf
         self._last: int | None = None  # where the run ends early
         self._holding_periods, self._rates = HoldingPeriods(experiment), StepRates(clock)
-        self._presence = Presence(experiment.names, clock)
+        after = silent_after(due_rate(experiment)) if experiment.run.pace == "realtime" else math.inf
+        self._presence = Presence(experiment.names, after, clock)
         self._events: deque[tuple[int, str]] = deque(maxlen=MOST_EVENTS)
         self._refused: dict[str, int] = {}
         self._reached = -1
@@ -148,11 +147,9 @@ class SnapshotSource:
         """Something happened, now."""
         self._events.append((self._reached, text))
 
-    def silent(self, steps: Sequence[int]) -> frozenset[int]:
-        """In real time: agents (from 0) that have made no step for a while, if others have."""
-        ages = self._presence.ages() if len(steps) > 1 else []
-        silent = {i for i, age in enumerate(ages) if age > self._silent_after and -1 < steps[i] < self._steps}
-        return frozenset(silent) if len(silent) < len(steps) else frozenset()
+    def silent(self) -> dict[int, float]:
+        """In real time: seconds without a step of agents (from 0) that have made none for a while, if others have."""
+        return self._presence.silent()
 
     def snapshot(
         self,
@@ -165,13 +162,12 @@ class SnapshotSource:
         """The snapshot now, from the newest step of every agent; ``ended``: those (from 0) without a process."""
         now = Snapshot(list(steps), report=report, note=note or (report.note if report else None), last=self._last)
         self._reached = max(self._reached, now.reached)
-        for text in self._presence.add(steps, ended):
+        for text in self._presence.add(steps, ended, self._steps):
             self.happened(text)
-        if silent := self.silent(steps):
-            ages = self._presence.ages()
-            quiet, others = min(ages[i] for i in silent), len(steps) - len(silent)
+        if silent := self.silent():
+            quiet, others = min(silent.values()), len(steps) - len(silent)
             words = silence_text(sorted(silent), quiet, others, pids or {}, self._names)
-            now = replace(now, silent=silent, warning=words)
+            now = replace(now, silent=frozenset(silent), warning=words)
         self._reached = max(self._reached, now.reached)
         for reason, count in (report.refused if report else {}).items():
             if reason not in self._refused:
@@ -189,10 +185,9 @@ class SnapshotSource:
         return now if recent is None else replace(now, path=self._holding_periods.since(int(recent.steps[0])))
 
 
-def silent_after(experiment: Experiment) -> float:
-    """Seconds without a new step after which an agent is shown as silent."""
-    run = experiment.run
-    return max(SILENT, 5 * experiment.step_length / run.speed if run.pace == "realtime" else 0.0)
+def due_rate(experiment: Experiment) -> float:
+    """Steps per second that are due in real time."""
+    return experiment.run.speed / experiment.step_length
 
 
 def run_description(experiment: Experiment) -> dict[str, Any]:
@@ -208,7 +203,7 @@ def run_description(experiment: Experiment) -> dict[str, Any]:
         "steps": experiment.steps,
         "dt": experiment.step_length,
         "pace": experiment.run.pace,
-        "silent": silent_after(experiment),
+        "silent": silent_after(due_rate(experiment)) if experiment.run.pace == "realtime" else SILENT,
         "leaders": list(experiment.spec.leaders.agents) if experiment.spec.leaders else [],
         "reference": experiment.reference if experiment.spec.leaders else None,
         "graphs": [

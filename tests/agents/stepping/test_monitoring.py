@@ -1,6 +1,7 @@
 """Stalls, lags and clocks against hand-made times."""
 
 import random
+from collections.abc import Callable
 
 import pytest
 
@@ -55,37 +56,82 @@ def test_a_run_that_is_stuck_for_120_s(clock: Clock, kind: str, told: int) -> No
     assert second == told
 
 
-def test_a_run_that_keeps_up(clock: Clock) -> None:
-    """Reports come every 0.2 s, and the clock of simulated time begins half a second after the agents."""
-    detector = LagDetector(100.0, clock)
-    for tick in range(1000):
+Steps = Callable[[float], list[int]]
+
+
+def warnings(clock: Clock, steps: Steps, rate: float = 100.0, seconds: int = 22, last: int = 10**6) -> list[Lag]:
+    """What a detector warns of; agents report their steps, from the time [s], every 0.2 s."""
+    detector, found = LagDetector(rate, clock), []
+    for tick in range(20 * seconds):
         clock.now = 100.0 + 0.05 * tick
-        assert detector.update([max(0, 20 * int(5 * (clock.now - 100.5)))] * 2) is None
+        if lag := detector.update(steps(0.2 * (tick // 4)), last):
+            found.append(Lag(round(lag.behind), lag.silent, round(lag.quiet)))
+    return found
 
 
-def test_a_run_at_half_the_speed(clock: Clock) -> None:
-    detector, told = LagDetector(100.0, clock), []
-    for second in range(40):
-        clock.now = 100.0 + second
-        if lag := detector.update([50 * second] * 3):
-            told.append((second, lag))
-    assert told == [(second, Lag(second / 2.0, ())) for second in (4, 8, 16, 32)]
+def on_time(t: float) -> int:
+    """Steps at a time: 100 a second from second 3 on."""
+    return max(0, round(100 * (t - 3.0)))
 
 
-def test_one_silent_agent_is_not_a_slow_network(clock: Clock) -> None:
-    """It stands still from second 10 on; the others are on time, until they are as slow."""
-    detector, told = LagDetector(100.0, clock), []
-    for second in range(30):
-        clock.now = 100.0 + second
-        on_time = 100 * second - (50 * (second - 13) if second > 13 else 0)
-        if lag := detector.update([on_time, on_time, 100 * min(second, 10)]):
-            told.append(lag)
-    assert told[0] == Lag(2.0, (2,), 2.0)
-    assert told[1:] == [Lag(4.0, (2,), 4.0), Lag(8.0, ()), Lag(16.0, ())]
+def with_silent(others: Callable[[float], float], until: float = 10.0) -> Steps:
+    """Agent 3 makes no step after a time; the others have made the steps of another time, which is not later."""
+    return lambda t: [on_time(others(t))] * 2 + [on_time(min(others(t), until))]
+
+
+def silent_for(*seconds: int) -> list[Lag]:
+    """Warnings of agent 3."""
+    return [Lag(0, (2,), each) for each in seconds]
+
+
+@pytest.mark.parametrize(
+    ("steps", "found"),
+    [
+        (with_silent(lambda t: t, 99.0), []),
+        (lambda t: [int(50 * t)] * 3, [Lag(2), Lag(4), Lag(8)]),
+        (with_silent(lambda t: t), silent_for(2, 4, 8)),
+        (with_silent(lambda t: t, 0.0), silent_for(2, 4, 8, 16)),
+        (with_silent(lambda t: t if t > 8 else 3 + (t - 3) / 1.6), silent_for(2, 4, 8)),
+        (with_silent(lambda t: t if t > 8 else 3 + (t - 3) / 2), [Lag(2), *silent_for(2, 4, 8)]),
+        (lambda t: [on_time(t)] * 2 + [on_time(t if t % 8 < 4.5 else t - t % 8 + 4.5)], silent_for(2, 2)),
+        (with_silent(lambda t: min(t, 8.0) if t < 18 else t, 99.0), []),
+        (
+            lambda t: [on_time(t), on_time(t if t < 14 else 7 + t / 2), on_time(min(t, 10))],
+            [*silent_for(2, 4), Lag(2, (2,), 8), Lag(2)],
+        ),
+    ],
+    ids=[
+        "on time",
+        "half the speed",
+        "one silent",
+        "one silent from the start",
+        "all a little late before",
+        "all late before, which is told",
+        "silent twice",
+        "all stand still",
+        "another is late, too",
+    ],
+)
+def test_one_silent_agent_is_not_a_slow_network(clock: Clock, steps: Steps, found: list[Lag]) -> None:
+    """Whatever has been told before, and however long all wait for their epoch."""
+    assert warnings(clock, steps) == found
+
+
+def test_one_silent_while_the_others_reach_the_end(clock: Clock) -> None:
+    steps = with_silent(lambda t: t)
+    assert warnings(clock, lambda t: [min(each, 900) for each in steps(t)], last=900) == silent_for(2, 4, 8)
+
+
+def test_seconds_between_two_steps(clock: Clock) -> None:
+    """An agent that makes a step every 3 s is not silent in between, nor late."""
+    assert warnings(clock, lambda t: [int((t - 0.3 * i) / 3.0) for i in range(3)], rate=1.0 / 3.0, seconds=60) == []
+
+
+def test_silent_agents_in_words() -> None:
     words = silence_text((2,), 2.0, 2, {2: 1234}, None)
     assert words == "agent 3 (PID 1234) has made no step for 2.0 s; the other 2 are on time"
-    two = silence_text((0, 2), 2.0, 1, {}, ["a", "b", "c"])
-    assert two == "agents a, c have made no step for 2.0 s; the other 1 is on time"
+    two = silence_text((0, 2), 2.0, 1, {}, ["a", "b", "c"], late=True)
+    assert two == "agents a, c have made no step for 2.0 s; the other 1 goes on"
 
 
 def test_a_clock_that_is_set(clock: Clock) -> None:
