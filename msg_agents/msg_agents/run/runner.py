@@ -49,12 +49,16 @@ from msg_analysis.bags.salvage import salvage_in_place
 from msg_analysis.bags.stored_file import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.writing import RECORDING_MARKER
 from msg_analysis.common.resources import available_cores
-from msg_analysis.common.text import agent_text, with_names
+from msg_analysis.common.text import agent_text
 from msg_analysis.errors import BagError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.twin.simulate import new_record
 
+OWN_LEASE = (  # where the middleware does not follow our profile, by which it waits an hour
+    "; the lease of the DDS participants, 20 s by default, may have ended while a process was stopped or very slow: "
+    "use a longer leaseDuration in your profile, or unset it"
+)
 FIRST_POLL, POLL = 0.02, 0.05  # s; the first until the switcher here knows of all agents
 
 
@@ -212,7 +216,8 @@ def run_network(
                         # Across hosts, and over links that are cut, others know better whether somebody is waited for.
                         alone = assignment is None and linked is None
                         stuck = StuckDetector(stuck_timeout) if alone else None
-                        _watch(*parts, follow_clock=not use_sim_time, stuck=stuck)
+                        advice = "" if uses_relay(environment or {}) else OWN_LEASE
+                        _watch(*parts, follow_clock=not use_sim_time, stuck=stuck, advice=advice)
                         view.end()
                     result.until = ending.to_json() if ending else None
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
@@ -253,6 +258,7 @@ def _watch(
     *,
     follow_clock: bool,  # whether the nodes' clock is that of this machine
     stuck: StuckDetector | None,
+    advice: str,  # what is added when it is stuck
 ) -> None:
     """Watch until all have done their part, one has failed for good, or a signal has ended the run."""
     began: float | None = None
@@ -280,14 +286,14 @@ def _watch(
             view.note(words)
             lag = LagDetector(due)
         if stall.update(sum(supervisor.steps)) and reached >= 0:
-            what = "no step" if reached < steps else "all steps are made, but no end"
-            view.note(f"{what} for {stall.stalled:.0f} s: {_stall_causes(supervisor, result.experiment.names)}")
+            view.note(f"{_still(reached < steps, stall.stalled)}: {supervisor.stall_causes(result.experiment.names)}")
         excused = run.pace == "realtime" and 0 <= reached < steps  # its clock may stand still
         excused |= stall.stalled > 1.0 and bool(supervisor.silent)
         if stuck and stuck.update(sum(supervisor.steps), excused=excused):
+            causes = supervisor.stall_causes(result.experiment.names)
             result.failures.append(
-                f"no step for {stuck.limit:g} s at step {reached}, though all processes run: messages do not arrive "
-                f"any more: {_stall_causes(supervisor, result.experiment.names)}"
+                f"{_still(reached < steps, stuck.limit)} at step {reached}, though all processes run: messages do not "
+                f"arrive any more: {causes}: run it again{advice}"
             )
             return
         if reached < 0:
@@ -311,19 +317,8 @@ def _watch(
         result.rate = min(supervisor.steps, default=0) / result.wall_time
 
 
-def _stall_causes(supervisor: Supervisor, names: Sequence[str] | None) -> str:
-    """Causes of a stall, as far as they are known; a silent process is stopped, or waits for one that is."""
-    words = [f"{node}: {message}" for node, message in sorted(supervisor.status().waiting.items())]
-    stopped = {child.spec.name: child.process.pid for child in supervisor.running if child.stopped}
-    if stopped:
-        words.append("stopped, and waited for: " + ", ".join(f"{name} (PID {pid})" for name, pid in stopped.items()))
-    silent = [child.spec.name for child in supervisor.silent if child.spec.name not in stopped]
-    if silent:
-        words.append("no report from " + ", ".join(silent))
-    if not words and supervisor.steps:  # the processes that know are on another host
-        last = min(supervisor.steps)
-        words.append(f"slowest: agent {supervisor.steps.index(last) + 1}, at step {last}")
-    return with_names("; ".join(words), names) or "cause unknown"
+def _still(steps_are_left: bool, seconds: float) -> str:
+    return f"{'no step' if steps_are_left else 'all steps are made, but no end'} for {seconds:.0f} s"
 
 
 def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View, events: EventLog) -> bool:

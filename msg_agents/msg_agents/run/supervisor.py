@@ -24,6 +24,7 @@ from msg_agents.run.fork_server import SHOW_STACKS, ForkServer, NodeStart
 from msg_agents.run.result import StatusSummary, read_report, read_status_files, read_steps
 from msg_agents.stepping.monitoring import LONGEST_LOOK
 from msg_analysis.common import programs
+from msg_analysis.common.text import with_names
 from msg_analysis.errors import ExitCode
 
 # Signals and the seconds that a process has to obey each; the second ones for one that has hung.
@@ -326,6 +327,23 @@ class Supervisor:
         """How far the clocks of several hosts are apart (None: not compared), and a warning."""
         report = read_report(self.logs / CLOCKS) or {}
         return report.get("offsets"), report.get("warning")
+
+    def stall_causes(self, names: Sequence[str] | None) -> str:
+        """Causes of a stall, as far as they are known; a silent process is stopped, or waits for one that is."""
+        words = [f"{node}: {message}" for node, message in sorted(self.status().waiting.items())]
+        stopped = {child.spec.name: child.process.pid for child in self.running if child.stopped}
+        if stopped:
+            listed = ", ".join(f"{name} (PID {pid})" for name, pid in stopped.items())
+            words.append(f"stopped, and waited for: {listed}")
+        silent = [child.spec.name for child in self.silent if child.spec.name not in stopped]
+        if silent:
+            words.append("no report from " + ", ".join(silent))
+        if not words and self.steps:  # the processes that know are on another host
+            last = min(self.steps)
+            awaited = ", ".join(child.spec.name for child in self.awaited)
+            slowest = f"slowest: agent {self.steps.index(last) + 1}, at step {last}"
+            words.append(slowest if last < self.last_step else f"waiting for the end of {awaited}")
+        return with_names("; ".join(words), names) or "cause unknown"
 
     @property
     def silent(self) -> list[Child]:

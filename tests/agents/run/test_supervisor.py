@@ -115,6 +115,27 @@ def test_the_recorder_is_ended_last(tmp_path: Path, start: Callable[..., Child])
     assert ended < told
 
 
+def test_causes_of_a_stall(tmp_path: Path, start: Callable[..., Child]) -> None:
+    """In order: of the nodes' own reports, of stopped and silent processes, and where all is unknown, of the steps."""
+    agent, recorder = start(OBEDIENT), start(OBEDIENT, "recorder")
+    supervisor = supervised(tmp_path, agent, recorder)
+    supervisor.last_step = 20
+    assert supervisor.stall_causes(None) == "no report from agent_1, recorder"
+    recorder.process.send_signal(signal.SIGSTOP)
+    wait_for(lambda: recorder.stopped)
+    stopped = f"stopped, and waited for: recorder (PID {recorder.process.pid})"
+    assert supervisor.stall_causes(None) == f"{stopped}; no report from agent_1"
+    recorder.process.send_signal(signal.SIGCONT)
+    wait_for(lambda: not recorder.stopped)
+    (tmp_path / "status").mkdir()
+    for name in ("agent_1", "recorder"):
+        (tmp_path / "status" / f"{name}.1.json").write_text("{}")
+    supervisor.steps = [7, 5]
+    assert supervisor.stall_causes(["Rome", "Ulm"]) == "slowest: agent Ulm, at step 5"
+    supervisor.steps = [20, 20]
+    assert supervisor.stall_causes(None) == "waiting for the end of agent_1, recorder"
+
+
 def test_a_stopped_process_is_ended_too(tmp_path: Path, start: Callable[..., Child]) -> None:
     child = start(OBEDIENT)
     child.process.send_signal(signal.SIGSTOP)
