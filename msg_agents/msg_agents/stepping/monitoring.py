@@ -142,24 +142,28 @@ class LagDetector:
         self._ages = StepAges(silent_after(rate), clock)
         self._limit = self._next_warning = 2.0 * silent_after(rate)  # s
         self._next: dict[int, float] = {}  # s without a step at which a silent agent is told again
+        self._patient_until = 0.0  # s; an agent that is back makes the steps that it has missed
 
     def update(self, steps: Sequence[int], last: float = inf) -> Lag | None:
         """After each look at the newest step of every agent: what to warn of now, and again when it has doubled."""
         self._ages.update(steps, last)
         silent = self._ages.silent()
+        now = self._clock()
+        if self._next.keys() - silent.keys():
+            self._patient_until = now + self._limit
         self._next = {agent: at for agent, at in self._next.items() if agent in silent}
         if self._ages.going is None:
             return None
         since, first = self._ages.going
         slowest = min((step for agent, step in enumerate(steps) if agent not in silent), default=first)
-        due = min(first + (self._clock() - since) * self._rate, last)
+        due = min(first + (now - since) * self._rate, last)
         behind = (due - slowest) / self._rate
         if any(quiet >= self._next.get(agent, self._limit) for agent, quiet in silent.items()):
             self._next = dict.fromkeys(silent, 2.0 * max(silent.values()))
             return Lag(behind, tuple(silent), min(silent.values()))
         if behind < self._limit / 2.0:
             self._next_warning = self._limit
-        if behind < self._next_warning:
+        if behind < self._next_warning or now < self._patient_until:
             return None
         self._next_warning = 2.0 * behind
         return Lag(behind)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -244,6 +245,7 @@ class Display:
         self.panel = panel
         self._console, self._web = console, web
         self._document: dict[str, Any] | None = None  # the newest on the page
+        self._description: threading.Thread | None = None  # gives the page what does not change
         # No thread: ``draw`` refreshes it.
         self._live = Live(console=console, auto_refresh=False, transient=transient, vertical_overflow="crop")
         self._jobs = JobControl(before=self._live.stop, after=lambda: self._live.start(refresh=True))
@@ -261,8 +263,10 @@ class Display:
 
     def begin(self, experiment: Experiment) -> bool:
         """Give the page what does not change in a run; whether anything is drawn."""
-        if self._web is not None:
-            self._web.begin(run_description(experiment))
+        if (web := self._web) is not None:
+            # What it imports can take seconds beside a network that starts, which has to be watched meanwhile.
+            self._description = threading.Thread(target=lambda: web.begin(run_description(experiment)), daemon=True)
+            self._description.start()
         return self.panel or self._web is not None
 
     def check(self) -> None:
@@ -281,6 +285,8 @@ class Display:
 
     def end(self, words: dict[str, Any], report: Path | None = None) -> None:
         """Tell the page how the run ended: "text", and "verdict" or None; it gets the report, too."""
+        if self._description is not None:
+            self._description.join()
         if self._web is not None:
             self._web.end(words, report)
 

@@ -79,6 +79,13 @@ def with_silent(others: Callable[[float], float], until: float = 10.0) -> Steps:
     return lambda t: [on_time(others(t))] * 2 + [on_time(min(others(t), until))]
 
 
+def with_backlog(stopped: float, back: float) -> Steps:
+    """Agent 3 stands still between two times, and is on time again a second later."""
+    return lambda t: (
+        [on_time(t)] * 2 + [on_time(t if t < stopped or t > back + 1 else max(stopped, t - (back - stopped)))]
+    )
+
+
 def silent_for(*seconds: int) -> list[Lag]:
     """Warnings of agent 3."""
     return [Lag(0, (2,), each) for each in seconds]
@@ -94,6 +101,7 @@ def silent_for(*seconds: int) -> list[Lag]:
         (with_silent(lambda t: t if t > 8 else 3 + (t - 3) / 1.6), silent_for(2, 4, 8)),
         (with_silent(lambda t: t if t > 8 else 3 + (t - 3) / 2), [Lag(2), *silent_for(2, 4, 8)]),
         (lambda t: [on_time(t)] * 2 + [on_time(t if t % 8 < 4.5 else t - t % 8 + 4.5)], silent_for(2, 2)),
+        (with_backlog(8.0, 11.5), silent_for(2)),
         (with_silent(lambda t: min(t, 8.0) if t < 18 else t, 99.0), []),
         (
             lambda t: [on_time(t), on_time(t if t < 14 else 7 + t / 2), on_time(min(t, 10))],
@@ -108,6 +116,7 @@ def silent_for(*seconds: int) -> list[Lag]:
         "all a little late before",
         "all late before, which is told",
         "silent twice",
+        "makes what it has missed",
         "all stand still",
         "another is late, too",
     ],

@@ -2,15 +2,17 @@
 
 import io
 import re
+import threading
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any, cast
 
 import networks
 import numpy as np
 import pytest
 from rich.console import Console
 
-from msg_agents.watch.panel import gauge, panel_of, plain_line
+from msg_agents.watch.panel import Display, gauge, panel_of, plain_line
 from msg_agents.watch.snapshot import (
     HoldingPeriods,
     Snapshot,
@@ -250,3 +252,20 @@ def test_refused_messages_are_an_event_once_for_each_reason() -> None:
     for count in (1, 2, 3):
         found = source.snapshot([4] * 5, LiveReport(0, 3, 4, 3, Estimate(), [], None, {"undecodable": count}))
     assert [text for _, text in found.events] == ["messages are refused: undecodable (1 so far)"]
+
+
+def test_a_page_that_is_not_ready_holds_up_nobody() -> None:
+    """The network is watched while its description is being made; the end waits for that."""
+    ready, seen = threading.Event(), []
+
+    def begin(_: dict[str, Any]) -> None:
+        ready.wait()
+        seen.append("begin")
+
+    web = SimpleNamespace(begin=begin, end=lambda *_: seen.append("end"))
+    display = Display(Console(), cast("Any", web), panel=False, transient=True)
+    assert display.begin(_experiment())
+    assert seen == []
+    ready.set()
+    display.end({})
+    assert seen == ["begin", "end"]
