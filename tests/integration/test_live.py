@@ -1,7 +1,9 @@
 """A network that is watched, running or played, by a process of its own: its errors, and its picture."""
 
 import json
+import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -179,6 +181,24 @@ def test_interrupted_it_says_what_it_has(
     assert re.search(
         f"after 1 s no network in ROS_DOMAIN_ID {domain} and within ROS_AUTOMATIC_DISCOVERY_RANGE {reach}", said
     )
+
+
+OTHER = 65534  # a user, which here may still read the files of this Python
+KEPT = "--inh-caps +dac_read_search --ambient-caps +dac_read_search"
+AS_OTHER = f"setpriv --reuid {OTHER} --regid {OTHER} --clear-groups {KEPT}".split()
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or not shutil.which("setpriv"), reason="run as root, with setpriv: another user")
+def test_a_user_whose_folder_others_have_taken(network: Any, domain: int) -> None:
+    """The log files of ROS, which cannot be written at home, are in a folder of that user all the same."""
+    shared = network.directory / "shared"
+    shared.mkdir()
+    shared.chmod(0o1777)
+    (shared / f"msg_agents-{OTHER}").mkdir(0o700)
+    live = network.execute("live", "--timeout", "1", machine=AS_OTHER, TMPDIR=str(shared), HOME="/root")
+    assert f"after 1 s no network in ROS_DOMAIN_ID {domain}" in network.ended(live, 2)[1]
+    (log,) = shared.glob("*/ros/*.log")
+    assert log.stat().st_uid == log.parents[1].stat().st_uid == OTHER
 
 
 PICTURES = """
