@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, Protocol, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
@@ -38,6 +38,7 @@ SMALL = 8  # agents that each have a process by ``processes: auto``; of more, so
 MOST_PROCESSES = 200  # of agents, which the relay connects: with all others they fill the ports of two ROS domains
 MOST_UNAIDED = 90  # of agents, which look for each other: some of the ``MOST_PARTICIPANTS`` of Fast DDS are others
 SPARE_PARTICIPANTS = 8  # participants on a host besides those of the run, such as tools that watch it
+Spec = TypeVar("Spec", bound=BaseModel)
 _RANGE = re.compile(r"([0-9]+)-([0-9]+)")
 
 
@@ -253,6 +254,16 @@ class HostsSpec(BaseModel):
     )
 
 
+def validated(kind: type[Spec], document: Any, source: str, keys: str) -> Spec:
+    """A document as such a model; the ExperimentError lists the mistakes, or says which ``keys`` are expected."""
+    if not isinstance(document, dict):
+        raise ExperimentError(source, [keys])
+    try:
+        return kind.model_validate(document)
+    except ValidationError as error:
+        raise ExperimentError(source, [translate(each, root=kind) for each in error.errors()]) from error
+
+
 @dataclass(frozen=True, slots=True)
 class Hosts:
     """A hosts file that fits an experiment."""
@@ -270,13 +281,8 @@ class Hosts:
     @classmethod
     def parse(cls, document: Any, experiment: Experiment, source: str = "hosts") -> Hosts:
         """Check a document from a YAML reader; the ExperimentError lists the mistakes, with ``source`` as place."""
-        if not isinstance(document, dict):
-            keys = "expected the keys domain, recorder and hosts: see `msg-agents host --help`"
-            raise ExperimentError(source, [keys])
-        try:
-            spec = HostsSpec.model_validate(document)
-        except ValidationError as error:
-            raise ExperimentError(source, [translate(each, root=HostsSpec) for each in error.errors()]) from error
+        keys = "expected the keys domain, recorder and hosts: see `msg-agents host --help`"
+        spec = validated(HostsSpec, document, source, keys)
         problems = assignment_problems({name: host.agents for name, host in spec.hosts.items()}, experiment.agents)
         if spec.recorder not in spec.hosts:
             wanted = f"expected one of the hosts, {', '.join(spec.hosts)}"

@@ -18,7 +18,6 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.twin.simulate import simulate
 
 STEPS, AGENTS = 300, 5
-SMALL = {"processes": 1, "duration": 5}
 
 
 def test_any_reader_finds_everything(network: Any) -> None:
@@ -184,12 +183,3 @@ def test_recorder_killed_between_two_files(network: Any) -> None:
         states = sum(info.msgcount for topic, info in reader.topics.items() if topic.endswith("state"))
         assert states == trajectory.completeness.received
         assert sum(1 for _ in reader.messages()) == reader.message_count
-
-
-def test_nothing_is_left_without_recording(network: Any) -> None:
-    file = network.file(run=SMALL)
-    run = network.start("run", file, "--no-record", "--json", "--out", network.directory / "runs")
-    result = network.result(run)
-    assert result["bag"] is None
-    assert result["failures"] == []
-    assert list(network.directory.iterdir()) == [file]

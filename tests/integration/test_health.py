@@ -123,7 +123,7 @@ def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
 @pytest.mark.timeout(150)
 def test_an_agent_that_was_not_given_the_end(network: Any) -> None:
     """It was stopped when the run ended: nothing is missing, so the run does not wait for it for ever."""
-    file = network.file(run={"duration": 6, "pace": "realtime", "processes": "one_per_agent"})
+    file = network.file(run={"duration": 6, "speed": 2, "pace": "realtime", "processes": "one_per_agent"})
     run = network.record(file, "--json")
     steps = network.wait_for_steps()
     (recorder,) = network.processes("recorder")

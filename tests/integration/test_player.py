@@ -60,7 +60,7 @@ def test_a_late_reader_gets_what_is_latched(network: Any, domain: int, twin_bag:
     """It comes in the middle of a replay that began in the middle: the experiment and the graphs are all there."""
     original = contents(mcap(twin_bag))
     played = network.start("play", twin_bag, "--start-offset", "7", "--rate", "0.5")
-    time.sleep(3.0)
+    time.sleep(2.0)
     late = plain(network.directory / "plain.mcap", {"/experiment": 1, "/graph": 2})
     network.ended(late)
     found = contents(network.directory / "plain.mcap")

@@ -18,8 +18,8 @@ from msg_agents.environment import node_environment
 from msg_agents.run.result import read_steps
 from msg_agents.run.supervisor import STEPS
 
-FAULTS = [["agent"], ["agent"] * 3, ["switcher"], ["agent", "switcher"]]
-RUN = {"duration": 150, "start": "zero", "processes": 3}  # 12 s, in the middle of which each fault happens
+FAULTS = [["agent"] * 3, ["switcher"], ["agent", "switcher"]]  # one agent: with the fork server, and below
+RUN = {"duration": 120, "start": "zero", "processes": 3}  # 10 s, in the middle of which each fault happens
 KILLED = r"(agents?_\w+|switcher): killed by SIGKILL.*, started again$"
 LISTENER = """
 import os, signal, struct, sys, rclpy

@@ -84,7 +84,7 @@ def test_a_worker_is_killed_in_the_middle(network: Any, cluster: tuple[str, list
 
 @pytest.mark.timeout(300)  # waits of several sweeps, on a machine that has much else to do
 def test_networks_interrupted_killed_and_resumed(network: Any) -> None:
-    """Sweeps in one directory: ended by SIGTERM, killed, resumed with a network that fails, resumed without."""
+    """Sweeps in one directory: ended by SIGTERM, killed, resumed with a network that fails."""
     # The false-alarm rate of the verdict is 1 %, with fixed seeds: none.
     out = network.directory / "out"
 
@@ -126,12 +126,7 @@ def test_networks_interrupted_killed_and_resumed(network: Any) -> None:
     assert result["points"][1]["reason"].startswith("stopped by Ctrl-C")
     check_against_the_twin(network, [row for row in result["points"] if row["status"] == "done"])
     assert not (out / "runs" / "report.html").exists()
-    (left,) = (out / "runs").iterdir()  # the others agree: their bags are not kept
-
-    process = started(15, 20)
-    result = network.result(process)
-    assert (result["done"], result["kept"], result["verdict"]) == (2, 2, "agrees")
-    assert list((out / "runs").iterdir()) == [left]
+    assert len(list((out / "runs").iterdir())) == 1  # the others agree: their bags are not kept
 
 
 @pytest.mark.timeout(300)

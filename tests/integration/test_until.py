@@ -70,9 +70,10 @@ def test_real_time(network: Any) -> None:
 
 
 def test_no_record(network: Any) -> None:
-    """Without a bag, and restarts, the result says how the run ended."""
-    stdout, stderr = start(network, "40%", "--restarts", "0", "--no-record", run=LONG).communicate(timeout=100)
-    assert '"ended_early": true' in stdout, stderr
+    """Without a bag, and restarts, the result says how the run ended, and nothing is left."""
+    result = network.result(start(network, "40%", "--restarts", "0", "--no-record", run=LONG))
+    assert (result["until"]["ended_early"], result["bag"], result["failures"]) == (True, None, [])
+    assert [path.name for path in network.directory.iterdir()] == ["net.yaml"]
 
 
 def test_not_reached(network: Any) -> None:

@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from msg_agents.channel.links import LinkSettings, LossModel
-from msg_agents.process_layout import agent_numbers, assignment_problems, process_name, split_agents
+from msg_agents.process_layout import agent_numbers, assignment_problems, process_name, split_agents, validated
 from msg_analysis.common.arrays import BoolArray, FloatArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import read_yaml
-from msg_analysis.experiment.problems import ExperimentError, problem, translate
+from msg_analysis.experiment.problems import ExperimentError, problem
 from msg_analysis.experiment.spec import expected, is_number
 
 BASE = "base"  # the host of recorder and switcher
@@ -166,13 +166,8 @@ class Channel:
     @classmethod
     def parse(cls, document: Any, experiment: Experiment, source: str = "channel") -> Channel:
         """Check a document from a YAML reader; the ExperimentError lists the mistakes, with ``source`` as place."""
-        if not isinstance(document, dict):
-            keys = ", ".join(ChannelSpec.model_fields)
-            raise ExperimentError(source, [f"expected some of the keys {keys}: see `msg-agents run --help`"])
-        try:
-            spec = ChannelSpec.model_validate(document)
-        except ValidationError as error:
-            raise ExperimentError(source, [translate(each, root=ChannelSpec) for each in error.errors()]) from error
+        keys = f"expected some of the keys {', '.join(ChannelSpec.model_fields)}: see `msg-agents run --help`"
+        spec = validated(ChannelSpec, document, source, keys)
         hosts, problems = _hosts(spec, experiment)
         default = _settings(spec.default, LinkSpec(), "default", problems)
         own = _pairs(spec, [BASE, *hosts], problems)

@@ -20,7 +20,6 @@ from msg_analysis.errors import InputError
 from msg_analysis.messages import topics
 from msg_analysis.messages.messages import AgentState
 
-RATE = 10.0  # pictures per second of wall time
 SPACING = 1.0  # m between neighbours on the circle
 AGENT_SIZE, EDGE_WIDTH, TEXT_SIZE = 0.4, 0.05, 0.35  # m
 MOST_NAMES = 100  # agents up to which each one is labelled with its number
@@ -169,11 +168,11 @@ def _at(x: float, y: float) -> Pose:
 
 def show_markers(
     *,
-    rate: float = RATE,
-    replica: int = 0,  # from 0
-    frame: str = "network",
-    timeout: float | None = None,  # s to wait for a network; None: no limit
-    on_note: Callable[[str], None] = lambda _: None,
+    rate: float,  # pictures per second of wall time
+    replica: int,  # from 0
+    frame: str,
+    timeout: float | None,  # s to wait for a network; None: no limit
+    on_note: Callable[[str], None],
 ) -> bool:
     """Publish markers of the network as ``run_watcher`` does; whether it was seen to be over."""
     node = run_watcher(

@@ -398,10 +398,10 @@ def play(
     path: Path,
     options: PlayOptions,
     *,
-    on_progress: Callable[[Played], None] = lambda _: None,
-    on_note: Callable[[str], None] = lambda _: None,
-    on_stop: Callable[[], None] = lambda: None,  # before Ctrl-Z stops the process
-    on_continue: Callable[[], None] = lambda: None,  # when it goes on
+    on_progress: Callable[[Played], None],
+    on_note: Callable[[str], None],
+    on_stop: Callable[[], None],  # before Ctrl-Z stops the process
+    on_continue: Callable[[], None],  # when it goes on
 ) -> Played:
     """Play a bag (or one of its files) in this process; BagError, InputError: not a bag, or not playable like that."""
     # Ctrl-C raises KeyboardInterrupt, another signal SystemExit: only ``on_progress`` then has said how far it came.

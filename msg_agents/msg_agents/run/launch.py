@@ -99,16 +99,16 @@ def flag(arguments: Mapping[str, str], name: str) -> bool:
     return word in TRUE
 
 
-def number(arguments: Mapping[str, str], name: str, *, least: float = 0.0) -> float | None:
-    """A launch argument that must be a number above ``least``, or empty (None)."""
+def number(arguments: Mapping[str, str], name: str) -> float | None:
+    """A launch argument that must be a number above 0, or empty (None)."""
     if not (text := arguments[name].strip()):
         return None
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not least < value < math.inf:
-        raise InputError(f"{name}:={text}: expected a number above {least:g}")
+    if not 0.0 < value < math.inf:
+        raise InputError(f"{name}:={text}: expected a number above 0")
     return value
 
 

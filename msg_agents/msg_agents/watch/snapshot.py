@@ -59,22 +59,6 @@ class StepRates:
         return rates, (min(after) - min(before)) / (now - then)
 
 
-class Presence:
-    """Which agents make no new steps, and since when."""
-
-    def __init__(self, names: Sequence[str] | None, after: float, clock: Callable[[], float]) -> None:
-        self._names, self._steps = names, StepAges(after, clock)
-        self.ages, self.silent = self._steps.ages, self._steps.silent
-        self.gone: set[int] = set()  # agents (from 0) whose process has ended, until a new one makes a step
-
-    def add(self, steps: Sequence[int], ended: Iterable[int], last: int) -> list[str]:
-        """Take the newest step of every agent, by index, and the agents whose process has ended; what is new."""
-        back = self._steps.update(steps, last)
-        returned = sorted(self.gone.intersection(back))
-        self.gone = self.gone.difference(back).union(ended)
-        return [f"{agent_text(agent + 1, self._names)} is back" for agent in returned if agent not in self.gone]
-
-
 class HoldingPeriods:
     """Finds the holding period of a step of a run."""
 
@@ -134,7 +118,9 @@ class SnapshotSource:
         self._last: int | None = None  # where the run ends early
         self._holding_periods, self._rates = HoldingPeriods(experiment), StepRates(clock)
         after = silent_after(due_rate(experiment)) if experiment.run.pace == "realtime" else math.inf
-        self._presence = Presence(experiment.names, after, clock)
+        self._ages = StepAges(after, clock)
+        self.silent = self._ages.silent
+        self._gone: set[int] = set()  # agents (from 0) whose process has ended, until a new one makes a step
         self._events: deque[tuple[int, str]] = deque(maxlen=MOST_EVENTS)
         self._refused: dict[str, int] = {}
         self._reached = -1
@@ -147,10 +133,6 @@ class SnapshotSource:
         """Something happened, now."""
         self._events.append((self._reached, text))
 
-    def silent(self) -> dict[int, float]:
-        """In real time: seconds without a step of agents (from 0) that have made none for a while, if others have."""
-        return self._presence.silent()
-
     def snapshot(
         self,
         steps: Sequence[int],
@@ -162,9 +144,11 @@ class SnapshotSource:
         """The snapshot now, from the newest step of every agent; ``ended``: those (from 0) without a process."""
         now = Snapshot(list(steps), report=report, note=note or (report.note if report else None), last=self._last)
         self._reached = max(self._reached, now.reached)
-        for text in self._presence.add(steps, ended, self._steps):
-            self.happened(text)
-        if silent := self.silent():
+        back, ended = set(self._ages.update(steps, self._steps)), set(ended)
+        for agent in sorted(self._gone & back - ended):
+            self.happened(f"{agent_text(agent + 1, self._names)} is back")
+        self._gone = self._gone - back | ended
+        if silent := self._ages.silent():
             quiet, others = min(silent.values()), len(steps) - len(silent)
             words = silence_text(sorted(silent), quiet, others, pids or {}, self._names)
             now = replace(now, silent=frozenset(silent), warning=words)
@@ -173,7 +157,7 @@ class SnapshotSource:
             if reason not in self._refused:
                 self.happened(f"messages are refused: {reason} ({count} so far)")
             self._refused[reason] = count
-        now = replace(now, ages=self._presence.ages(), gone=frozenset(self._presence.gone), events=tuple(self._events))
+        now = replace(now, ages=self._ages.ages(), gone=frozenset(self._gone), events=tuple(self._events))
         if now.reached < 0:
             return now
         self._rates.add(steps)
