@@ -260,6 +260,8 @@ class Display:
         if self.panel:
             self._jobs.__exit__(*_)
             self._live.stop()
+        if self._description is not None:
+            self._description.join()
 
     def begin(self, experiment: Experiment) -> bool:
         """Give the page what does not change in a run; whether anything is drawn."""
@@ -285,8 +287,6 @@ class Display:
 
     def end(self, words: dict[str, Any], report: Path | None = None) -> None:
         """Tell the page how the run ended: "text", and "verdict" or None; it gets the report, too."""
-        if self._description is not None:
-            self._description.join()
         if self._web is not None:
             self._web.end(words, report)
 

@@ -135,11 +135,6 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     refused(call("run", tmp_path / "binary"), "binary")
 
 
-def test_out_is_not_writable(small: Path) -> None:
-    """Even root writes nothing below /proc."""
-    refused(call("run", small, "--out", "/proc/runs"), "/proc/runs")
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -263,9 +263,9 @@ def test_a_page_that_is_not_ready_holds_up_nobody() -> None:
         seen.append("begin")
 
     web = SimpleNamespace(begin=begin, end=lambda *_: seen.append("end"))
-    display = Display(Console(), cast("Any", web), panel=False, transient=True)
-    assert display.begin(_experiment())
-    assert seen == []
-    ready.set()
+    with Display(Console(), cast("Any", web), panel=False, transient=True) as display:
+        assert display.begin(_experiment())
+        assert seen == []
+        ready.set()
     display.end({})
     assert seen == ["begin", "end"]
