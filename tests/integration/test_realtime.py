@@ -119,7 +119,7 @@ def test_without_a_clock(network: Any, option: list[str]) -> None:
     file = run_file(network.directory, 5, run=REALTIME)
     with free_domain() as domain:
         agents = [part for number in "12345" for part in ("--agent", number)]
-        node = network.execute("agent", file, *agents, "--discovery-timeout", "2", *option, ROS_DOMAIN_ID=str(domain))
+        node = network.execute("agent", file, *agents, "--discovery-timeout", "1", *option, ROS_DOMAIN_ID=str(domain))
         stdout, stderr = node.communicate(timeout=60)
     assert (node.returncode, stdout) == (2, ""), stderr
     assert "did not discover: a publisher of /clock." in stderr

@@ -165,7 +165,7 @@ def test_a_node_of_your_own(network: Any, domain: int) -> None:
     """A plain rclpy node sees graphs and states of a running network, and ends with it."""
     watching = python(watcher(), cwd=network.directory)
     network.wait_for(lambda: participants(domain), 60, "the watcher has a node")  # later it would wait for ever
-    file = network.file(run={"pace": "realtime", "speed": 2.5, "processes": 2})  # 6 s
+    file = network.file(run={"pace": "realtime", "speed": 5, "processes": 2})  # 3 s
     result = network.completed(network.record(file, "--domain", str(domain), "--json"))
     assert result["rejected_messages"] == []
     printed, _ = network.ended(watching)

@@ -60,10 +60,10 @@ def test_interrupted_again_and_again(network: Any, domain: int) -> None:
 
 def test_alone(network: Any, domain: int, record: Path) -> None:
     """Nobody comes: exit code 2 (something is wrong with what was started), naming everyone who is missing."""
-    options = ("--agent", "1", "--await", "recorder", "--discovery-timeout", "3")
+    options = ("--agent", "1", "--await", "recorder", "--discovery-timeout", "1")
     stdout, stderr = network.ended(network.start("agent", record, *options), 2)
     assert stdout == ""
-    error = re.search(r"^error: after 3 s (.*) did not discover: (.*?)\. Are they running", stderr, re.MULTILINE)
+    error = re.search(r"^error: after 1 s (.*) did not discover: (.*?)\. Are they running", stderr, re.MULTILINE)
     assert error, stderr
     assert error[2].split(", ") == ["agent_2", "agent_5", "recorder"]
     assert f"in ROS_DOMAIN_ID {domain} and" in stderr
@@ -100,7 +100,7 @@ def test_two_records_of_one_run(network: Any, domain: int, record: Path, other: 
     changed = record.with_name("changed.json")
     changed.write_text(json.dumps(document))
     files = {"agents": record, "recorder": record} | {other: changed}
-    options = ("--await", "recorder", "--timeout", "2", "--discovery-timeout", "30")
+    options = ("--await", "recorder", "--timeout", "2", "--discovery-timeout", "15")
     nodes = {
         "switcher": network.start("switcher", record, *options),
         "agents": network.start("agent", files["agents"], *agents("12345"), *options),

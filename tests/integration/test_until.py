@@ -166,12 +166,11 @@ def test_network_of_a_sweep(network: Any) -> None:
     assert all(500 < point["steps"] < PLANNED for point in points)
 
 
-@pytest.mark.parametrize("error", [MemoryError("too little"), ZeroDivisionError("a fault")])
-def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The run goes on to its planned end, and says that it was not watched."""
 
     def fail(_: object) -> None:
-        raise error
+        raise MemoryError("too little")
 
     monkeypatch.setattr(online_errors.LiveEstimate, "report", fail)
     notes: list[str] = []
@@ -181,9 +180,7 @@ def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch, error: Ex
     assert_equal_to_twin(result.trajectory)
     assert len(result.trajectory.modes) == 800
     assert not result.until["ended_early"]
-    assert result.until["reason"].startswith(
-        f"not known: the errors cannot be followed any more ({type(error).__name__}"
-    )
+    assert result.until["reason"].startswith("not known: the errors cannot be followed any more (MemoryError")
     assert any("the run goes on to step 800" in note for note in notes)
 
 
