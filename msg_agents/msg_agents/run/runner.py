@@ -301,7 +301,7 @@ def _watch(
         if lag and reached < steps and (late := lag.update(supervisor.steps, steps)):
             others, names = len(supervisor.steps) - len(late.silent), result.experiment.names
             view.note(
-                silence_text(late.silent, late.quiet, others, supervisor.pids, names, late=lag.late(late))
+                silence_text(late.silent, late.quiet, others, supervisor.pids, names)
                 if late.silent
                 else f"the network cannot keep up: it is {late.behind:.1f} s behind the {due:g} steps/s of real time: "
                 f"lower `run: speed: {run.speed:g}`, or give several agents to one process (`run: processes`)"

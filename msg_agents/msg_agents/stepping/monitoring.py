@@ -64,19 +64,12 @@ class StuckDetector:
 
 
 def silence_text(
-    agents: Sequence[int],
-    seconds: float,
-    others: int,
-    pids: Mapping[int, int],
-    names: Sequence[str] | None,
-    *,
-    late: bool = False,
+    agents: Sequence[int], seconds: float, others: int, pids: Mapping[int, int], names: Sequence[str] | None
 ) -> str:
-    """That these agents (from 0) have made no step for so long, while ``others``, perhaps late, have made some."""
+    """That these agents (from 0) have made no step for so long, while ``others`` have; ``pids`` of those known."""
     shown = [agent_name(i + 1, names) + (f" (PID {pids[i]})" if i in pids else "") for i in agents]
     who = f"agent {shown[0]} has" if len(shown) == 1 else f"agents {', '.join(shown)} have"
-    go_on = ("goes on" if late else "is on time") if others == 1 else "go on" if late else "are on time"
-    return f"{who} made no step for {seconds:.1f} s; the other {others} {go_on}"
+    return f"{who} made no step for {seconds:.1f} s; the other {others} {'is' if others == 1 else 'are'} on time"
 
 
 def silent_after(rate: float) -> float:
@@ -120,8 +113,8 @@ class StepAges:
         """Seconds without a step of those agents (from 0) that have made none for a while, although others have."""
         if self.going is None:
             return {}
-        now, (since, _) = self._clock(), self.going
-        quiet = [now - max(moved, since) for moved in self._moved]
+        most = self._clock() - self.going[0]
+        quiet = [min(age, most) for age in self.ages()]
         return {i: s for i, s in enumerate(quiet) if s > self._after and -1 < self._steps[i] < self._last}
 
 
@@ -129,8 +122,8 @@ class StepAges:
 class Lag:
     """What to warn of in a run in real time: silent agents, or that the others are behind their clock."""
 
-    behind: float  # s, of those that are not silent
-    silent: tuple[int, ...] = ()  # agents (from 0); empty: all are late
+    behind: float = 0.0  # s, of those that are not silent
+    silent: tuple[int, ...] = ()  # agents (from 0)
     quiet: float = 0.0  # s without a step of these
 
 
@@ -154,23 +147,18 @@ class LagDetector:
         self._next = {agent: at for agent, at in self._next.items() if agent in silent}
         if self._ages.going is None:
             return None
-        since, first = self._ages.going
-        slowest = min((step for agent, step in enumerate(steps) if agent not in silent), default=first)
-        due = min(first + (now - since) * self._rate, last)
-        behind = (due - slowest) / self._rate
         if any(quiet >= self._next.get(agent, self._limit) for agent, quiet in silent.items()):
             self._next = dict.fromkeys(silent, 2.0 * max(silent.values()))
-            return Lag(behind, tuple(silent), min(silent.values()))
+            return Lag(silent=tuple(silent), quiet=min(silent.values()))
+        since, first = self._ages.going
+        slowest = min((step for agent, step in enumerate(steps) if agent not in silent), default=first)
+        behind = (min(first + (now - since) * self._rate, last) - slowest) / self._rate
         if behind < self._limit / 2.0:
             self._next_warning = self._limit
         if behind < self._next_warning or now < self._patient_until:
             return None
         self._next_warning = 2.0 * behind
         return Lag(behind)
-
-    def late(self, lag: Lag) -> bool:
-        """Whether the agents that are not silent are behind, too."""
-        return lag.behind >= self._limit
 
 
 class ClockDetector:
