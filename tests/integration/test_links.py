@@ -19,6 +19,7 @@ REALTIME: dict[str, Any] = {"pace": "realtime", "speed": 5, "dt": 0.05, "duratio
 UNDISTURBED = REALTIME | {"duration": 7.5}  # 150 steps, where nobody is killed in the middle
 BY_LINK = {"default": 0.1, "edges": [[2, 3, 0.7]], "arcs": [[1, 2, 0.4]]}
 MESSAGES: dict[str, dict[str, Any]] = {
+    "plain": {},
     "own": {"broadcast": 0.3, "link": 0.2, "loss": 0.3},
     "hold": {"broadcast": 0.3, "link": 0.2, "loss": 0.4, "on_loss": "hold"},
     "late": {"broadcast": 0.3, "delay": 2},
@@ -78,7 +79,7 @@ def test_lockstep(network: Any, law: str, messages: str, processes: Any) -> None
             ("leaders", "hold", 2),
             ("consensus", "late", 2),
             ("grounded", "all", 2),
-            ("saturated", "own", 2),
+            ("saturated", "plain", 2),
             ("integral_action", "all", "one_per_agent"),
         ]
     ),
@@ -92,13 +93,6 @@ def test_real_time(network: Any, law: str, messages: str, processes: Any) -> Non
     noise = trajectory.record.experiment.noise
     silent = trajectory.used[100:, 3, 0] < 0  # agent 4 hears agent 3 in every graph
     assert silent.any() == bool(noise.loss.any and not noise.holds)
-
-
-def test_a_protocol_that_is_not_linear_in_real_time(network: Any) -> None:
-    """On plain links."""
-    what = network.experiment(**LAWS["saturated"], run={**UNDISTURBED, "start": "zero", "processes": 2})
-    result = network.run(what)
-    assert_equal(result.trajectory)
 
 
 def test_killed_agents_hold_again_what_they_held(network: Any) -> None:

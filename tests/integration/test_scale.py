@@ -31,15 +31,6 @@ def test_complete_and_equal_to_the_twin(network: Any, rows: int, columns: int, p
     assert result.trajectory.completeness.expected == agents * 41
 
 
-def test_a_killed_process_of_many_agents_comes_back(network: Any) -> None:
-    """What its agents had told each other directly has gone with it."""
-    run = {"duration": 100, "start": "zero", "processes": 2, "replicas": 16}
-    process = network.record(network.file(**grid(6, 5), run=run), "--restarts", "1", "--json")
-    network.wait_for_steps()
-    network.processes("agent")[0].kill()
-    assert len(network.completed(process)["restarts"]) == 1
-
-
 def complete(agents: int) -> dict[str, Any]:
     """Everybody hears everybody, or those on a ring."""
     return {"agents": agents, "graphs": {"all": {"complete": True}, "ring": {"cycle": [*range(1, agents + 1)]}}}

@@ -113,9 +113,9 @@ class StepAges:
         """Seconds without a step of those agents (from 0) that have made none for a while, although others have."""
         if self.going is None:
             return {}
-        most = self._clock() - self.going[0]
-        quiet = [min(age, most) for age in self.ages()]
-        return {i: s for i, s in enumerate(quiet) if s > self._after and -1 < self._steps[i] < self._last}
+        going_for = self._clock() - self.going[0]
+        left = [-1 < step < self._last and going_for > self._after for step in self._steps]
+        return {i: age for i, age in enumerate(self.ages()) if left[i] and age > self._after}
 
 
 @dataclass(frozen=True, slots=True)
