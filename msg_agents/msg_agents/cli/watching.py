@@ -142,7 +142,8 @@ def live(
     The network runs, or is played. It ends with the run, or with Ctrl-C (exit code 3: the end was not reached). The
     numbers are those of `msg-analysis compare`, also published on the topic `estimate`; they are not a verdict.
     """
-    from msg_agents.nodes.live import watch
+    from msg_agents.nodes.live import Live
+    from msg_agents.nodes.watch_process import run_watcher
     from msg_agents.watch.panel import Display
     from msg_analysis.report.comparison_text import live_document
 
@@ -155,15 +156,13 @@ def live(
             announce(served, web_host, print_note)
         with Display(console, served, panel=panel, transient=False) as display:
             view = LiveView(display, None if as_json or panel else print_text)
-            found = watch(
-                reliable=reliable,
-                record=record,
+            node = run_watcher(
+                lambda: Live(reliable=reliable, record=record, on_report=view.show, on_note=view.note),
                 timeout=timeout,
-                on_report=view.show,
                 on_note=print_note,
-                on_event=view.note,
                 on_look=display.check,
             )
+            found = None if node is None else node.outcome
         if found is not None:
             words = "The run has ended." if found.finished else "This page is no longer updated."
             display.end({"text": words, "verdict": None if found.finished else "incomplete"})
@@ -232,10 +231,15 @@ def markers(*, rate: float, replica: int, frame: str, timeout: float | None, dom
     mean (or the reference), and the links of the active graph. It ends with the run, or with Ctrl-C (exit code 3:
     the end was not reached). The network never waits for it.
     """
-    from msg_agents.nodes.markers import show_markers
+    from msg_agents.nodes.markers import Markers
+    from msg_agents.nodes.watch_process import run_watcher
 
     enter(domain)
-    over = show_markers(rate=rate, replica=replica - 1, frame=frame, timeout=timeout, on_note=print_note)
+    node = run_watcher(
+        lambda: Markers(rate=rate, replica=replica - 1, frame=frame, on_note=print_note),
+        timeout=timeout,
+        on_note=print_note,
+    )
     sys.stderr.flush()
     # All is done, and leaving the middleware may hang.
-    os._exit(ExitCode.FINE if over else ExitCode.INCOMPLETE)
+    os._exit(ExitCode.FINE if node is not None and node.done.done() else ExitCode.INCOMPLETE)

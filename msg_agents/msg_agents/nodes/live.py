@@ -9,14 +9,13 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from builtin_interfaces.msg import Time
 from msg_agents_interfaces.msg import Estimate as EstimateMsg
 from std_msgs.msg import Header
 
 from msg_agents.nodes.ros import every, until_shutdown
-from msg_agents.nodes.watch_process import Watcher, run_watcher
+from msg_agents.nodes.watch_process import Watcher
 from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.inference.online_errors import LiveEstimate, LiveReport
 from msg_analysis.messages import topics
@@ -160,16 +159,3 @@ class Live(Watcher):
 
 def _number(value: float | None) -> float:
     return math.nan if value is None else value
-
-
-def watch(
-    *,
-    reliable: bool = False,
-    record: RunRecord | None = None,  # None: of the topic ``experiment``
-    on_report: Callable[[Watched, float], None] = lambda *_: None,
-    on_event: Callable[[str], None] = lambda _: None,  # about the network
-    **options: Any,  # of ``run_watcher``
-) -> Watched | None:
-    """Watch a network; what was seen, or None without a network."""
-    node = run_watcher(lambda: Live(reliable=reliable, record=record, on_report=on_report, on_note=on_event), **options)
-    return node and node.outcome

@@ -14,7 +14,7 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from msg_agents.nodes.ros import every, until_shutdown
-from msg_agents.nodes.watch_process import Watcher, run_watcher
+from msg_agents.nodes.watch_process import Watcher
 from msg_analysis.common.text import agent_name
 from msg_analysis.errors import InputError
 from msg_analysis.messages import topics
@@ -164,18 +164,3 @@ def _at(x: float, y: float) -> Pose:
     pose = Pose()
     pose.position.x, pose.position.y, pose.orientation.w = x, y, 1.0
     return pose
-
-
-def show_markers(
-    *,
-    rate: float,  # pictures per second of wall time
-    replica: int,  # from 0
-    frame: str,
-    timeout: float | None,  # s to wait for a network; None: no limit
-    on_note: Callable[[str], None],
-) -> bool:
-    """Publish markers of the network as ``run_watcher`` does; whether it was seen to be over."""
-    node = run_watcher(
-        lambda: Markers(rate=rate, replica=replica, frame=frame, on_note=on_note), timeout=timeout, on_note=on_note
-    )
-    return node is not None and node.done.done()

@@ -154,8 +154,8 @@ Kind = TypeVar("Kind", bound=Watcher)
 def run_watcher(
     make_node: Callable[[], Kind],  # called after rclpy.init
     *,
-    timeout: float | None = None,
-    on_note: Callable[[str], None] = lambda _: None,
+    timeout: float | None,  # s to wait for a network; None: no limit
+    on_note: Callable[[str], None],
     on_look: Callable[[], None] = lambda: None,  # called about every ``SPIN_SLICE`` s, between two callbacks
 ) -> Kind | None:
     """Watch a network in this process until it is over or a signal comes; None: interrupted before there was a node."""
