@@ -41,9 +41,9 @@ def test_a_replay_recorded_again_is_the_original(network: Any, domain: int, plai
 def test_a_stopped_reader_loses_nothing(network: Any, domain: int, twin_bag: Path, plain: Any) -> None:
     """The bag again and again, to a reader that is stopped for 2 s: the player waits, and goes on where it was."""
     original, file = contents(mcap(twin_bag)), network.directory / "plain.mcap"
-    reader = plain(file, dict.fromkeys(original, 1000))
+    reader = plain(file, {topic: 6 * len(messages) for topic, messages in original.items()})
     played = network.start("play", twin_bag, "--rate", "max", "--wait-for-subscribers", "1", "--loop")
-    network.wait_for(lambda: file.exists() and file.stat().st_size > 50_000, 30, "messages")
+    network.wait_for(lambda: file.exists() and file.stat().st_size > 50_000, 60, "messages")
     reader.send_signal(signal.SIGSTOP)
     time.sleep(2.0)
     reader.send_signal(signal.SIGCONT)

@@ -174,8 +174,8 @@ def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(online_errors.LiveEstimate, "report", fail)
     notes: list[str] = []
-    four_seconds = {"pace": "realtime", "duration": 40, "speed": 10.0}  # the errors are looked at once a second
-    experiment = network.experiment(run=four_seconds | {"processes": 2})
+    eight_seconds = {"pace": "realtime", "duration": 40, "speed": 5.0}  # the errors are looked at once a second
+    experiment = network.experiment(run=eight_seconds | {"processes": 2})
     result = network.run(experiment, until=Until(0.5), on_note=notes.append)
     assert_equal_to_twin(result.trajectory)
     assert len(result.trajectory.modes) == 800
