@@ -38,6 +38,7 @@ def test_a_replay_recorded_again_is_the_original(network: Any, domain: int, plai
     assert (again.states == result.trajectory.states).all()
 
 
+@pytest.mark.timeout(240)
 def test_a_stopped_reader_loses_nothing(network: Any, domain: int, twin_bag: Path, plain: Any) -> None:
     """The bag again and again, to a reader that is stopped for 2 s: the player waits, and goes on where it was."""
     original, file = contents(mcap(twin_bag)), network.directory / "plain.mcap"
