@@ -115,7 +115,8 @@ def _is_quantity(name: str, values: Sequence[object]) -> bool:
     return bool(given) and not counts and all(_value(value) is not None for value in given)
 
 
-def _content(key: str, file: Path) -> bytes:
+def file_content(key: str, file: Path) -> bytes:
+    """The bytes of a file of bounded size; ``key`` is for the GraphError."""
     try:
         return read_bytes(file)
     except FileNotFoundError as error:
@@ -127,7 +128,7 @@ def _content(key: str, file: Path) -> bytes:
 def _tree(key: str, file: Path) -> Element:
     """The elements of an XML file by their local names. Not by networkx, which leaves out or refuses too much."""
     try:
-        root = ElementTree.fromstring(_content(key, file))
+        root = ElementTree.fromstring(file_content(key, file))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise GraphError(key, str(file), f"expected a GraphML file ({error})", "export it again") from error
     for element in root.iter():
@@ -284,7 +285,7 @@ def read_csv(key: str, file: Path) -> ForeignGraph:
 
 def _table(key: str, file: Path) -> tuple[str, list[tuple[int, list[str]]]]:
     """The separator of a CSV file, and its rows that are not empty, the header first, with their lines."""
-    content = _content(key, file)
+    content = filefile_content(key, file)
     utf_16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
         text = content.decode("utf-16" if utf_16 else "utf-8-sig")
@@ -321,7 +322,7 @@ def _set_points(
 
 def read_matrix(key: str, file: Path) -> list[list[float]]:
     """The rows of a matrix in a file, .csv or .npy; ``key`` is for the GraphError."""
-    content = _content(key, file)
+    content = filefile_content(key, file)
     try:
         if file.suffix == ".npy":
             matrix = np.load(io.BytesIO(content), allow_pickle=False)

@@ -1,0 +1,289 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Recorded topologies: tables that say which agents were linked, or where they were, and when."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from operator import itemgetter
+from pathlib import Path
+
+import numpy as np
+
+from msg_analysis.experiment.graph_files import GraphError, file_content, node_name
+from msg_analysis.experiment.problems import show
+from msg_analysis.experiment.spec import LARGEST_NUMBER
+
+ROUNDING = 1e-9  # of times: what differs by less, relative to its size, is the same time
+
+COLUMNS: Mapping[str, Sequence[str]] = {
+    "intervals": ("start", "end", "source", "target"),
+    "contacts": ("time", "source", "target"),
+    "schedule": ("time", "graph"),
+    "positions": ("time", "agent", "x", "y"),
+}
+"""Kinds of traces, and the columns that a table has which is one."""
+
+OPTIONAL = {"intervals": "weight", "contacts": "weight", "positions": "z"}
+_WANTED = "expected the columns " + " or ".join(",".join(columns) for columns in COLUMNS.values())
+_CORRECT = "correct the line"
+
+Link = tuple[int, int, float]
+"""Source, target (which listens to it) and weight; agents by their place in ``Trace.nodes``."""
+
+_Interval = tuple[float, float, Link]
+_Row = tuple[str, float, Sequence[str]]  # where it stands, its time, and its other cells in the order of the columns
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """Which graph was there when. A stretch of time lasts until the next one begins, the last one until ``end``.
+
+    Attributes
+    ----------
+    nodes
+        the agents as the file has them, in the order in which they appear; of a schedule, its graphs
+    graphs
+        the links of every graph that differs from the others, in the order in which they appear; none of a schedule
+    starts
+        (p,) where the stretches begin [units of simulated time], ascending from 0
+    which
+        (p,) graph of every stretch, from 0
+    end
+        where the last stretch ends; inf: the file does not say it
+    first
+        the time of the file that is time 0
+    directed
+        whether only its target hears a link
+    """
+
+    nodes: Sequence[str]
+    graphs: Sequence[Sequence[Link]]
+    starts: Sequence[float]
+    which: Sequence[int]
+    end: float
+    first: float
+    directed: bool
+
+
+def read_trace(
+    key: str, file: Path, *, hold: float | None = None, radius: float | None = None, directed: bool = True
+) -> Trace:
+    """The trace in a CSV file. GraphError: its mistake.
+
+    Parameters
+    ----------
+    key, file
+        in the experiment, for messages; where it is
+    hold
+        how long a contact or a position is valid, or the last graph of a schedule lasts [units of simulated time]
+    radius
+        distance up to which agents with positions are linked
+    directed
+        whether only the target of a contact or interval hears the other
+    """
+    kind, rows = _rows(key, file)
+    if kind == "contacts" and hold is None:
+        raise GraphError("switching.hold", "missing", "expected with contacts", "add how long one is valid")
+    if kind == "intervals" and hold is not None:
+        raise GraphError("switching.hold", hold, "expected none with intervals, which have an end", "remove it")
+    if kind == "positions" and radius is None:
+        raise GraphError("switching.radius", "missing", "expected with positions", "add how near linked agents are")
+    if kind != "positions" and radius is not None:
+        raise GraphError("switching.radius", radius, f"expected with positions, and this is {kind}", "remove it")
+    if kind == "schedule":
+        return _schedule(key, rows, hold)
+    nodes: dict[str, int] = {}
+    if radius is not None:
+        moments = _near(key, rows, nodes, radius, hold)
+    else:
+        moments = _moments(
+            _joined(key, _intervals(key, rows, nodes, hold), directed=directed, refreshed=hold is not None)
+        )
+    return _trace(nodes, moments, directed=directed and radius is None)
+
+
+def _rows(key: str, file: Path) -> tuple[str, Iterator[_Row]]:
+    """The kind of trace, and its rows in the order of time."""
+    try:
+        text = file_content(key, file).decode("utf-8-sig")
+        names: list[str] = []
+        for separator in (",", ";", "\t"):
+            table = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
+            names = [name.strip().lower() for name in next(table, [])]
+            found = next((kind for kind, columns in COLUMNS.items() if set(columns) <= set(names)), None)
+            if found:
+                break
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise GraphError(key, str(file), f"expected a CSV file in UTF-8 ({error})", "export it again") from error
+    if not found:
+        raise GraphError(key, f"{file}, line 1: {show(','.join(names))}", _WANTED, "correct the header")
+    wanted = [*COLUMNS[found], *([OPTIONAL[found]] if OPTIONAL.get(found) in names else [])]
+    if twice := next((name for name in wanted if names.count(name) > 1), None):
+        raise GraphError(key, f"{file}, line 1: {twice} twice", "expected it once", "remove one")
+    pick = itemgetter(*map(names.index, wanted))
+
+    def rows() -> Iterator[_Row]:
+        before = -math.inf
+        try:
+            for row in table:
+                if not any(row):
+                    continue
+                place = f"{file}, line {table.line_num}"
+                try:
+                    first, *others = pick(row)
+                except IndexError:
+                    shown = f"{place}: {show(separator.join(row))}"
+                    raise GraphError(key, shown, f"expected {len(names)} values as in the header", _CORRECT) from None
+                time = _number(key, place, wanted[0], first)
+                if time < before:
+                    expected = f"expected at least {before:.12g}, the one before"
+                    raise GraphError(key, f"{place}: {wanted[0]} {time:.12g}", expected, "sort the file by it")
+                before = time
+                yield place, time, others
+        except csv.Error as error:
+            raise GraphError(key, f"{file}, line {table.line_num}", f"expected CSV ({error})", _CORRECT) from error
+        if before == -math.inf:
+            raise GraphError(key, str(file), "expected rows below the header", "record something")
+
+    return found, rows()
+
+
+def _number(key: str, place: str, column: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= LARGEST_NUMBER:
+        raise GraphError(key, f"{place}: {column} {show(text)}", "expected a finite number", _CORRECT)
+    return value
+
+
+def _agent(key: str, text: str, nodes: dict[str, int]) -> int:
+    found = nodes.get(text)  # a million rows have few different ones
+    return nodes.setdefault(node_name(key, text, _CORRECT), len(nodes)) if found is None else found
+
+
+def _same(one: float, other: float) -> bool:
+    """Whether times differ by rounding only."""
+    return abs(one - other) <= ROUNDING * max(1.0, abs(one))
+
+
+def _schedule(key: str, rows: Iterable[_Row], hold: float | None) -> Trace:
+    nodes: dict[str, int] = {}
+    starts, which = [], []
+    for place, time, (graph, *_) in rows:
+        if starts and _same(time, starts[-1]):
+            raise GraphError(key, f"{place}: time {time:.12g} twice", "expected one graph at a time", _CORRECT)
+        starts.append(time)
+        which.append(nodes.setdefault(graph.strip(), len(nodes)))
+    end = math.inf if hold is None else starts[-1] - starts[0] + hold
+    return Trace(list(nodes), (), [time - starts[0] for time in starts], which, end, starts[0], directed=False)
+
+
+def _intervals(
+    key: str, rows: Iterable[_Row], nodes: dict[str, int], hold: float | None
+) -> Iterator[tuple[str, _Interval]]:
+    """When each row says that a link was there."""
+    for place, begin, cells in rows:
+        if hold is None:
+            end, cells = _number(key, place, "end", cells[0]), cells[1:]
+            if end <= begin or _same(begin, end):
+                raise GraphError(key, f"{place}: end {end:.12g}", f"expected more than start {begin:.12g}", _CORRECT)
+        else:
+            end = begin + hold
+        a, b = (_agent(key, cell, nodes) for cell in cells[:2])
+        weight = _number(key, place, "weight", cells[2]) if cells[2:] else 1.0
+        if a == b or weight <= 0.0:
+            shown, wanted = (
+                (show(cells[0]), "two different agents") if a == b else (f"weight {weight:g}", "a number > 0")
+            )
+            raise GraphError(key, f"{place}: {shown}", f"expected {wanted}", _CORRECT)
+        yield place, (begin, end, (a, b, weight))
+
+
+def _joined(
+    key: str, intervals: Iterable[tuple[str, _Interval]], *, directed: bool, refreshed: bool
+) -> Iterator[_Interval]:
+    """The same, no two of a link that touch; ``refreshed``: a later one takes over from an earlier one."""
+    open_: dict[tuple[int, int], _Interval] = {}
+    for place, (begin, end, (a, b, weight)) in intervals:
+        pair = (a, b) if directed or a < b else (b, a)
+        now = (begin, end, (*pair, weight))
+        if pair in open_:
+            since, until, link = open_[pair]
+            if not refreshed and begin < until and not _same(begin, until):
+                shown, wanted = f"{place}: start {begin:.12g}", f"expected at least {until:.12g}, where this link ended"
+                raise GraphError(key, shown, wanted, "correct one of the two")
+            if begin > until and not _same(begin, until):
+                yield since, until, link
+            elif link[2] == weight:
+                now = (since, max(end, until), link)
+            elif not _same(since, begin):
+                yield since, begin, link
+        open_[pair] = now
+    yield from open_.values()
+
+
+def _moments(intervals: Iterable[_Interval]) -> Iterator[tuple[float, frozenset[Link]]]:
+    """From each time on, the links that are there; the last one is the end."""
+    begins, ends, links = zip(*intervals, strict=True)
+    times = np.concatenate([ends, begins])
+    there: set[Link] = set()
+    order = np.argsort(times, kind="stable").tolist()  # at one time, links go before others come
+    count = len(ends)
+    for number, place in enumerate(order):
+        (there.discard if place < count else there.add)(links[place % count])
+        if number + 1 == len(order) or not _same(times[place], times[order[number + 1]]):
+            yield float(times[place]), frozenset(there)
+
+
+def _near(
+    key: str, rows: Iterable[_Row], nodes: dict[str, int], radius: float, hold: float | None
+) -> Iterator[tuple[float, frozenset[Link]]]:
+    """The same of agents with places, which are linked while they are within the radius."""
+    from scipy.spatial import KDTree  # here, since every process of a run would wait for it
+
+    places: dict[int, tuple[float, Sequence[float]]] = {}  # until when it is valid, and where
+    time = 0.0
+
+    def links() -> frozenset[Link]:
+        agents = sorted(places)
+        pairs = KDTree([places[agent][1] for agent in agents]).query_pairs(radius) if len(agents) > 1 else ()
+        return frozenset((agents[a], agents[b], 1.0) for a, b in pairs)
+
+    def forget(until: float) -> Iterator[tuple[float, frozenset[Link]]]:
+        for end in sorted({end for end, _ in places.values() if end < until}):
+            for agent in [agent for agent, (valid, _) in places.items() if valid <= end]:
+                del places[agent]
+            yield end, links()
+
+    for time, group in groupby(rows, key=itemgetter(1)):
+        yield from forget(time)
+        for place, _, (name, *cells) in group:
+            agent = _agent(key, name, nodes)
+            where = [_number(key, place, column, cell) for column, cell in zip("xyz", cells, strict=False)]
+            places[agent] = (time + hold if hold else math.inf, where)
+        yield time, links()
+    yield from forget(time + (hold or 0.0))
+    yield time + (hold or 0.0), frozenset()
+
+
+def _trace(nodes: Mapping[str, int], moments: Iterable[tuple[float, frozenset[Link]]], *, directed: bool) -> Trace:
+    numbers: dict[frozenset[Link], int] = {}
+    starts: list[float] = []
+    which: list[int] = []
+    first = end = math.nan
+    for (time, links), (end, _) in pairwise(moments):
+        first = time if not which else first
+        number = numbers.setdefault(links, len(numbers))
+        if not _same(time, end) and which[-1:] != [number]:
+            starts.append(time - first)
+            which.append(number)
+    return Trace(list(nodes), [sorted(links) for links in numbers], starts, which, end - first, first, directed)
