@@ -20,7 +20,7 @@ from msg_analysis.experiment import loading, protocols, validation
 from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.loading import Sections, other_kind, read_yaml
-from msg_analysis.experiment.markov_chain import MarkovChain, Time
+from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time, require_chain
 from msg_analysis.experiment.problems import ExperimentError, problem, show
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
 from msg_analysis.experiment.spec import ExperimentSpec, NoiseSpec, Purpose, RunSpec, SwitchingSpec, json_schema
@@ -52,8 +52,8 @@ class Experiment(Variants):
         the normalised document: defaults written out, number of agents known, GraphML files read
     graph_list
         the n graphs, in the order of the modes
-    chain
-        the Markov chain that switches between the graphs
+    switching_law
+        what switches between the graphs: a Markov chain, or a schedule
     noise_gain
         (n, m, m) F_i; Q_i = F_i F_i^T
     loss
@@ -68,7 +68,7 @@ class Experiment(Variants):
 
     spec: ExperimentSpec
     graph_list: tuple[Graph, ...]
-    chain: MarkovChain
+    switching_law: MarkovChain | Schedule
     noise_gain: FloatArray
     loss: FloatArray
     source: str = "experiment"
@@ -416,6 +416,16 @@ class Experiment(Variants):
         return self.spec.time
 
     @property
+    def chain(self) -> MarkovChain:
+        """The Markov chain that switches between the graphs; NotAvailableError where they have a schedule."""
+        return require_chain(self.switching_law)
+
+    @property
+    def schedule(self) -> Schedule | None:
+        """The given sequence of the graphs; None where a chain switches between them."""
+        return self.switching_law if isinstance(self.switching_law, Schedule) else None
+
+    @property
     def agents(self) -> int:
         """Number of agents m."""
         return self.graph_list[0].agents
@@ -461,6 +471,14 @@ class Experiment(Variants):
     def reference(self) -> float:
         """The value that tracking agents should reach; 0 for consensus."""
         return self.spec.leaders.reference if self.spec.leaders else 0.0
+
+    @property
+    def known_start(self) -> FloatArray | None:
+        """(m,) x(0); None where it is drawn from the steady state."""
+        start = self.run.start
+        if start == "stationary":
+            return None
+        return np.zeros(self.agents) if start == "zero" else np.array(start, dtype=float)
 
     @property
     def steps(self) -> int:

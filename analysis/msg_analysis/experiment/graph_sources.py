@@ -222,9 +222,10 @@ def link_problems(
 
 def build_graph(name: str, spec: GraphSpec, agents: int) -> Graph:
     """The graph with its (m, m) adjacency, from a spec without mistakes."""
-    adjacency = np.zeros((agents, agents))
-    for i, j, weight in links(spec, agents):
-        adjacency[j - 1, i - 1] = weight
-        if spec.arcs is None:
-            adjacency[i - 1, j - 1] = weight
-    return Graph(name, adjacency)
+    found = links(spec, agents)
+    if spec.arcs is None:
+        found += [(j, i, weight) for i, j, weight in found]
+    found.sort(key=lambda arc: (arc[1], arc[0]))
+    sources, targets, weights = zip(*found, strict=True) if found else ((), (), ())
+    ends = np.array(targets, dtype=np.int64) - 1, np.array(sources, dtype=np.int64) - 1
+    return Graph(name, agents, *ends, np.array(weights, dtype=float))

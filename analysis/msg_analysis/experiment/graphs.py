@@ -39,41 +39,62 @@ def widest_reaching(leads: BoolArray) -> list[int]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Graph:
-    """One mode of the switching network.
+    """One mode of the switching network; agent t listens to agent s with weight ``a[t, s]`` [1 / unit of time].
 
     Attributes
     ----------
     name
         name of the graph in the experiment file
-    adjacency
-        (m, m), zero diagonal; ``adjacency[i, j]`` [1 / unit of time] is the weight with which agent i listens to
-        agent j (from 0). Symmetric for an undirected graph.
+    agents
+        number of agents m
+    targets, sources, weights
+        (l,) every arc: who listens, to whom (agents from 0), and the weight; sorted by target, then source
     """
 
     name: str
-    adjacency: FloatArray
+    agents: int
+    targets: IntArray
+    sources: IntArray
+    weights: FloatArray
+
+    @classmethod
+    def of(cls, name: str, adjacency: FloatArray) -> Graph:
+        """The graph with this ``adjacency`` (m, m)."""
+        targets, sources = np.nonzero(adjacency)
+        return cls(name, len(adjacency), targets, sources, adjacency[targets, sources])
 
     @property
-    def agents(self) -> int:
-        """Number of agents m."""
-        return int(self.adjacency.shape[0])
+    def adjacency(self) -> FloatArray:
+        """(m, m) weights ``a``, zero diagonal; symmetric for an undirected graph."""
+        matrix = np.zeros((self.agents, self.agents))
+        matrix[self.targets, self.sources] = self.weights
+        return matrix
 
     @property
     def laplacian(self) -> FloatArray:
         """(m, m) in-degree Laplacian L = D - A; every row sums to zero (section II of the paper)."""
-        return np.diag(self.adjacency.sum(axis=1)) - self.adjacency
+        adjacency = self.adjacency
+        return np.diag(adjacency.sum(axis=1)) - adjacency
+
+    @property
+    def degrees(self) -> FloatArray:
+        """(m,) in-degrees: sums of the weights with which each agent listens."""
+        return np.bincount(self.targets, self.weights, self.agents)
 
     @property
     def symmetric(self) -> bool:
         """Whether the graph is undirected."""
-        return bool(np.array_equal(self.adjacency, self.adjacency.T))
+        adjacency = self.adjacency
+        return bool(np.array_equal(adjacency, adjacency.T))
 
     @property
     def arcs(self) -> list[tuple[int, int, float]]:
         """(source, target, weight) of every arc, agents from 1: target listens to source. Sorted by target, source."""
-        return [(s + 1, t + 1, float(self.adjacency[t, s])) for t, s in np.argwhere(self.adjacency).tolist()]
+        ends = (self.sources + 1).tolist(), (self.targets + 1).tolist()
+        return list(zip(*ends, self.weights.tolist(), strict=True))
 
     @property
     def edges(self) -> list[tuple[int, int, float]]:
         """(i, j, weight), i < j, of every pair that listen to each other with equal weight, agents from 1."""
-        return [(s, t, w) for s, t, w in self.arcs if s < t and self.adjacency[s - 1, t - 1] == w]
+        arcs = set(self.arcs)
+        return [(s, t, w) for s, t, w in self.arcs if s < t and (t, s, w) in arcs]

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import re
 from collections.abc import Hashable, Mapping, Sequence
@@ -22,10 +23,12 @@ from msg_analysis.errors import InputError
 from msg_analysis.experiment import graph_files, graph_sources, protocols, validation
 from msg_analysis.experiment.graph_files import ForeignGraph, GraphError
 from msg_analysis.experiment.graphs import Graph
-from msg_analysis.experiment.markov_chain import MarkovChain, Time
+from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
 from msg_analysis.experiment.problems import WEIGHT, problem, show, translate
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
-from msg_analysis.experiment.spec import BESIDE, ExperimentSpec, GraphSpec, NoiseSpec, RunSpec
+from msg_analysis.experiment.spec import BESIDE, ExperimentSpec, GraphSpec, NoiseSpec, RunSpec, SwitchingSpec
+from msg_analysis.experiment.traces import read_trace
+from msg_analysis.experiment.validation import STEP_TOLERANCE
 
 
 class _StrictLoader(SAFE_LOADER):  # type: ignore[misc]  # one of two classes: see there
@@ -235,7 +238,7 @@ class Sections:
             self.values["run"] = run.model_copy(update={"dt": 1.0})
         self.agents: int | None = None
         self.graphs: tuple[Graph, ...] = ()
-        self.chain: MarkovChain | None = None
+        self.switching: MarkovChain | Schedule | None = None
         self.noise_gain: FloatArray | None = None
         self.loss: FloatArray | None = None
         self._recorded = recorded  # the protocol of a recorded run need not be installed
@@ -245,9 +248,11 @@ class Sections:
         """Check what several keys say together; paths in the document are relative to ``directory``."""
         time = self.values["time"]
         self._find_protocol()
+        self._read_trace(directory)
         self._count_agents(directory)
         self._name_leaders()
         self._name_start()
+        self._fit_run()
         run = self.values["run"]
         leaders = self.values["leaders"]
         leaders_good = self.values["problem"] is not None and "leaders" in self.known
@@ -256,7 +261,7 @@ class Sections:
             leaders_good = not found
             self.problems += found
         if self.values["graphs"] and self.values["switching"] and time:
-            self.chain, found = validation.chain_of(self.values["switching"], list(self.values["graphs"]), time)
+            self.switching, found = validation.switching_of(self.values["switching"], list(self.values["graphs"]), time)
             self.problems += found
         whole_steps = False
         if run and time:
@@ -285,7 +290,7 @@ class Sections:
         return {
             "spec": ExperimentSpec.model_construct(**(self.values | {"agents": self.agents})),
             "graph_list": self.graphs,
-            "chain": self.chain,
+            "switching_law": self.switching,
             "noise_gain": self.noise_gain,
             "loss": self.loss,
             "protocol": self.protocol,
@@ -302,6 +307,63 @@ class Sections:
             parameters = self.protocol.parameters.model_dump(mode="json")
             self.values["protocol"] = type(spec).model_validate({"name": spec.name, **parameters})
 
+    def _read_trace(self, directory: Path) -> None:
+        """The graphs and the schedule of a trace, in place of it."""
+        switching: SwitchingSpec | None = self.values["switching"]
+        graphs: dict[str, GraphSpec] | None = self.values["graphs"]
+        if switching is None or graphs is None:
+            return
+        key = "switching.trace"
+        if switching.trace is None:
+            if not graphs:
+                self.problems.append(problem("graphs", "missing", "expected at least one graph", "add one"))
+                self.values["graphs"] = None
+            return
+        try:
+            file, directed = directory / switching.trace, not switching.undirected
+            trace = read_trace(key, file, hold=switching.hold, radius=switching.radius, directed=directed)
+            if switching.schedule is not None or bool(graphs) == bool(trace.graphs):
+                wanted = "none with a trace of links" if trace.graphs else "the graphs that the trace names"
+                raise GraphError("graphs", listed(graphs) or "missing", f"expected {wanted}", "correct one of the two")
+        except GraphError as error:
+            self.problems.append(str(error))
+            self.values["graphs"] = self.values["switching"] = None
+            return
+        names = trace.nodes
+        if trace.graphs:
+            names = [f"g{number}" for number in range(1, len(trace.graphs) + 1)]
+            weight, nodes = switching.weight or 1.0, trace.nodes
+            for name, links in zip(names, trace.graphs, strict=True):
+                found = [(nodes[a], nodes[b], weight * each) for a, b, each in links]
+                self._foreign[name] = ForeignGraph(nodes if name == "g1" else (), found, trace.directed)
+                graphs[name], self.keys[name] = GraphSpec.model_construct(edges=[]), key
+        keys = ("trace", "hold", "radius", "undirected", "weight")
+        schedule = [(start, names[graph]) for start, graph in zip(trace.starts, trace.which, strict=True)]
+        given = {"schedule": schedule, "end": None if math.isinf(trace.end) else trace.end}
+        self.values["switching"] = switching.model_copy(update=dict.fromkeys(keys) | given)
+        if trace.first != 0.0:
+            self.notes.append(f"{key}: time 0 of the run is {trace.first:.12g} in the file")
+
+    def _fit_run(self) -> None:
+        """A run of a schedule begins at known places, and ends with it at the latest."""
+        run: RunSpec | None = self.values["run"]
+        switching: SwitchingSpec | None = self.values["switching"]
+        if run is None or switching is None or switching.schedule is None:
+            return
+        changes: dict[str, Any] = {}
+        if run.start == "stationary":
+            changes["start"] = "zero"
+            if "start" in run.model_fields_set:
+                wanted = "expected 'zero' or values, since a schedule has no steady state"
+                self.problems.append(problem("run.start", "stationary", wanted, "say where the agents are"))
+        if switching.end is not None and not switching.repeat:
+            if "duration" not in run.model_fields_set:
+                changes["duration"] = max(1, math.floor(switching.end / run.dt * (1.0 + STEP_TOLERANCE))) * run.dt
+            elif run.duration > switching.end * (1.0 + STEP_TOLERANCE):
+                wanted = f"expected at most {switching.end:.12g}, where the schedule ends"
+                self.problems.append(problem("run.duration", run.duration, wanted, "lower it, or add `repeat: true`"))
+        self.values["run"] = run.model_copy(update=changes)
+
     def _count_agents(self, directory: Path) -> None:
         """The number of agents and their names, if every graph is valid; files with graphs are read here."""
         graphs: dict[str, GraphSpec] | None = self.values["graphs"]
@@ -309,6 +371,8 @@ class Sections:
             return
         before = len(self.problems)
         for name, spec in graphs.items():
+            if name in self._foreign:  # of a trace
+                continue
             if name == "stationary":
                 wanted = "expected another name, since switching.initial uses this one"
                 self.problems.append(problem("graphs", "'stationary'", wanted, "rename the graph"))

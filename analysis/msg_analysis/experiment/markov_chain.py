@@ -1,11 +1,13 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The Markov chain that switches between the graphs."""
+"""What switches between the graphs: a Markov chain, or a schedule."""
 
 from __future__ import annotations
 
+import itertools
 import math
+import sys
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,7 +16,8 @@ from typing import Literal
 import numpy as np
 
 from msg_analysis.arithmetic.reproducible import exponential, reproducible_product
-from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.errors import NotAvailableError
 from msg_analysis.experiment.graphs import hops
 
 Time = Literal["continuous", "discrete"]
@@ -128,6 +131,42 @@ class MarkovChain:
                 held = float(random.geometric(min(leaving[mode], 1.0)))
             yield mode, held
             mode = _draw(jumps[mode], random)
+
+
+ROUNDING = 1e-9  # relative, of times in steps: what is so near to a step begins with it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Schedule:
+    """A given sequence of the n graphs: recorded, or made by an engineer."""
+
+    starts: FloatArray  # (p,) when each stretch begins [units of simulated time], ascending from 0
+    order: IntArray  # (p,) graph of each stretch, from 0
+    modes: int  # number of graphs n
+    end: float  # when the last stretch ends; inf: never
+    repeat: bool  # whether it then begins again
+
+    @property
+    def stationary(self) -> FloatArray:
+        """(n,) shares of time of the graphs, up to the end or the beginning of the last stretch."""
+        ends = np.append(self.starts[1:], self.starts[-1:] if math.isinf(self.end) else self.end)
+        spent = np.bincount(self.order, ends - self.starts, self.modes)
+        return np.asarray(spent / spent.sum() if spent.any() else np.eye(self.modes)[self.order[0]])
+
+    def stretches(self, dt: float) -> Iterator[tuple[int, int]]:
+        """(mode, the step from which on it is not used any more) of each stretch, without end where it repeats."""
+        ends = [*self.starts[1:].tolist(), self.end]
+        for turn in itertools.count() if self.repeat else (0,):
+            for mode, end in zip(self.order.tolist(), ends, strict=True):
+                steps = (end + turn * self.end if turn else end) / dt
+                yield mode, sys.maxsize if math.isinf(steps) else math.ceil(steps - ROUNDING * max(1.0, steps))
+
+
+def require_chain(switching: MarkovChain | Schedule) -> MarkovChain:
+    """The chain; NotAvailableError where the graphs have a schedule instead."""
+    if isinstance(switching, Schedule):
+        raise NotAvailableError("switching: the sequence of the graphs is given: expected a Markov chain for this")
+    return switching
 
 
 def _cumulative(law: FloatArray) -> list[float]:

@@ -184,7 +184,7 @@ class GraphSpec(Section):
 
 
 class SwitchingSpec(Section):
-    """The Markov chain that switches between the graphs. May be left out where there is one graph."""
+    """What switches between the graphs: a Markov chain, or a schedule. May be left out where there is one graph."""
 
     generator: Matrix | None = Field(
         None,
@@ -203,6 +203,35 @@ class SwitchingSpec(Section):
         examples=[[[0.9, 0.1], [0.2, 0.8]]],
     )
     initial: str = Field("stationary", description="'stationary' or a graph's name", examples=["stationary"])
+    schedule: Annotated[list[tuple[NonNegative, GraphName]], Field(min_length=1)] | None = Field(
+        None,
+        description="instead of a chain: [time, graph], when each graph begins, from 0 on",
+        examples=[[[0, "line"], [2.5, "ring"]]],
+    )
+    end: Positive | None = Field(
+        None, description="when the last graph of the schedule ends; by default with the run", examples=[10.0]
+    )
+    repeat: bool | None = Field(None, description="whether the schedule then begins again", examples=[True])
+    trace: str | None = Field(
+        None,
+        min_length=1,
+        description="instead of graphs and a chain: a CSV file, relative to the experiment file, of what was recorded, "
+        "with the columns time,source,target or start,end,source,target (target listens to source), and weight; or "
+        "time,agent,x,y and z; or, with graphs, time,graph. Its first time is time 0 of the run",
+        examples=["contacts.csv"],
+    )
+    hold: Positive | None = Field(
+        None, description="with a trace: how long a contact, a position or the last graph is valid", examples=[1.0]
+    )
+    radius: Positive | None = Field(
+        None, description="with a trace of positions: up to which distance agents are linked", examples=[2.5]
+    )
+    undirected: bool | None = Field(
+        None, description="with a trace: whether the source of a link listens to its target, too", examples=[True]
+    )
+    weight: Positive | None = Field(
+        None, description="with a trace: multiplies the weights of its links, which are 1 by default", examples=[0.2]
+    )
 
 
 LARGEST_BURST = 1e6  # messages: what an agent that restarts has to draw again grows with it
@@ -468,8 +497,8 @@ class ExperimentSpec(Section):
         examples=[["north", "south"]],
     )
     graphs: dict[GraphName, GraphSpec] = Field(
-        min_length=1,
-        description="named graphs; their order is the order of the modes",
+        {},
+        description="named graphs; their order is the order of the modes. None with a trace that has them",
         examples=[{"line": {"path": [1, 2, 3]}}],
     )
     switching: SwitchingSpec = Field(

@@ -14,7 +14,7 @@ import numpy as np
 from msg_analysis.common.arrays import BoolArray, FloatArray
 from msg_analysis.common.text import agent_name, agent_text, listed
 from msg_analysis.experiment.graphs import Graph, hops, widest_reaching
-from msg_analysis.experiment.markov_chain import MarkovChain, Time
+from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
 from msg_analysis.experiment.problems import problem, show
 from msg_analysis.experiment.spec import LeadersSpec, LossSpec, NoiseGain, NoiseSpec, Purpose, RunSpec, SwitchingSpec
 
@@ -33,7 +33,47 @@ LONGEST_DURATION = 2**31 - 1
 """A message's stamp has 32 bits for the seconds of simulated time."""
 
 
-def chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tuple[MarkovChain | None, list[str]]:
+SCHEDULE_KEYS = ("end", "repeat", "hold", "radius", "undirected", "weight")
+"""Of ``switching``, that belong to a schedule or a trace."""
+
+
+def switching_of(
+    switching: SwitchingSpec, names: Sequence[str], time: Time
+) -> tuple[MarkovChain | Schedule | None, list[str]]:
+    """What the file says that switches, and what is wrong with it (then it is None)."""
+    if switching.schedule is None:
+        given = [key for key in SCHEDULE_KEYS if getattr(switching, key) is not None]
+        lines = [problem(f"switching.{key}", getattr(switching, key), "expected with a schedule or a trace", "remove it") for key in given]
+        chain, found = _chain_of(switching, names, time)
+        return (None if lines else chain), lines + found
+    found = []
+    for key in ("generator", "rates", "transition"):
+        if getattr(switching, key) is not None:
+            found.append(problem(f"switching.{key}", "given", "expected a chain or a schedule", "remove one of them"))
+    before = -1.0
+    for place, (start, name) in enumerate(switching.schedule, start=1):
+        key = f"switching.schedule[{place}]"
+        if name not in names:
+            found.append(problem(key, show(name), f"expected one of the graphs {', '.join(names)}", "correct it"))
+        if place == 1 and start != 0.0:
+            found.append(problem(key, start, "expected 0, the start of the run", "say which graph is first"))
+        elif start <= before:
+            found.append(problem(key, start, f"expected more than {before:g}, the time before", "sort them"))
+        before = start
+    end = math.inf if switching.end is None else switching.end
+    if end <= before:
+        found.append(problem("switching.end", end, f"expected more than {before:g}, the last time", "raise it"))
+    if switching.repeat and math.isinf(end):
+        found.append(problem("switching.repeat", True, "expected with the end of the schedule", "add `end` or `hold`"))
+    if found:
+        return None, found
+    starts, order = zip(*switching.schedule, strict=True)
+    numbers = {name: mode for mode, name in enumerate(names)}
+    path = np.array(starts), np.array([numbers[name] for name in order])
+    return Schedule(*path, len(names), end, bool(switching.repeat)), []
+
+
+def _chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tuple[MarkovChain | None, list[str]]:
     """The chain that the file describes, and what is wrong with it (then the chain is None)."""
     found = []
     if switching.initial not in ("stationary", *names):
@@ -145,7 +185,7 @@ def connection_problems(
     """Agents that are not connected in the union of all graphs; ``leaders`` is None in consensus."""
     # Mean-square stability of the disagreement (tracking: of the deviation from the reference) needs a union in which
     # some agent (tracking: the leaders together) reaches every other one.
-    union = np.any([graph.adjacency.T > 0 for graph in graphs], axis=0)
+    union = union_of(graphs).T
     sources = widest_reaching(union) if leaders is None else [label - 1 for label in leaders.agents]
     lost = np.flatnonzero(hops(union, sources) < 0).tolist()
     if not lost:
@@ -258,6 +298,8 @@ def stability_problems(graphs: Iterable[Graph], gains: FloatArray, dt: float) ->
     """Graphs for which an Euler step of dt is unstable; ``gains`` (m,) kappa, inf for grounded leaders."""
     found = []
     for graph in graphs:
+        if dt * (graph.degrees + gains)[np.isfinite(gains)].max(initial=0.0) < 1.0:
+            continue  # no agent overshoots (Gershgorin)
         limit = stability_limit(graph, gains)
         if dt >= limit:
             wanted = f"expected less than {limit:.6g}, the stability limit of graph {graph.name}"
@@ -327,9 +369,17 @@ def _too_large_to_predict(experiment: Experiment) -> list[str]:
     return lines
 
 
+def union_of(graphs: Sequence[Graph]) -> BoolArray:
+    """(m, m) whether agent i listens to agent j in some graph."""
+    union = np.zeros((graphs[0].agents,) * 2, dtype=np.bool_)
+    for graph in graphs:
+        union[graph.targets, graph.sources] = True
+    return union
+
+
 def heard_links(graphs: Sequence[Graph], time: Time) -> BoolArray:
     """(m, m) whether agent i hears agent j in some graph: in discrete time, with exp(-Z), over many arcs, too."""
-    heard = np.any([graph.adjacency > 0 for graph in graphs], axis=0)
+    heard = union_of(graphs)
     if time == "discrete":
         heard = np.any([[hops(graph.adjacency > 0, [i]) > 0 for i in range(graph.agents)] for graph in graphs], axis=0)
     return np.asarray(heard)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -38,6 +38,8 @@ def holding_periods(experiment: Experiment, initial: FloatArray) -> Iterator[Hol
     """The graph path of a run, drawn from the experiment's seed; ``initial`` (n,) is the law of g(0)."""
     # Step k uses the graph of the chain at time k dt, so successive graphs are a Markov chain with P = expm(Gamma dt),
     # exactly. A holding period between two sampling times, which no step uses, is left out.
+    if experiment.schedule:
+        return _numbered(experiment.schedule.stretches(experiment.step_length), experiment.steps)
     random = generator(experiment.run.seed, Stream.SWITCHING)
     return _sampled(experiment.chain, initial, random, experiment.steps, experiment.step_length)
 
@@ -48,12 +50,22 @@ def _sampled(
     """The chain at the times 0, dt, ..., (steps - 1) dt."""
     if chain.jumps_within(dt) > MOST_JUMPS:
         chain, dt = chain.sampled(dt), 1.0
-    time, first, sequence = 0.0, 0, 0
-    for mode, held in chain.holding_periods(initial, random):
-        time += held
-        end = steps if math.isinf(time) else min(steps, math.ceil(time / dt))
+
+    def ends() -> Iterator[tuple[int, int]]:
+        time = 0.0
+        for mode, held in chain.holding_periods(initial, random):
+            time += held
+            yield mode, steps if math.isinf(time) else math.ceil(time / dt)
+
+    return _numbered(ends(), steps)
+
+
+def _numbered(ends: Iterable[tuple[int, int]], steps: int) -> Iterator[HoldingPeriod]:
+    """Of (mode, the step from which on it is not used any more), those that some step before ``steps`` uses."""
+    first, sequence = 0, 0
+    for mode, end in ends:
         if end > first:
-            yield HoldingPeriod(sequence, mode, first, end - 1)
+            yield HoldingPeriod(sequence, mode, first, min(steps, end) - 1)
             sequence += 1
             first = end
         if end >= steps:

@@ -23,7 +23,7 @@ import numpy as np
 from msg_analysis.arithmetic.reproducible import Stream, exponential, generator
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.common.resources import one_blas_thread
-from msg_analysis.experiment.markov_chain import MarkovChain
+from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, require_chain
 
 if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
@@ -34,7 +34,7 @@ class Wiring:
     """Which agent uses the values of which agents in which graph, and the law of the graphs; all count from 0."""
 
     links: BoolArray  # (n, m, m) whether agent i uses what agent j publishes; the diagonal has no meaning
-    chain: MarkovChain  # switches between the graphs
+    switching: MarkovChain | Schedule  # between the graphs
     initial: FloatArray  # (n,) law of g(0)
     dt: float  # simulated time of a step
     losses: FloatArray  # (m, m) probability that a message from agent j (column) to agent i (row) is lost
@@ -56,14 +56,21 @@ class Wiring:
         return int(self.links.shape[1])
 
     @property
+    def chain(self) -> MarkovChain:
+        """The Markov chain; ValueError where there is a schedule."""
+        return require_chain(self.switching)
+
+    @property
     def transition(self) -> FloatArray:
-        """(n, n) P, the law of the graph one step later."""
+        """(n, n) P, the law of the graph one step later; where there is a schedule, which switches, the identity."""
+        if isinstance(self.switching, Schedule):
+            return np.eye(self.modes)
         return _transition(self.chain, self.dt)
 
     @property
     def stationary(self) -> FloatArray:
-        """(n,) stationary law pi of the graph."""
-        return self.chain.stationary
+        """(n,) stationary law pi of the graph; of a schedule, the shares of time."""
+        return self.switching.stationary
 
     def inputs(self, mode: int, agent: int) -> IntArray:
         """(d,) agents, ascending, with values that an agent uses under a mode; the agent itself is always included."""
@@ -145,7 +152,7 @@ def build_model(experiment: Experiment, matrices: StepMatrices | None = None) ->
         return build_step_model(experiment, matrices)
     return Wiring(
         links=_arcs(experiment),
-        chain=experiment.chain,
+        switching=experiment.switching_law,
         initial=first_graph(experiment),
         dt=experiment.step_length,
         losses=experiment.loss,
@@ -200,7 +207,7 @@ def build_step_model(experiment: Experiment, matrices: StepMatrices | None = Non
         losses=loss,
         burst=experiment.noise.burst,
         loss_variance=loss * (1 - loss) * coupling**2,
-        chain=experiment.chain,
+        switching=experiment.switching_law,
         initial=first_graph(experiment),
         grounded=grounded,
         reference=reference,
@@ -237,6 +244,8 @@ def _built_in(experiment: Experiment) -> FloatArray:
 def first_graph(experiment: Experiment) -> FloatArray:
     """(n,): the law of g(0)."""
     first = experiment.switching.initial
+    if experiment.schedule:
+        return np.eye(len(experiment.graph_list))[experiment.schedule.order[0]]
     if first == "stationary":
         return experiment.chain.stationary
     return np.array([float(graph.name == first) for graph in experiment.graph_list])

@@ -228,18 +228,25 @@ def continuous(experiment: Experiment) -> JumpSystem:
 
 def held(system: JumpSystem, mode: int) -> JumpSystem:
     """The same system, in continuous or discrete time, with one graph (``mode``, from 0) held fixed."""
-    one = slice(mode, mode + 1)
+    chain = np.zeros((1, 1)) if system.time == "continuous" else np.ones((1, 1))
+    return part(system, np.array([mode]), chain, np.ones(1), np.zeros(1, np.int64))
+
+
+def part(
+    system: JumpSystem, modes: IntArray, chain: FloatArray, stationary: FloatArray, graphs: IntArray
+) -> JumpSystem:
+    """The same system with these of its modes, between which another chain switches; ``graphs``: see ``Messages``."""
     return replace(
         system,
-        matrices=system.matrices[one],
-        noise=system.noise[one],
-        chain=np.zeros((1, 1)) if system.time == "continuous" else np.ones((1, 1)),
-        stationary=np.ones(1),
-        loss_variance=None if system.loss_variance is None else system.loss_variance[one],
-        unreduced=None if system.unreduced is None else system.unreduced[one],
-        losses=system.losses and system.losses.of_mode(mode),
-        unreduced_losses=system.unreduced_losses and system.unreduced_losses.of_mode(mode),
-        messages=system.messages and replace(system.messages, graphs=np.zeros(1, np.int64)),
+        matrices=system.matrices[modes],
+        noise=system.noise[modes],
+        chain=chain,
+        stationary=stationary,
+        loss_variance=None if system.loss_variance is None else system.loss_variance[modes],
+        unreduced=None if system.unreduced is None else system.unreduced[modes],
+        losses=system.losses and system.losses.of_modes(modes),
+        unreduced_losses=system.unreduced_losses and system.unreduced_losses.of_modes(modes),
+        messages=system.messages and replace(system.messages, graphs=graphs),
     )
 
 

@@ -64,10 +64,9 @@ class LossEvents:
                 found |= np.outer(changed.any(axis=0), seen.any(axis=0))
         return found
 
-    def of_mode(self, mode: int) -> LossEvents:
-        """Those of one graph, from 0."""
-        chain = None if self.chain is None else self.chain[mode : mode + 1]
-        return LossEvents(self.into[mode : mode + 1], self.differences[mode : mode + 1], chain)
+    def of_modes(self, modes: IntArray) -> LossEvents:
+        """Those of some modes, from 0."""
+        return LossEvents(self.into[modes], self.differences[modes], None if self.chain is None else self.chain[modes])
 
     def projected(self, basis: FloatArray) -> LossEvents:
         """In the coordinates that the columns of ``basis`` (d, d') span."""

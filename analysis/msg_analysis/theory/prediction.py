@@ -23,6 +23,7 @@ from msg_analysis.common.resources import blas_threads, few_blas_threads, one_bl
 from msg_analysis.common.text import agent_text, finite, markdown_table, number_text
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment.graphs import hops, widest_reaching
+from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.step_model import StepLaw, StepModel, build_run_model, build_step_model, step_law
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.coupled_equations import SolverReport
@@ -30,6 +31,7 @@ from msg_analysis.theory.first_steps import simplification
 from msg_analysis.theory.fourth_moments import FourthMoment, fourth_moment
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
+from msg_analysis.theory.scheduled import PathMoments, path_moments
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -137,8 +139,8 @@ class Prediction:
         what is predicted
     step
         the experiment compiled to one step of an agent
-    solver
-        of the equations of the run's steps, in real time those of its sequential law
+    system
+        the reduced system of the run's steps, in real time of its sequential law
     steady
         (n, d, d) steady second moments of ``system``
     emulated
@@ -148,16 +150,23 @@ class Prediction:
         ``continuous``; None in discrete time, with a protocol, or with noise on the air, loss or delay
     paper
         the system of the paper: in continuous time where there is ``continuous``, else the steps; None with noise on
-        the air, loss or delay
+        the air, loss or delay, or with a schedule
+    path
+        of a schedule: the moments given its graphs, of which ``emulated`` and ``steady`` are the means over time; else
+        None
+    chain_solver
+        of the equations of ``system``; None with a schedule
     """
 
     experiment: Experiment
     step: StepModel
-    solver: MomentSolver
+    system: JumpSystem
     steady: FloatArray
     emulated: Moments
     continuous_moments: Moments | None
     paper: JumpSystem | None
+    path: PathMoments | None = None
+    chain_solver: MomentSolver | None = None
 
     @property
     def continuous(self) -> Moments:
@@ -190,7 +199,9 @@ class Prediction:
 
     @cached_property
     def disconnected(self) -> list[str]:
-        """The graphs that, held fixed, cannot keep the agents together."""
+        """The graphs that, held fixed, cannot keep the agents together; none of a schedule, which holds none fixed."""
+        if self.path:
+            return []
         held = enumerate(self.experiment.graph_list)
         return [graph.name for mode, graph in held if not _holds_together(self.experiment, mode)]
 
@@ -226,13 +237,17 @@ class Prediction:
         return prediction_figure(self)
 
     @property
-    def system(self) -> JumpSystem:
-        """The reduced system of the run's steps."""
-        return self.solver.system
+    def solver(self) -> MomentSolver:
+        """Of the equations of the steady second moments; NotAvailableError with a schedule, which has none."""
+        if self.chain_solver is None:
+            raise NotAvailableError("switching.schedule: there is no steady state: expected a Markov chain for this")
+        return self.chain_solver
 
     @cached_property
     def fourth_moment(self) -> FourthMoment:
         """Whether the fourth moments of the run's steps are finite: without, errors have no standard errors."""
+        if self.path:
+            return FourthMoment(None, None, None, finite=True)  # of a given sequence of graphs they always are
         with blas_threads(self.experiment.agents):
             return fourth_moment(build_run_model(self.experiment, self.step), self.system)
 
@@ -261,6 +276,10 @@ class Prediction:
         else:
             document["continuous"] = self.continuous_moments.to_json() if self.continuous_moments else None
             document["emulated"] = self.emulated.to_json()
+        if self.path:
+            largest, k = self.path.largest
+            key = "discrete" if self.experiment.time == "discrete" else "emulated"
+            document[key] |= {"largest": largest, "largest_time": k * self.experiment.step_length}
         document["static"] = self.static_moments.to_json() if self.static_moments else None
         document["disconnected"] = self.disconnected
         document["fourth_moment"] = self.fourth_moment.to_json()
@@ -276,12 +295,15 @@ def _why_no_paper(experiment: Experiment) -> str:
 
 
 @few_blas_threads
-def predict(experiment: Experiment, step: StepModel | None = None) -> Prediction:
+def predict(experiment: Experiment, step: StepModel | None = None, *, start: float = 0.0) -> Prediction:
     """Steady-state prediction of an experiment (Propositions 2 and 3 of the paper, 7 and 8 in discrete time).
 
-    ``step``: its step model, if it is known. InputError: too large, or without finite steady errors.
+    Of a schedule, the means over the times after ``start`` [units of simulated time], given its graphs. ``step``: its
+    step model, if it is known. InputError: too large, or without finite steady errors.
     """
     step = step or build_step_model(experiment)
+    if experiment.schedule:
+        return _given(experiment, step, start)
     continuous = paper = None
     if not experiment.noise.steps_only:
         if experiment.time == "continuous" and not experiment.protocol:
@@ -292,7 +314,23 @@ def predict(experiment: Experiment, step: StepModel | None = None) -> Prediction
             paper = systems.emulated(step, experiment.problem)
     solver, steady = _steady(step, build_run_model(experiment, step), experiment.problem)
     emulated = dataclasses.replace(_moments(solver, steady, experiment.names), law=step_law(experiment))
-    return Prediction(experiment, step, solver, steady, emulated, continuous, paper)
+    return Prediction(experiment, step, solver.system, steady, emulated, continuous, paper, chain_solver=solver)
+
+
+def _given(experiment: Experiment, step: StepModel, start: float) -> Prediction:
+    """Of a schedule."""
+    first = round(start / experiment.step_length)
+    if not 0 <= first < experiment.steps:
+        wanted = f"expected a time from 0 to below {experiment.run.duration:g}, the end of the run"
+        raise InputError(f"from: {start:g}: {wanted}: correct it")
+    run = build_run_model(experiment, step)
+    system = systems.emulated(run, experiment.problem)
+    places = experiment.known_start
+    assert places is not None, "a schedule has no steady state to start from"
+    path = path_moments(run, system, places[:, None], mode_path(experiment, step.initial), first)
+    covariance = system.lifted(path.by_mode.sum(axis=0))
+    emulated = Moments(covariance, names=experiment.names, law=step_law(experiment))
+    return Prediction(experiment, step, system, path.by_mode, emulated, None, None, path)
 
 
 def stationary_start_factor(experiment: Experiment, mode: int) -> FloatArray:

@@ -112,10 +112,9 @@ def start_of(experiment: Experiment, system: JumpSystem, agents: FloatArray) -> 
     law = system.stationary
     if experiment.switching.initial != "stationary":
         law = system.of_modes(first_graph(experiment))
-    start = experiment.run.start
-    if start == "stationary":
+    place = experiment.known_start
+    if place is None:
         return steady_start(system, agents, law)
-    place = np.zeros(experiment.agents) if start == "zero" else np.array(start, dtype=float)
     return point_start(system, place - experiment.reference, law)
 
 

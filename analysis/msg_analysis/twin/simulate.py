@@ -219,12 +219,9 @@ GRID = 2.0**-12  # unit of x(0), in standard deviations, where it would be longe
 
 def draw_start(experiment: Experiment, model: Wiring, first_mode: int) -> FloatArray:
     """(m, replicas) x(0): zero, the given values, or drawn from the stationary law given g(0) = ``first_mode``."""
-    replicas = experiment.run.replicas
-    start = experiment.run.start
-    if start == "zero":
-        return np.zeros((experiment.agents, replicas))
-    if start != "stationary":
-        return np.repeat(np.array(start, dtype=float)[:, None], replicas, axis=1)
+    known = experiment.known_start
+    if known is not None:
+        return np.repeat(known[:, None], experiment.run.replicas, axis=1)
     assert isinstance(model, StepModel), "experiments without a prediction start from given values"
     found = _from_the_past(experiment, model, first_mode)
     if found is None and (reason := unpredictable(experiment)):

@@ -70,7 +70,7 @@ def test_whom_nothing_connects_against_networkx(seed: int, agents: int, density:
     np.fill_diagonal(hears, False)
     digraph = nx.from_numpy_array(hears.T, create_using=nx.DiGraph)
     reached = max(len(nx.descendants(digraph, v)) + 1 for v in digraph)
-    found = connection_problems([Graph("graph", hears.astype(float))], None)
+    found = connection_problems([Graph.of("graph", hears.astype(float))], None)
     assert len(found) == (reached < agents)
     for problem in found:
         lost, sources = re.fullmatch(
@@ -193,16 +193,16 @@ def test_stability_limit_against_powers_of_the_step(seed: int) -> None:
     if seed % 2:
         adjacency = adjacency + adjacency.T
     np.fill_diagonal(adjacency, 0)
-    graph = Graph("graph", adjacency)
+    graph = Graph.of("graph", adjacency)
     limit = validation.stability_limit(graph, np.zeros(5))
     assert contracts(graph.laplacian, 0.99 * limit)
     assert not contracts(graph.laplacian, 1.01 * limit)
 
 
 def test_stability_limit_of_leaders() -> None:
-    star = Graph("star", np.array([[0, 1, 1], [1, 0, 0], [1, 0, 0]], dtype=float))
+    star = Graph.of("star", np.array([[0, 1, 1], [1, 0, 0], [1, 0, 0]], dtype=float))
     gains = np.array([math.inf, 0, 0])
     assert validation.stability_limit(star, gains) == 2.0  # followers alone: Z = I
     z = star.laplacian + np.diag([4.0, 0, 0])
     assert validation.stability_limit(star, np.array([4.0, 0, 0])) == pytest.approx(2 / np.linalg.eigvalsh(z)[-1])
-    assert validation.stability_limit(Graph("none", np.zeros((3, 3))), np.zeros(3)) == math.inf
+    assert validation.stability_limit(Graph.of("none", np.zeros((3, 3))), np.zeros(3)) == math.inf

@@ -22,7 +22,7 @@ def test_resistances_are_those_of_networkx(seed, m, weighted):
     graph.add_edges_from(nx.gnp_random_graph(m, 0.3, seed=seed + 1).edges)
     for a, b in graph.edges:
         graph[a][b]["weight"] = float(random.uniform(0.2, 3.0)) if weighted else 1.0
-    found = graph_indices(Graph("g", nx.to_numpy_array(graph, nodelist=range(m))))
+    found = graph_indices(Graph.of("g", nx.to_numpy_array(graph, nodelist=range(m))))
     centrality = nx.information_centrality(graph, weight="weight")
     np.testing.assert_allclose(found.information_centrality, [centrality[i] for i in range(m)], rtol=1e-9)
     pairs = [(i, j) for i in range(m) for j in range(i)]
@@ -31,8 +31,8 @@ def test_resistances_are_those_of_networkx(seed, m, weighted):
 
 
 def test_no_resistances_where_there_are_none():
-    assert graph_indices(Graph("g", np.array([[0.0, 1.0], [0.0, 0.0]]))) is None
-    assert graph_indices(Graph("g", np.zeros((3, 3)))) is None
+    assert graph_indices(Graph.of("g", np.array([[0.0, 1.0], [0.0, 0.0]]))) is None
+    assert graph_indices(Graph.of("g", np.zeros((3, 3)))) is None
 
 
 @MODELS
