@@ -324,7 +324,9 @@ class Sections:
             trace = read_trace(key, file, hold=switching.hold, radius=switching.radius, directed=directed)
             if switching.schedule is not None or bool(graphs) == bool(trace.graphs):
                 wanted = "none with a trace of links" if trace.graphs else "the graphs that the trace names"
-                raise GraphError("graphs", listed(graphs) or "missing", f"expected {wanted}", "correct one of the two")
+                raise GraphError(
+                    "graphs", listed(list(graphs)) or "missing", f"expected {wanted}", "correct one of the two"
+                )
         except GraphError as error:
             self.problems.append(str(error))
             self.values["graphs"] = self.values["switching"] = None

@@ -43,7 +43,10 @@ def switching_of(
     """What the file says that switches, and what is wrong with it (then it is None)."""
     if switching.schedule is None:
         given = [key for key in SCHEDULE_KEYS if getattr(switching, key) is not None]
-        lines = [problem(f"switching.{key}", getattr(switching, key), "expected with a schedule or a trace", "remove it") for key in given]
+        lines = [
+            problem(f"switching.{key}", getattr(switching, key), "expected with a schedule or a trace", "remove it")
+            for key in given
+        ]
         chain, found = _chain_of(switching, names, time)
         return (None if lines else chain), lines + found
     found = []
