@@ -79,7 +79,7 @@ class Graph:
     @property
     def degrees(self) -> FloatArray:
         """(m,) in-degrees: sums of the weights with which each agent listens."""
-        return np.bincount(self.targets, self.weights, self.agents)
+        return np.asarray(np.bincount(self.targets, self.weights, self.agents), dtype=float)
 
     @property
     def symmetric(self) -> bool:

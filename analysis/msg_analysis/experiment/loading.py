@@ -316,7 +316,11 @@ class Sections:
         key = "switching.trace"
         if switching.trace is None:
             if not graphs:
-                self.problems.append(problem("graphs", "missing", "expected at least one graph", "add one"))
+                self.problems.append(
+                    problem(
+                        "graphs", "missing", "expected named graphs, or a trace", "for example line: {path: [1, 2, 3]}"
+                    )
+                )
                 self.values["graphs"] = None
             return
         try:

@@ -153,6 +153,15 @@ class Schedule:
         spent = np.bincount(self.order, ends - self.starts, self.modes)
         return np.asarray(spent / spent.sum() if spent.any() else np.eye(self.modes)[self.order[0]])
 
+    def sampled(self, steps: int, dt: float) -> IntArray:
+        """(steps,) graphs at the times 0, dt, ..."""
+        modes, first = np.empty(steps, dtype=np.int64), 0
+        for mode, end in self.stretches(dt):
+            modes[first:end], first = mode, max(first, end)
+            if first >= steps:
+                break
+        return modes
+
     def stretches(self, dt: float) -> Iterator[tuple[int, int]]:
         """(mode, the step from which on it is not used any more) of each stretch, without end where it repeats."""
         ends = [*self.starts[1:].tolist(), self.end]

@@ -177,7 +177,8 @@ def _same(one: float, other: float) -> bool:
 
 def _schedule(key: str, rows: Iterable[_Row], hold: float | None) -> Trace:
     nodes: dict[str, int] = {}
-    starts, which = [], []
+    starts: list[float] = []
+    which: list[int] = []
     for place, time, (graph, *_) in rows:
         if starts and _same(time, starts[-1]):
             raise GraphError(key, f"{place}: time {time:.12g} twice", "expected one graph at a time", _CORRECT)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
+from msg_analysis.experiment.markov_chain import Schedule
 from msg_analysis.inference.dependence import LAGS
 from msg_analysis.inference.e_values import Analyses, log_mean, log_means, log_sum
 from msg_analysis.inference.observation import Observation
@@ -63,7 +64,8 @@ class EvidenceSums:
         paired = usable[first] & usable[second] & (len(first) <= MOST_PAIRS) & (not correlated)
         independent_losses = step.burst is None and not real_time
         # Given its past and what was received, each sum is exact; the system error only where nothing is added or lost.
-        self.error = ErrorMartingale.of(prediction, replicas) if self.plain and errors_have_digits(prediction) else None
+        random = self.plain and not prediction.path and errors_have_digits(prediction)
+        self.error = ErrorMartingale.of(prediction, replicas) if random else None
         self._law = law = Law(
             step=step,
             graphs=[graph.name for graph in experiment.graph_list],
@@ -125,13 +127,16 @@ class EvidenceSums:
 
     def _zeros(self, analyses: int) -> RunningSums:
         rates = 0 if self.error is None else len(self.error.rates)
-        return RunningSums.zeros(analyses, self._step.agents, self._step.modes, rates)
+        counted = 0 if isinstance(self._step.switching, Schedule) else self._step.modes
+        return RunningSums.zeros(analyses, self._step.agents, counted, rates)
 
     def add_transitions(
         self, graphs: IntArray, following: IntArray, parts: RunningSums | None = None, analysis: IntArray | int = 0
     ) -> None:
         """Add steps of the switching: graphs (k,) and those of the next step (k,), before an ``analysis`` (k,)."""
         counts, modes = (parts or self.total).counts, self._step.modes
+        if not counts.size:
+            return
         place = (analysis * modes + graphs) * modes + following
         counts += np.bincount(place, minlength=counts.size).reshape(counts.shape)
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Questions about what a log must hold exactly: x(0), stamps in lockstep, and agents without noise.
+"""Questions about what a log must hold exactly: x(0), stamps in lockstep, a schedule, and agents without noise.
 
 A correct run never fails one; so these tests count only where they fail, and cost the others nothing.
 """
@@ -16,10 +16,12 @@ from typing import Self
 import numpy as np
 
 from msg_analysis.arithmetic.reproducible import SECOND, StepClock
-from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.experiment.markov_chain import Schedule
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.question import Block, Diagnostic, Finding, Law, Place, Statistics, Test, agent_words
 from msg_analysis.inference.residuals import received_residuals
+from msg_analysis.model.step_model import Wiring
 
 ROUNDING = 2.0**-40  # of the largest x(0): smaller differences are for ``check``
 
@@ -84,6 +86,23 @@ class Stamps(Exact):
             f"the state of {agent_words(found.agent)} {when} is stamped {found.estimate!r} s of simulated time, not "
             f"{found.expected!r} s"
         )
+
+
+class GivenGraphs(Exact):
+    """Whether the graphs follow the schedule of the file."""
+
+    name = "schedule"
+    meaning = "the graphs are not those of the schedule"
+    kind = "schedule"
+    about_chain = True
+
+    @classmethod
+    def words(cls, found: Finding, names: Sequence[str]) -> str:
+        """The first step with another graph."""
+        assert found.graph is not None
+        assert found.other is not None
+        when = found.place.words if found.place else ""
+        return f"graph {names[found.graph]} was active {when}, where the schedule has {names[found.other]}"
 
 
 class WithoutNoise(Exact):
@@ -151,10 +170,15 @@ class WithoutNoise(Exact):
 
 
 def exact_findings(
-    start: FloatArray, record: FloatArray, wrong_stamp: tuple[int, int, int] | None, dt: float
+    step: Wiring, start: FloatArray, record: FloatArray, wrong_stamp: tuple[int, int, int] | None, modes: IntArray
 ) -> dict[str, Finding]:
-    """By name of the question, from x(0) (m, R) of log and record, and ``Run.wrong_stamp``; of a run of steps dt."""
+    """By name of the question, from x(0) (m, R) of log and record, ``Run.wrong_stamp``, and the graphs (N,)."""
     found = {}
+    if isinstance(step.switching, Schedule):
+        expected = step.switching.sampled(len(modes), step.dt)
+        for at in np.flatnonzero(modes != expected)[:1].tolist():
+            graph, other = int(modes[at]), int(expected[at])
+            found[GivenGraphs.name] = Finding(-math.inf, graph=graph, other=other, place=Place(at, at))
     away = np.abs(start - record) > ROUNDING * np.abs(record).max(initial=0.0) + np.finfo(float).tiny
     if away.any():
         agent, replica = np.argwhere(away)[0].tolist()
@@ -167,13 +191,13 @@ def exact_findings(
             expected=float(record[agent, replica]),
         )
     if wrong_stamp is not None:
-        step, agent, stamp = wrong_stamp
+        at, agent, stamp = wrong_stamp
         found[Stamps.name] = Finding(
             -math.inf,
             agent=agent,
-            place=Place(step, step),
+            place=Place(at, at),
             estimate=stamp / SECOND,
-            expected=StepClock(dt).nanoseconds(step) / SECOND,
+            expected=StepClock(step.dt).nanoseconds(at) / SECOND,
         )
     return found
 

@@ -20,7 +20,7 @@ import numpy as np
 from scipy import special
 
 from msg_analysis.common.text import HALF_WIDTH_95
-from msg_analysis.experiment.markov_chain import MarkovChain
+from msg_analysis.experiment.markov_chain import MarkovChain, Schedule
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.evidence_sums import EvidenceSums
 from msg_analysis.inference.graphs import Switching
@@ -237,7 +237,7 @@ def _gain(prediction: Prediction, factor: float, replicas: int) -> _Informations
 
 def _switching(step: StepModel, factor: float) -> _Informations:
     """The likelihood ratio of the counted switches, with every rate away from a graph times the factor."""
-    if step.modes == 1:
+    if step.modes == 1 or isinstance(step.switching, Schedule):
         return {}
     law = step.transition
     chain = step.chain

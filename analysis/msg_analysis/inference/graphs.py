@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import xlogy
 
 from msg_analysis.common.arrays import AnyArray, FloatArray, IntArray
-from msg_analysis.experiment.markov_chain import MarkovChain, stationary_law
+from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, stationary_law
 from msg_analysis.inference.candidates import Cause, Rate, find_rates, numbers_text
 from msg_analysis.inference.counts import likelihood_ratio
 from msg_analysis.inference.e_values import proportion_evidence, row_evidence
@@ -32,8 +32,8 @@ class Switching(Question):
     p_value = attrgetter("p_switching")
 
     def number_of_tests(self) -> int:
-        """None with one graph."""
-        return int(self.law.step.modes > 1)
+        """None with one graph, or with a schedule."""
+        return int(len(self._left) > 0)
 
     def evidence(self, sums: RunningSums) -> FloatArray:
         """One row for each graph that is left some time, and one for all: rows are independent of each other."""
@@ -60,6 +60,8 @@ class Switching(Question):
     @classmethod
     def causes(cls, search: Search) -> list[Cause]:
         """Jumps that the law excludes; else rates, or in discrete time probabilities, that explain the transitions."""
+        if search.transitions is None:
+            return []
         names, counts, experiment = search.names, search.transitions.counts, search.experiment
         transition = experiment.chain.transition(experiment.step_length)
         if search.renamed:  # the log's names may be wrong, or those of the steps: the chain says which
@@ -147,6 +149,8 @@ class HoldingTimes(SummedDiagnostic):
     def finding(self) -> Finding | None:
         """The graph and the part whose switches are furthest from the share that is usual in the graph."""
         all_steps, all_left = self.sums
+        if not len(self._left):
+            return None
         visits = float(all_steps.sum()) * stationary_law(self._transition)
         statistic, dof, clearest, found = 0.0, 0, -1.0, Finding(0.0)
         for graph, p in enumerate(self._leaving.tolist()):
@@ -255,7 +259,7 @@ class SecondOrder(SummedDiagnostic):
         n = law.step.modes
         self._transition = law.step.transition
         # With two graphs, the one before is known; what is left is the question of the holding times.
-        self._asked = 2 < n <= MOST_GRAPHS
+        self._asked = 2 < n <= MOST_GRAPHS and not isinstance(law.step.switching, Schedule)
         self.sums = [np.zeros((n, 2, n, n) if self._asked else (0,), np.int64)]  # before, first or later, graph, next
         self._last = self._before = -1  # graph of the step before the next block, and the graph before that one
 

@@ -13,7 +13,7 @@ import numpy as np
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.dependence import ConstantState, LongLags, Replicas, Whiteness
-from msg_analysis.inference.exact_values import Stamps, Start, WithoutNoise
+from msg_analysis.inference.exact_values import GivenGraphs, Stamps, Start, WithoutNoise
 from msg_analysis.inference.graph_names import SwappedGraphs
 from msg_analysis.inference.graphs import HoldingTimes, SecondOrder, Switching
 from msg_analysis.inference.messages import Broadcast, CommonGain, Gains, MessageLosses, StaleValues
@@ -46,6 +46,7 @@ QUESTIONS: tuple[type[Question], ...] = (
     WithoutNoise,
     Start,
     Stamps,
+    GivenGraphs,
     RunsAlike,
 )
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.text import number_text
+from msg_analysis.experiment.markov_chain import Schedule
 from msg_analysis.inference.observation import Observation
 from msg_analysis.model.step_model import StepModel
 from msg_analysis.theory import packed_symmetric
@@ -38,6 +39,8 @@ FEW_SWITCHES = 10.0  # expected, below which intervals over all paths cover too 
 
 def expected_switches(step: StepModel, steps: int) -> float:
     """Of a run with so many steps in its steady state, away from the graph with the fewest; infinite for one graph."""
+    if isinstance(step.switching, Schedule):
+        return math.inf
     leaving = steps * step.stationary * (1.0 - np.diag(step.transition))
     return math.inf if step.modes == 1 else float(leaving.min())
 

@@ -10,8 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray
+from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray, IntArray
 from msg_analysis.common.resources import blas_threads
+from msg_analysis.errors import InputError
+from msg_analysis.experiment.markov_chain import Schedule
 from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.comparison import MAX_MISSED, Comparison, few_digits, trusted
@@ -34,6 +36,7 @@ from msg_analysis.inference.time_means import TimeMeans, time_means
 from msg_analysis.inference.timing import Timing, measure_timing
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
+from msg_analysis.model.step_model import Wiring
 from msg_analysis.theory.prediction import Prediction, predict
 
 ANALYSES = 20, 80  # at the evidence over time, in short and in long runs: each takes as long as some hundred steps
@@ -50,7 +53,7 @@ class Evidence:
     decisive: bool  # whether the law that the means are compared with is exact
     given: TimeMeans | None  # with their expectation given the path; None where it is not computed
     residuals: ResidualSums
-    transitions: Transitions
+    transitions: Transitions | None  # None where there is a schedule
     loss: LossTally | None  # None without loss
     broadcast: BroadcastSums | None  # None without broadcast noise
     watched: WatchedEvidence  # what holds at any time
@@ -79,9 +82,14 @@ class Evidence:
                 position = order.position
                 means, laws = measure_laws(observation, order, timing, level)
             else:
-                means = time_means(observation)
                 kept = observation.prediction.system.readout is not None
                 given = means_in_lockstep(observation) if kept else means_given_path(observation)
+                if observation.prediction.path:
+                    if given is None:
+                        raise InputError("switching.schedule: too large for errors given the graphs: use fewer agents")
+                    means, given = given, None
+                else:
+                    means = time_means(observation)
             residuals = ResidualSums(observation, position, watched)
         return cls(
             steps=observation.steps,
@@ -90,12 +98,18 @@ class Evidence:
             and errors_have_digits(observation.prediction),
             given=given,
             residuals=residuals,
-            transitions=Transitions.of(observation.modes, observation.step.modes),
+            transitions=_transitions(observation.step, observation.modes),
             loss=LossTally.of(observation),
             broadcast=BroadcastSums.of(observation),
             watched=watched,
             exact=(
-                exact_findings(observation.states[0], observation.start, observation.wrong_stamp, observation.step.dt),
+                exact_findings(
+                    observation.step,
+                    observation.states[0],
+                    observation.start,
+                    observation.wrong_stamp,
+                    observation.modes,
+                ),
             ),
             timing=timing,
             laws=laws,
@@ -118,7 +132,7 @@ class Evidence:
             means=_merged_means(self.means, self.steps, other.means, other.steps),
             decisive=self.decisive and other.decisive,
             given=given,
-            transitions=self.transitions.merged(other.transitions),
+            transitions=self.transitions and other.transitions and self.transitions.merged(other.transitions),
             exact=self.exact + other.exact,
             timing=None,
             laws=None,
@@ -194,7 +208,7 @@ def evaluate(
         covariance = replace(tested, measured=covariance.measured, predicted=covariance.predicted)
     law = evidence.tested
     tested_error, tested_nodes = estimates(law, prediction.system) if law else (None, [])
-    switching = evidence.transitions.test(prediction.step.transition)
+    switching = evidence.transitions.test(prediction.step.transition) if evidence.transitions else None
     loss = evidence.loss.test() if evidence.loss else None
     run = Statistics(
         system_error=tested_error,
@@ -202,7 +216,7 @@ def evaluate(
         corrected=", corrected" if law and law is evidence.given else "",
         p_covariance=covariance.p if evidence.decisive else None,
         residuals=evidence.residuals.tests(),
-        p_switching=switching.p,
+        p_switching=switching.p if switching else None,
         p_loss=loss.p if loss else None,
         p_broadcast=evidence.broadcast.p_value() if evidence.broadcast else None,
         findings=evidence.watched.sums.findings() | of_runs(evidence.exact),
@@ -244,6 +258,11 @@ def evaluate(
     )
 
 
+def _transitions(step: Wiring, modes: IntArray) -> Transitions | None:
+    """Those of a chain; None where there is a schedule."""
+    return None if isinstance(step.switching, Schedule) else Transitions.of(modes, step.modes)
+
+
 def _any_time(
     record: RunRecord, prediction: Prediction, evidence: Evidence, level: float, families: dict[str, FloatArray]
 ) -> AnyTimeEvidence:
@@ -272,8 +291,10 @@ def _measured(trajectory: Run, level: float, unpredicted: str, block_numbers: in
             running=_running(np.empty(0), None, step.dt),
             unpredicted=unpredicted,
         )
-    switching, loss = Transitions.of(measurement.modes, step.modes).test(step.transition), loss_test(measurement)
-    exact = exact_findings(trajectory.states[0], trajectory.record.start, trajectory.wrong_stamp, step.dt)
+    transitions, loss = _transitions(step, measurement.modes), loss_test(measurement)
+    switching = transitions.test(step.transition) if transitions else None
+    start, wrong_stamp = trajectory.record.start, trajectory.wrong_stamp
+    exact = exact_findings(step, trajectory.states[0], start, wrong_stamp, measurement.modes)
     return Comparison(
         trajectory=trajectory,
         level=level,
@@ -283,7 +304,10 @@ def _measured(trajectory: Run, level: float, unpredicted: str, block_numbers: in
         covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
         switching=switching,
         batch=batch_interval(series),
-        tests=decide(Statistics(p_switching=switching.p, p_loss=loss.p if loss else None, findings=exact), level),
+        tests=decide(
+            Statistics(p_switching=switching.p if switching else None, p_loss=loss.p if loss else None, findings=exact),
+            level,
+        ),
         running=_running(series, None, step.dt, measurement.first),
         loss=loss,
         unpredicted=unpredicted,

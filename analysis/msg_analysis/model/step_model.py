@@ -245,7 +245,7 @@ def first_graph(experiment: Experiment) -> FloatArray:
     """(n,): the law of g(0)."""
     first = experiment.switching.initial
     if experiment.schedule:
-        return np.eye(len(experiment.graph_list))[experiment.schedule.order[0]]
+        return np.asarray(np.eye(len(experiment.graph_list))[experiment.schedule.order[0]])
     if first == "stationary":
         return experiment.chain.stationary
     return np.array([float(graph.name == first) for graph in experiment.graph_list])

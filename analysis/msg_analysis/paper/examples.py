@@ -61,7 +61,7 @@ class GraphFamily:
 
     def at(self, *rates: float) -> Experiment:
         """The experiment at (epsilon, r12, r21)."""
-        return dataclasses.replace(self.base, chain=MarkovChain("continuous", self.generator(*rates)))
+        return dataclasses.replace(self.base, switching_law=MarkovChain("continuous", self.generator(*rates)))
 
     def certainties(self, *rates: float) -> FloatArray:
         """(1 + m,) certainty of the system and of every node."""

@@ -64,12 +64,12 @@ def _course(step: StepModel, system: JumpSystem, start: FloatArray, modes: IntAr
     """(d, d) second moments of y(1), ..., y(N)."""
     states = system.modes // step.modes  # of the channels
     channels = system.chain[:states, :states]
-    shares = system.stationary.reshape(-1, states).sum(axis=0)
+    shares: FloatArray = system.stationary.reshape(-1, states).sum(axis=0)
 
     def only(graphs: IntArray, chain: FloatArray) -> JumpSystem:
         which = (graphs[:, None] * states + np.arange(states)).reshape(-1)
         every = np.arange(len(graphs))
-        law = np.kron(np.full(len(graphs), 1.0 / len(graphs)), shares)
+        law: FloatArray = np.tile(shares / len(graphs), len(graphs))
         return part(system, which, np.kron(chain, channels), law, np.repeat(every, states))
 
     # The first steps may use the messages with x(0) again: their graphs are followed as a chain, which is certain.

@@ -97,7 +97,7 @@ CASES: list[tuple[dict[str, Any], list[str]]] = [
     ({"run.process": 3}, ["run.process: unknown key", "did you mean `noise.process`?"]),
     ({"run.noise": {}}, ["run.noise: unknown key", "did you mean `noise`, without `run`?"]),
     # graphs
-    ({"graphs": {}}, ["graphs: {}: expected at least 1"]),
+    ({"graphs": {}}, ["graphs: missing: expected named graphs"]),
     ({"graphs.ring": {}}, ["graphs.ring: nothing: expected one of path, cycle, edges"]),
     ({"graphs.ring": {"path": [1, 2], "complete": True}}, ["graphs.ring: path and complete: expected one of"]),
     ({"graphs.ring": {"complete": False}}, ["graphs.ring.complete: false: expected true"]),
