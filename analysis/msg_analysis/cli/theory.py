@@ -57,7 +57,7 @@ def transient(experiment: Path, times: str, *, table: Path | None, as_json: bool
 
     require_place(table)
     loaded = load_experiment(experiment)
-    loaded.require_available("predict")
+    loaded.require_available("steady")
     document = describe_transient(loaded, _parse_times(times), **options)
     if table:
         write_transient_csv(document, table)
@@ -99,7 +99,7 @@ def facts(experiment: Path, as_json: bool) -> None:
     from msg_analysis.report.theory_text import print_facts
 
     loaded = load_experiment(experiment)
-    loaded.require_available("predict")
+    loaded.require_available("steady")
     document = describe_facts(loaded)
     print_result(document, print_facts, as_json=as_json)
 

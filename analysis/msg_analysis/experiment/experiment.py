@@ -233,7 +233,7 @@ class Experiment(Variants):
         """
         from msg_analysis.theory.transient import solve_transient
 
-        self.require_available("predict")
+        self.require_available("steady")
         given = np.asarray(times, dtype=float)
         return replace(solve_transient(self, given, law=law, unreduced=unreduced).course, times=given)
 
@@ -304,6 +304,7 @@ class Experiment(Variants):
         """
         from msg_analysis.inference.sample_size import plan
 
+        self.require_available("steady")
         return plan(self.predict(), precision, seconds=seconds, rate=rate, level=level)
 
     def spectrum(self, lags: ArrayLike | None = None, frequencies: ArrayLike | None = None) -> Spectrum:
@@ -332,6 +333,7 @@ class Experiment(Variants):
         """
         from msg_analysis.theory.spectrum import spectrum
 
+        self.require_available("steady")
         wanted = None if lags is None else np.asarray(lags, dtype=np.int64)
         return spectrum(self.predict(), wanted, None if frequencies is None else np.asarray(frequencies, dtype=float))
 
@@ -378,7 +380,7 @@ class Experiment(Variants):
         """
         from msg_analysis.theory.leaders import select_leaders
 
-        self.require_available("predict")
+        self.require_available("steady")
         return select_leaders(self, count, method=method, law=law, gain=gain, top=top, watch=watch)
 
     def require_available(self, purpose: Purpose = "run") -> None:
@@ -387,7 +389,7 @@ class Experiment(Variants):
         Parameters
         ----------
         purpose
-            "run" (simulate it or run a network) or "predict"
+            "run" (simulate it or run a network), "predict", or "steady" (what only a chain has)
 
         Raises
         ------

@@ -469,7 +469,7 @@ class RunSpec(Section):
         return round(self.duration / self.dt)
 
 
-Purpose = Literal["predict", "run"]
+Purpose = Literal["predict", "steady", "run"]
 
 
 class ExperimentSpec(Section):

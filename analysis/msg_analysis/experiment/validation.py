@@ -346,7 +346,10 @@ def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
 
 def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
     """What the experiment asks for that this version cannot do, one line each."""
-    lines = _too_large_to_predict(experiment) if purpose == "predict" else []
+    lines = _too_large_to_predict(experiment) if purpose != "run" else []
+    if purpose == "steady" and experiment.schedule:
+        wanted = "has no steady state, expected a Markov chain for this"
+        lines.append(problem("switching.schedule", "a given sequence of graphs", wanted, "use predict, run and compare"))
     return lines + (experiment.protocol.unavailable(purpose) if experiment.protocol else [])
 
 

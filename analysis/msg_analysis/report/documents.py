@@ -77,7 +77,7 @@ class MeasuredSpectrum:
 
 def predicted_spectrum(experiment: Experiment) -> MeasuredSpectrum:
     """Of an experiment; errors as of ``spectrum`` and ``predict``."""
-    experiment.require_available("predict")
+    experiment.require_available("steady")
     return MeasuredSpectrum(spectrum(predict(experiment)))
 
 
@@ -85,7 +85,7 @@ def measure_spectrum(bag: Path, level: float) -> MeasuredSpectrum:
     """Of the run in a bag, of a torn one of what is before the first gap."""
     trajectory = read_bag(bag)
     experiment = trajectory.record.experiment
-    experiment.require_available("predict")
+    experiment.require_available("steady")
     prediction = predict(experiment, trajectory.record.step_model)
     observation = Observation.of(trajectory, prediction)
     reason = why_not_tested(observation)
