@@ -89,7 +89,7 @@ class Experiment(Variants):
         return f"<Experiment {what}, graphs {graphs}{more}; {self.steps} steps of {self.step_length:g}>"
 
     def _repr_markdown_(self) -> str:
-        shares = self.chain.stationary
+        shares = self.switching_law.stationary
         rows = [
             (graph.name, str(len(graph.edges if graph.symmetric else graph.arcs)), number_text(share))
             for graph, share in zip(self.graph_list, shares, strict=True)
@@ -490,8 +490,8 @@ class Experiment(Variants):
     @property
     def holding_times(self) -> list[float | None]:
         """Mean time in each graph before it is left [units of simulated time]; None where it is never left."""
-        unit = self.step_length if self.time == "discrete" else 1.0
-        return [None if time is None else unit * time for time in self.chain.holding_times]
+        unit = self.step_length if self.time == "discrete" and not self.schedule else 1.0
+        return [None if time is None else unit * time for time in self.switching_law.holding_times]
 
     @property
     def step_length(self) -> float:

@@ -11,7 +11,7 @@ import sys
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -147,11 +147,27 @@ class Schedule:
     repeat: bool  # whether it then begins again
 
     @property
-    def stationary(self) -> FloatArray:
-        """(n,) shares of time of the graphs, up to the end or the beginning of the last stretch."""
+    def _spent(self) -> FloatArray:
+        """(n,) time in every graph, up to the end, or without one to the beginning of the last stretch."""
         ends = np.append(self.starts[1:], self.starts[-1:] if math.isinf(self.end) else self.end)
-        spent = np.bincount(self.order, ends - self.starts, self.modes)
-        return np.asarray(spent / spent.sum() if spent.any() else np.eye(self.modes)[self.order[0]])
+        return np.asarray(np.bincount(self.order, ends - self.starts, self.modes), dtype=float)
+
+    @property
+    def stationary(self) -> FloatArray:
+        """(n,) shares of time of the graphs."""
+        spent = self._spent
+        return spent / spent.sum() if spent.any() else np.eye(self.modes)[self.order[0]]
+
+    @property
+    def holding_times(self) -> list[float | None]:
+        """Mean length of the stretches of each graph [units of simulated time]; None where it is not known."""
+        counts = np.bincount(self.order, minlength=self.modes).tolist()
+        return [time / count if time else None for time, count in zip(self._spent.tolist(), counts, strict=True)]
+
+    def to_json(self) -> dict[str, Any]:
+        """What ``info`` says of it."""
+        end = None if math.isinf(self.end) else self.end
+        return {"stretches": len(self.starts), "end": end, "repeat": self.repeat}
 
     def sampled(self, steps: int, dt: float) -> IntArray:
         """(steps,) graphs at the times 0, dt, ..."""

@@ -349,7 +349,9 @@ def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
     lines = _too_large_to_predict(experiment) if purpose != "run" else []
     if purpose == "steady" and experiment.schedule:
         wanted = "has no steady state, expected a Markov chain for this"
-        lines.append(problem("switching.schedule", "a given sequence of graphs", wanted, "use predict, run and compare"))
+        lines.append(
+            problem("switching.schedule", "a given sequence of graphs", wanted, "use predict, run and compare")
+        )
     return lines + (experiment.protocol.unavailable(purpose) if experiment.protocol else [])
 
 

@@ -247,7 +247,7 @@ def first_graph(experiment: Experiment) -> FloatArray:
     if experiment.schedule:
         return np.asarray(np.eye(len(experiment.graph_list))[experiment.schedule.order[0]])
     if first == "stationary":
-        return experiment.chain.stationary
+        return experiment.switching_law.stationary
     return np.array([float(graph.name == first) for graph in experiment.graph_list])
 
 

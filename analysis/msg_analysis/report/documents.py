@@ -219,11 +219,11 @@ def _mean_squares(document: dict[str, Any]) -> tuple[str, str]:
 def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     """The document of ``info EXPERIMENT``, also of one that cannot be run; None: infinite or not known."""
     document = experiment.to_document()
-    chain = experiment.chain
+    switching, schedule = experiment.switching_law, experiment.schedule
     states, matrices = loading.memory_needed(
-        experiment.agents, chain.modes, experiment.steps, experiment.width, experiment.noise.delay, experiment.truth
+        experiment.agents, switching.modes, experiment.steps, experiment.width, experiment.noise.delay, experiment.truth
     )
-    limits: list[float | None] = [None] * chain.modes
+    limits: list[float | None] = [None] * switching.modes
     if experiment.time != "discrete" and not experiment.noise.delay and not experiment.protocol:
         found = (validation.stability_limit(graph, experiment.leader_gains) for graph in experiment.graph_list)
         limits = [limit if math.isfinite(limit) else None for limit in found]
@@ -241,7 +241,11 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
         "protocol": _protocol(experiment),
         "noise": document["noise"],
         "run": document["run"] | {"steps": experiment.steps},
-        "switching": {"matrix": chain.matrix.tolist(), "initial": experiment.switching.initial},
+        "switching": {
+            "matrix": None if schedule else experiment.chain.matrix.tolist(),
+            "initial": experiment.switching.initial,
+            "schedule": schedule and schedule.to_json(),
+        },
         "graphs": [
             {
                 "name": graph.name,
@@ -253,7 +257,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
                 "stability_limit": limit,
             }
             for graph, share, holding_time, limit in zip(
-                experiment.graph_list, chain.stationary, experiment.holding_times, limits, strict=True
+                experiment.graph_list, switching.stationary, experiment.holding_times, limits, strict=True
             )
         ],
         "stability_limit": min((limit for limit in limits if limit is not None), default=None),

@@ -249,7 +249,7 @@ def explain(experiment: Experiment) -> list[str]:
 
 def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
     """Of every graph; ``share``: of time; ``held``: mean holding time [units of simulated time], None: never left."""
-    rows = zip(experiment.graph_list, experiment.chain.stationary, experiment.holding_times, strict=True)
+    rows = zip(experiment.graph_list, experiment.switching_law.stationary, experiment.holding_times, strict=True)
     return [
         {
             "name": graph.name,

@@ -327,7 +327,7 @@ def _models(
     known = trajectory.modes[:steps]
     if len(known):
         graphs = [graph.name for graph in experiment.graph_list]
-        models["occupancy"] = run_plots.occupancy(known, graphs, experiment.chain.stationary)
+        models["occupancy"] = run_plots.occupancy(known, graphs, experiment.switching_law.stationary)
         if not document["unpredicted"]:
             reference = None if experiment.problem == "consensus" else experiment.reference
             states = bounded(trajectory.values[:steps])
@@ -383,9 +383,9 @@ def _sequence(comparison: Comparison, document: dict[str, Any]) -> str:
     if document["unpredicted"] or len(experiment.graph_list) == 1 or not len(modes):
         return ""
     shares = np.bincount(modes[modes >= 0], minlength=len(experiment.graph_list)) / len(modes)
-    mode = int(np.abs(shares - experiment.chain.stationary).argmax())
+    mode = int(np.abs(shares - experiment.switching_law.stationary).argmax())
     words = f"Not {CORRECTED}: {experiment.graph_list[mode].name} was active in {percent(shares[mode])} of the steps, "
-    words += f"{percent(experiment.chain.stationary[mode])} on average, which moves all errors together."
+    words += f"{percent(experiment.switching_law.stationary[mode])} on average, which moves all errors together."
     if given:
         error = given["system_error"]
         words += f" The system error {CORRECTED} is {measured_text(error['measured'], error['interval'])}."

@@ -172,7 +172,13 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     facts.add_row("stability limit of dt", number_text(document["stability_limit"]))
     facts.add_row("replicas", str(run["replicas"]))
     facts.add_row("seed", str(run["seed"]))
-    facts.add_row("start", f"{_short(run['start'])}, first graph {document['switching']['initial']}")
+    schedule = document["switching"].get("schedule")
+    first = document["graphs"][0]["name"] if schedule else document["switching"]["initial"]
+    facts.add_row("start", f"{_short(run['start'])}, first graph {first}")
+    if schedule:
+        end = "with the run" if schedule["end"] is None else f"at {number_text(schedule['end'])}"
+        then = ", then again" if schedule["repeat"] else ""
+        facts.add_row("schedule", f"{counted(schedule['stretches'], 'graph')}, ends {end}{then}")
     facts.add_row("pace", f"{run['pace']}, processes {run['processes']}")
     facts.add_row("predicted system error", number_text(document["predicted_system_error"]))
     memory = document["memory"]
@@ -187,7 +193,7 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     console.print(graphs)
     title = "Switching rates" if document["time"] == "continuous" else "Switching probabilities"
     modes = [graph["name"] for graph in document["graphs"]]
-    if 1 < len(modes) <= ROWS:
+    if 1 < len(modes) <= ROWS and not schedule:
         chain = number_table(console, title, "from / to", *modes)
         for name, row in zip(modes, document["switching"]["matrix"], strict=True):
             chain.add_row(Text(name), *map(number_text, row))

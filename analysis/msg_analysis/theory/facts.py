@@ -81,7 +81,7 @@ def check_facts(experiment: Experiment) -> list[Fact]:
             f"facts: {n} graphs of {m} agents give matrices of n m^2 = {n * m * m} rows, expected at most "
             f"{MAX_UNKNOWNS}: check a smaller network of the same kind"
         )
-    chain, law = experiment.chain.matrix, experiment.chain.stationary
+    chain, law = experiment.chain.matrix, experiment.switching_law.stationary
     consensus = experiment.problem == "consensus"
     if experiment.protocol:
         step = build_step_model(experiment)

@@ -220,7 +220,7 @@ def continuous(experiment: Experiment) -> JumpSystem:
         matrices=lift.T @ drift @ lift,
         noise=_reduced_noise(gain @ gain.transpose(0, 2, 1), lift),
         chain=experiment.chain.matrix,
-        stationary=experiment.chain.stationary,
+        stationary=experiment.switching_law.stationary,
         lift=lift,
         unreduced=drift if consensus else None,
     )

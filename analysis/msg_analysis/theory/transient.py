@@ -164,7 +164,7 @@ def unreduced_consensus(experiment: Experiment) -> JumpSystem:
         matrices=drift,
         noise=gain @ gain.transpose(0, 2, 1),
         chain=experiment.chain.matrix,
-        stationary=experiment.chain.stationary,
+        stationary=experiment.switching_law.stationary,
         lift=np.eye(experiment.agents),
     )
 
