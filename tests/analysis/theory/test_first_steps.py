@@ -33,20 +33,31 @@ CASES = {
 }
 
 
-def parse(case, start=(1.0, -2.0, 0.5)):
+def parse(case, start=(1.0, -2.0, 0.5), switching=None):
     graphs, noise, more = CASES[case]
     agents = 3 if graphs is LINE else 2
     run = {"dt": 0.3, "duration": 6, "seed": 3, "pace": more.get("pace", "lockstep")}
     run["start"] = start if isinstance(start, str) else list(start[:agents])
     document = {"name": "case", "agents": agents, "graphs": graphs, "noise": noise, "run": run}
-    document["switching"] = {"generator": [[-2.0, 2.0], [3.0, -3.0]]}
+    document["switching"] = switching or {"generator": [[-2.0, 2.0], [3.0, -3.0]]}
     if "leaders" in more:
         document |= {"problem": "tracking", "leaders": more["leaders"]}
     return Experiment.parse(document)
 
 
-def by_outcomes(experiment, steps, start):
-    """(steps + 1, m, m) E[x x^T] of the deviations; ``start`` (n, m, m): those at first, for every graph."""
+def chain_paths(experiment, steps):
+    """Every path of the graphs, and its probability."""
+    chain, law = scipy.linalg.expm(experiment.step_length * experiment.chain.matrix), experiment.chain.stationary
+    for path in itertools.product(range(2), repeat=steps):
+        yield path, law[path[0]] * np.prod([chain[g, h] for g, h in itertools.pairwise(path)])
+
+
+def by_outcomes(experiment, paths, start):
+    """(steps + 1, m, m) E[x x^T] of the deviations; ``start`` (n, m, m): those at first, for every graph.
+
+    ``paths``: the graphs of the steps, and the probability of this.
+    """
+    steps = len(paths[0][0])
     noise, m, dt = experiment.noise, experiment.agents, experiment.step_length
     held = np.isinf(experiment.leader_gains)
     weights = []
@@ -58,7 +69,7 @@ def by_outcomes(experiment, steps, start):
     process = np.array(noise.process, dtype=float) if isinstance(noise.process, list | tuple) else float(noise.process)
     gain = math.sqrt(dt) * (process * np.eye(m) if np.ndim(process) == 0 else process) * ~held[:, None]
     order = np.argsort(phases(experiment)) if experiment.run.pace == "realtime" else range(m)
-    chain, count = scipy.linalg.expm(dt * experiment.chain.matrix), range(steps + 1)
+    count = range(steps + 1)
     links = [(i, j) for i, j in itertools.permutations(range(m), 2) if any(w[i, j] for w in weights)]
     lossy = [link for link in links if experiment.loss[link] > 0.0]
     # Columns: x(0), process noise of every step, broadcast and link noise of every message, each of variance 1.
@@ -107,14 +118,11 @@ def by_outcomes(experiment, steps, start):
             chance *= p if fate[0] else 1.0 - p
             for old, new in itertools.pairwise(fate):
                 chance *= ((1.0 - mends) if new else mends) if old else (fails if new else 1.0 - fails)
-        for path in itertools.product(range(2), repeat=steps):
-            probability = chance * np.prod([chain[g, h] for g, h in itertools.pairwise(path)])
+        for path, probability in paths:
             rows = outcome(path, lost)
             covariance = np.eye(size)
             covariance[:m, :m] = start[path[0]]
-            law = experiment.chain.stationary[path[0]]
-            covariance[m:, m:] *= law
-            found += probability * (rows @ covariance @ rows.transpose(0, 2, 1))
+            found += chance * probability * (rows @ covariance @ rows.transpose(0, 2, 1))
     if experiment.problem == "consensus":
         centre = np.eye(m) - 1.0 / m
         found = centre @ found @ centre
@@ -131,10 +139,11 @@ def test_transients_with_a_delay_are_those_of_every_outcome(case, start):
     system = predict(experiment).system
     if start == "known":
         place = np.array(experiment.run.start) - experiment.reference
-        moments = np.multiply.outer(experiment.chain.stationary, np.outer(place, place))
+        moments = np.array([np.outer(place, place)] * 2)
     else:
         moments = system.by_graph(system.lifted(predict(experiment).steady))
-    expected = by_outcomes(experiment, steps, moments)
+        moments = moments / experiment.chain.stationary[:, None, None]
+    expected = by_outcomes(experiment, list(chain_paths(experiment, steps)), moments)
     course = solve_transient(experiment, experiment.step_length * np.arange(steps + 1)).course
     found = course.mode_second_moments.sum(axis=1)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
@@ -166,3 +175,19 @@ def test_what_is_left_out_of_the_first_steps_of_a_large_network():
     starts = [known_start(system, place, system.stationary, most_numbers=most) for most in (2000, 0)]
     exact, near = (transient(system, start, np.array([21.0])).system_error[0] for start in starts)
     assert near / exact - 1.0 == pytest.approx(-0.26, abs=0.005)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_with_a_schedule(case):
+    """The graphs change in the first steps, too."""
+    path = (1, 0, 0, 1, 1)
+    experiment = parse(case)
+    path = path[: experiment.noise.delay + 3]
+    schedule = [[0.3 * k, "ab"[g]] for k, g in enumerate(path)]
+    experiment = parse(case, switching={"schedule": schedule}).with_run(duration=0.3 * len(path))
+    place = np.array(experiment.run.start) - experiment.reference
+    expected = by_outcomes(experiment, [(path, 1.0)], np.array([np.outer(place, place)] * 2))
+    nodes = np.diagonal(expected, axis1=1, axis2=2)[1:]
+    found = predict(experiment, start=0.3)
+    np.testing.assert_allclose(found.path.system_errors, nodes.sum(axis=1), rtol=1e-9)
+    np.testing.assert_allclose(found.emulated.node_errors, nodes[1:].mean(axis=0), rtol=1e-9, atol=1e-12)
