@@ -129,6 +129,8 @@ def trusted(prediction: Prediction, means: TimeMeans, *, given: bool) -> Trust:
 
 def _doubt(prediction: Prediction, means: TimeMeans) -> tuple[Reason, str] | None:
     """What makes the intervals of the errors over all paths wrong, in words."""
+    if prediction.path and means.long_enough:
+        return None
     if means.heavy:
         return "heavy_tails", (
             f"The fourth moments of the states {_infinite(prediction.fourth_moment)}: rare large values make a large "

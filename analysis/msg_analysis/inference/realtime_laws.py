@@ -24,6 +24,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.text import percent
 from msg_analysis.inference.estimates import Estimate, covariance_test, estimates
 from msg_analysis.inference.event_order import EventOrder, order_events, sampled
+from msg_analysis.inference.given_path import means_given_path
 from msg_analysis.inference.observation import Observation, Timers
 from msg_analysis.inference.pattern_events import Periods
 from msg_analysis.inference.statistics import holm, two_sided
@@ -217,7 +218,9 @@ class Laws:
 
 def measure_laws(observation: Observation, order: EventOrder, timing: Timing, level: float) -> tuple[TimeMeans, Laws]:
     """Compare a run in real time with each law; also the means under the pattern law, else the sequential law."""
-    sequential = time_means(replace(observation, states=sampled(observation, order)))
+    ideal = replace(observation, states=sampled(observation, order))
+    given = means_given_path(ideal) if ideal.prediction.path and ideal.prediction.system.readout is None else None
+    sequential = given or time_means(ideal)
     error, p = _least(observation, sequential)
     effect = None
     try:

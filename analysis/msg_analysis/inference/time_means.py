@@ -29,6 +29,7 @@ from msg_analysis.theory.first_steps import Start, known_start, steady_start
 from msg_analysis.theory.jump_system import JumpSystem, held
 from msg_analysis.theory.moments import mode_potential, transient_mean
 from msg_analysis.theory.prediction import Prediction
+from msg_analysis.theory.scheduled import mean_given
 
 ROUNDING = 64 * float(np.finfo(float).eps)  # of the largest state: what thousands of steps may leave in differences
 PARTS = 20  # of a run, whose variances are compared
@@ -201,6 +202,8 @@ def start_of_run(prediction: Prediction, start: FloatArray, first: int | None) -
 def expected_mean(observation: Observation) -> FloatArray:
     """(f, f): exact mean of E[y y^T] over the steps of a run: steady, or transient from the known start."""
     prediction = observation.prediction
+    if prediction.path:
+        return prediction.system.framed(mean_given(prediction.system, observation.start, observation.modes))
     start = start_of_run(prediction, observation.start, int(observation.modes[0]))
     mean = transient_mean(prediction.system, prediction.steady, start, observation.steps)
     return prediction.system.framed(mean)
@@ -212,7 +215,8 @@ def time_means(observation: Observation) -> TimeMeans:
     forms, nodes, trace = forms_of(system, "nodes")
     p = packed_symmetric.size(system.frame.shape[1])
     # Where agents keep values from step to step, f depends on more than is logged: then there are no standard errors.
-    values = [] if system.readout is not None else values_of(observation.prediction, forms)
+    without = system.readout is not None or observation.prediction.path
+    values = [] if without else values_of(observation.prediction, forms)
     totals = np.zeros((observation.step.modes, p + 1))
     covariance = np.zeros((len(forms), len(forms)))
     series, variances = np.empty(steps), np.zeros(steps)

@@ -12,7 +12,6 @@ import numpy as np
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray, IntArray
 from msg_analysis.common.resources import blas_threads
-from msg_analysis.errors import InputError
 from msg_analysis.experiment.markov_chain import Schedule
 from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.inference.candidates import Cause
@@ -85,9 +84,7 @@ class Evidence:
                 kept = observation.prediction.system.readout is not None
                 given = means_in_lockstep(observation) if kept else means_given_path(observation)
                 if observation.prediction.path:
-                    if given is None:
-                        raise InputError("switching.schedule: too large for errors given the graphs: use fewer agents")
-                    means, given = given, None
+                    means, given = given or time_means(observation), None
                 else:
                     means = time_means(observation)
             residuals = ResidualSums(observation, position, watched)

@@ -327,7 +327,7 @@ def _given(experiment: Experiment, step: StepModel, start: float) -> Prediction:
     system = systems.emulated(run, experiment.problem)
     places = experiment.known_start
     assert places is not None, "a schedule has no steady state to start from"
-    path = path_moments(run, system, places[:, None], mode_path(experiment, step.initial), first)
+    path = path_moments(system, places[:, None], mode_path(experiment, step.initial), first)
     covariance = system.lifted(path.by_mode.sum(axis=0))
     emulated = Moments(covariance, names=experiment.names, law=step_law(experiment))
     return Prediction(experiment, step, system, path.by_mode, emulated, None, None, path)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -43,25 +44,38 @@ class PathMoments:
         return float(self.system_errors[k]), k + 1
 
 
-def path_moments(
-    step: StepModel, system: JumpSystem, start: FloatArray, modes: IntArray, first: int = 0
-) -> PathMoments:
+def path_moments(system: JumpSystem, start: FloatArray, modes: IntArray, first: int = 0) -> PathMoments:
     """Moments of a run from ``start`` (m, R) with the graphs ``modes`` (N,), means over x(first + 1), ..., x(N)."""
     errors = np.empty(len(modes))
-    by_mode = np.zeros((step.modes, system.dimension, system.dimension))
+    by_mode = np.zeros((_step(system).modes, system.dimension, system.dimension))
     weights = system.output.T @ system.output  # so that tr(weights M) is the system error
-    for k, moments in enumerate(_course(step, system, start, modes)):
+    for k, moments in enumerate(_course(system, start, modes)):
         if k % STEPS_PER_REPORT == 0:
             tell("moments given the graphs", k, len(modes))
-        errors[k] = np.vdot(weights, moments)
-        if k >= first:
-            by_mode[modes[k]] += moments
+        if k:
+            errors[k - 1] = np.vdot(weights, moments)
+        if k > first:
+            by_mode[modes[k - 1]] += moments
     by_mode /= max(1, len(modes) - first)
     return PathMoments(errors, np.diag(system.lifted(by_mode.sum(axis=0))), by_mode)
 
 
-def _course(step: StepModel, system: JumpSystem, start: FloatArray, modes: IntArray) -> Iterator[FloatArray]:
-    """(d, d) second moments of y(1), ..., y(N)."""
+def mean_given(system: JumpSystem, start: FloatArray, modes: IntArray) -> FloatArray:
+    """(d, d): mean of the second moments of y(0), ..., y(N - 1)."""
+    total = np.zeros((system.dimension, system.dimension))
+    for moments in islice(_course(system, start, modes), len(modes)):
+        total += moments
+    return total / len(modes)
+
+
+def _step(system: JumpSystem) -> StepModel:
+    assert system.step is not None, "a system of the steps of a run"
+    return system.step
+
+
+def _course(system: JumpSystem, start: FloatArray, modes: IntArray) -> Iterator[FloatArray]:
+    """(d, d) second moments of y(0), ..., y(N)."""
+    step = _step(system)
     states = system.modes // step.modes  # of the channels
     channels = system.chain[:states, :states]
     shares: FloatArray = system.stationary.reshape(-1, states).sum(axis=0)
@@ -69,16 +83,18 @@ def _course(step: StepModel, system: JumpSystem, start: FloatArray, modes: IntAr
     def only(graphs: IntArray, chain: FloatArray) -> JumpSystem:
         which = (graphs[:, None] * states + np.arange(states)).reshape(-1)
         every = np.arange(len(graphs))
-        law: FloatArray = np.tile(shares / len(graphs), len(graphs))
+        law: FloatArray = np.asarray(np.tile(shares, len(graphs)) / len(graphs), dtype=float)
         return part(system, which, np.kron(chain, channels), law, np.repeat(every, states))
 
-    # The first steps may use the messages with x(0) again: their graphs are followed as a chain, which is certain.
-    graphs = modes[: step.delay + 2]
-    certain = np.eye(len(graphs))[np.minimum(np.arange(len(graphs)) + 1, len(graphs) - 1)]
+    # The first steps may use the messages with x(0) again: their graphs are followed as a chain, which is certain, and
+    # which has one more that stands for all links of the others.
+    count = min(len(modes), step.delay + 2)
+    graphs = np.append(modes[:count], 0)
+    certain = np.eye(count + 1)[[*range(1, count), count - 1, count]]
     begin = dataclasses.replace(only(graphs, certain), step=_of_graphs(step, graphs, certain))
-    law = np.kron(np.eye(len(graphs))[0], shares)
+    law = np.kron(np.eye(count + 1)[0], shares)
     known = known_start(begin, (start - step.reference).T, law)
-    for now in known[1 : len(modes) + 1]:
+    for now in known[: len(modes) + 1]:
         yield now.moments.sum(axis=0)
     here = slice((len(known) - 1) * states, len(known) * states)
     moments, law = known[-1].moments[here], known[-1].law[here]
@@ -89,7 +105,8 @@ def _course(step: StepModel, system: JumpSystem, start: FloatArray, modes: IntAr
 
 
 def _of_graphs(step: StepModel, graphs: IntArray, chain: FloatArray) -> StepModel:
-    """The step with these graphs, one after the other, as its modes."""
+    """The step with these graphs, one after the other, as its modes, and the last one with the links of all."""
     stacks = ("links", "weights", "nominal", "offsets", "noise_gain", "noise", "loss_variance")
     found = {name: getattr(step, name)[graphs] for name in stacks}
+    found["links"][-1] = step.links.any(axis=0)
     return dataclasses.replace(step, switching=MarkovChain("discrete", chain), initial=np.eye(len(graphs))[0], **found)
