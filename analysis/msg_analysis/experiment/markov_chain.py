@@ -156,7 +156,7 @@ class Schedule:
     def stationary(self) -> FloatArray:
         """(n,) shares of time of the graphs."""
         spent = self._spent
-        return spent / spent.sum() if spent.any() else np.eye(self.modes)[self.order[0]]
+        return np.asarray(spent / spent.sum() if spent.any() else np.eye(self.modes)[self.order[0]])
 
     @property
     def holding_times(self) -> list[float | None]:

@@ -175,10 +175,11 @@ def _at(point: FloatArray) -> str:
 
 
 def chain_drawing(experiment: Experiment, candidates: Candidates = NOBODY) -> Markup | None:
-    """A circle per graph, an arrow per rate or probability; None for a single graph, and more than ``MOST_MODES``."""
-    chain, modes = experiment.chain, len(experiment.graph_list)
-    if not 1 < modes <= MOST_MODES:
+    """A circle per graph, an arrow per rate; None for one graph, more than ``MOST_MODES``, and with a schedule."""
+    modes = len(experiment.graph_list)
+    if not 1 < modes <= MOST_MODES or experiment.schedule:
         return None
+    chain = experiment.chain
     radius = 46.0
     ring = 105.0 if modes == 2 else 150.0
     angles = [math.pi - 2 * math.pi * mode / modes for mode in range(modes)]
@@ -285,9 +286,13 @@ def _task(experiment: Experiment) -> str:
 
 
 def _switching(experiment: Experiment) -> str:
-    modes, chain = len(experiment.graph_list), experiment.chain
+    modes = len(experiment.graph_list)
     if modes == 1:
         return f"The graph is always {experiment.graph_list[0].name}."
+    if schedule := experiment.schedule:
+        times = f"{len(schedule.starts)} stretches of time" + (", again and again" if schedule.repeat else "")
+        return f"The sequence of {modes} graphs is given: {times}. All predictions are given this sequence."
+    chain = experiment.chain
     first = experiment.switching.initial
     begin = "drawn from the stationary distribution" if first == "stationary" else first
     begin = f"The first graph is {begin}."
