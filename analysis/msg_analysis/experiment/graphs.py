@@ -82,6 +82,16 @@ class Graph:
         return np.asarray(np.bincount(self.targets, self.weights, self.agents), dtype=float)
 
     @property
+    def parts(self) -> int:
+        """Number of parts that no link connects, whatever its direction."""
+        linked, found, left = self.adjacency > 0, 0, set(range(self.agents))
+        linked |= linked.T
+        while left:
+            left -= set(np.flatnonzero(hops(linked, [min(left)]) >= 0).tolist())
+            found += 1
+        return found
+
+    @property
     def symmetric(self) -> bool:
         """Whether the graph is undirected."""
         adjacency = self.adjacency

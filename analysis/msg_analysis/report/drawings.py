@@ -290,8 +290,8 @@ def _switching(experiment: Experiment) -> str:
     if modes == 1:
         return f"The graph is always {experiment.graph_list[0].name}."
     if schedule := experiment.schedule:
-        times = f"{len(schedule.starts)} stretches of time" + (", again and again" if schedule.repeat else "")
-        return f"The sequence of {modes} graphs is given: {times}. All predictions are given this sequence."
+        stretches = f"{len(schedule.starts)} stretches of time" + (", again and again" if schedule.repeat else "")
+        return f"The sequence of {modes} graphs is given: {stretches}. All predictions are given this sequence."
     chain = experiment.chain
     first = experiment.switching.initial
     begin = "drawn from the stationary distribution" if first == "stationary" else first

@@ -272,6 +272,7 @@ def render(
         first_agents=_first(_FIRST_LINES, *candidates.involved, *apart),  # whose convergence is drawn at first
         style=plot_style,
         most_lines=error_plots.MOST_LINES,
+        most_lanes=run_plots.MOST_LANES,
         drawn=drawn,
         shown=_first(_FIRST_TRAJECTORIES, *candidates.involved, *range(1, experiment.agents + 1)),
         candidates=candidates,
@@ -327,7 +328,8 @@ def _models(
     known = trajectory.modes[:steps]
     if len(known):
         graphs = [graph.name for graph in experiment.graph_list]
-        models["occupancy"] = run_plots.occupancy(known, graphs, experiment.switching_law.stationary)
+        if not experiment.schedule:
+            models["occupancy"] = run_plots.occupancy(known, graphs, experiment.switching_law.stationary)
         if not document["unpredicted"]:
             reference = None if experiment.problem == "consensus" else experiment.reference
             states = bounded(trajectory.values[:steps])

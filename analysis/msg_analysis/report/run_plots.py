@@ -38,6 +38,7 @@ from msg_analysis.report.plot_style import (
 )
 
 KINDS = ("killed", "back", "late", "refused", "missing")
+MOST_LANES = 16  # graphs that have a lane each
 MOST_EVENTS = 400  # of a kind, the longest; others are counted
 _NEAR = 5  # steps between two late ones of an agent that are told together
 
@@ -193,11 +194,18 @@ def trajectory_plots(
     data.append(
         _source("intervals", start=np.append(starts[:shown], end) * dt, graph=np.append(modes[starts[:shown]], -1))
     )
-    data.append(_source("graphs", name=names, colour=[graph_colour(mode) for mode in range(len(names))]))
+    many = len(names) > MOST_LANES
+    lane, colour = np.arange(len(names)), [graph_colour(mode) for mode in range(len(names))]
+    if many:
+        lane = np.array([len(graph.edges if graph.symmetric else graph.arcs) for graph in experiment.graph_list])
+        parts = [graph.parts for graph in experiment.graph_list]
+        colour = [SKY if each == 1 else GREY for each in parts]
+        names = [f"{name}: {n} links, {each} parts" for name, n, each in zip(names, lane, parts, strict=True)]
+    data.append(_source("graphs", name=names, colour=colour, lane=lane))
     figures = {
         "trajectories": _states(time, data),
         **({"events": _events(time, events, dt)} if events else {}),
-        "path": _active_graph(time, names),
+        "path": _links_over_time(time, int(lane.max())) if many else _active_graph(time, names),
         "errors": _error(time, predicted),
         "overview": _overview(time, float(len(modes) * dt)),
     }
@@ -281,14 +289,23 @@ def _states(time: Range1d, data: list[ColumnDataSource]) -> UIElement:
 
 
 def _active_graph(time: Range1d, names: Sequence[str]) -> UIElement:
-    lane = Range1d(len(names) - 0.4, -0.6)
-    plot = _over_time(min(26 + 22 * len(names), 420), time, y_range=lane, y_axis_label="graph")
+    plot = _lanes(time, Range1d(len(names) - 0.4, -0.6), 26 + 22 * len(names), "graph")
+    _name_lanes(plot, [PlainText(text=shorten(name, 7)) for name in names])
+    return plot
+
+
+def _links_over_time(time: Range1d, most: int) -> UIElement:
+    """Instead of a lane for each graph: its number of links, and whether it is in one part (blue)."""
+    return _lanes(time, Range1d(-0.6, most + 0.6), 150, "links")
+
+
+def _lanes(time: Range1d, lane: Range1d, height: float, label: str) -> Any:
+    plot = _over_time(height, time, y_range=lane, y_axis_label=label)
     plot.xaxis.visible = False
     lanes = _source("lanes", graph=[], left=[], right=[], colour=[], name=[])
     bars = plot.hbar("graph", left="left", right="right", height=0.76, color="colour", line_alpha=0, source=lanes)
     rows = [("graph", "@name"), ("from", "@left{0.[00]} to @right{0.[00]}")]
     show_values(plot, [bars], rows)
-    _name_lanes(plot, [PlainText(text=shorten(name, 7)) for name in names])
     return plot
 
 

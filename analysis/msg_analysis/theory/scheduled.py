@@ -83,7 +83,7 @@ def _course(system: JumpSystem, start: FloatArray, modes: IntArray) -> Iterator[
     def only(graphs: IntArray, chain: FloatArray) -> JumpSystem:
         which = (graphs[:, None] * states + np.arange(states)).reshape(-1)
         every = np.arange(len(graphs))
-        law: FloatArray = np.asarray(np.tile(shares, len(graphs)) / len(graphs), dtype=float)
+        law = np.array([*(shares / len(graphs))] * len(graphs))
         return part(system, which, np.kron(chain, channels), law, np.repeat(every, states))
 
     # The first steps may use the messages with x(0) again: their graphs are followed as a chain, which is certain, and

@@ -113,14 +113,15 @@
   function drawGraphs(pixels) {
     const starts = column("intervals", "start"), graphs = column("intervals", "graph");
     const names = column("graphs", "name"), colours = column("graphs", "colour");
+    const lane = column("graphs", "lane");
     const gap = (time.end - time.start) / pixels, open = new Map(), lanes = [], strips = [];
     let place = Math.max(0, firstAfter(starts, time.start) - 1);
     let strip = null, longest = 0;
     for (; place < starts.length - 1 && starts[place] < time.end; place += 1) {
       const graph = graphs[place];
       if (graph < 0) continue;
-      const left = starts[place], right = starts[place + 1], lane = open.get(graph);
-      if (lane && left - lane.right < gap) lane.right = right;
+      const left = starts[place], right = starts[place + 1], bar = open.get(graph);
+      if (bar && left - bar.right < gap) bar.right = right;
       else {
         open.set(graph, { graph, left, right });
         lanes.push(open.get(graph));
@@ -138,7 +139,7 @@
       left: bars.map((bar) => bar.left), right: bars.map((bar) => bar.right),
       colour: bars.map((bar) => colours[bar.graph]),
     });
-    model("lanes").data = { ...columns(lanes), graph: lanes.map((bar) => bar.graph), name: lanes.map((bar) => names[bar.graph]) };
+    model("lanes").data = { ...columns(lanes), graph: lanes.map((bar) => lane[bar.graph]), name: lanes.map((bar) => names[bar.graph]) };
     model("strips").data = columns(strips.length > MOST_STRIPS ? [] : strips);
     model("error_strips").data = columns(strips.length > MOST_STRIPS ? [] : strips);
   }
