@@ -82,9 +82,9 @@ def _course(system: JumpSystem, start: FloatArray, modes: IntArray) -> Iterator[
 
     def only(graphs: IntArray, chain: FloatArray) -> JumpSystem:
         which = (graphs[:, None] * states + np.arange(states)).reshape(-1)
-        every = np.arange(len(graphs))
-        law = np.array([*(shares / len(graphs))] * len(graphs))
-        return part(system, which, np.kron(chain, channels), law, np.repeat(every, states))
+        jumps = np.asarray(np.kron(chain, channels), dtype=float)
+        law = np.tile(shares / len(graphs), len(graphs))
+        return part(system, which, jumps, law, np.repeat(np.arange(len(graphs)), states))
 
     # The first steps may use the messages with x(0) again: their graphs are followed as a chain, which is certain, and
     # which has one more that stands for all links of the others.
