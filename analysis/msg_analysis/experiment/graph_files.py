@@ -285,7 +285,7 @@ def read_csv(key: str, file: Path) -> ForeignGraph:
 
 def _table(key: str, file: Path) -> tuple[str, list[tuple[int, list[str]]]]:
     """The separator of a CSV file, and its rows that are not empty, the header first, with their lines."""
-    content = filefile_content(key, file)
+    content = file_content(key, file)
     utf_16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
         text = content.decode("utf-16" if utf_16 else "utf-8-sig")
@@ -322,7 +322,7 @@ def _set_points(
 
 def read_matrix(key: str, file: Path) -> list[list[float]]:
     """The rows of a matrix in a file, .csv or .npy; ``key`` is for the GraphError."""
-    content = filefile_content(key, file)
+    content = file_content(key, file)
     try:
         if file.suffix == ".npy":
             matrix = np.load(io.BytesIO(content), allow_pickle=False)
