@@ -64,12 +64,15 @@ def main() -> None:
 )
 @experiment_argument
 @set_option
+@click.option(
+    "--from", "start", type=float, metavar="TIME", default=0.0, help="Of a schedule: the mean of later times only."
+)
 @json_option
-def predict(experiment: Path, changes: tuple[str, ...], as_json: bool) -> None:
-    """Predict the steady errors of EXPERIMENT, exactly."""
+def predict(experiment: Path, *, changes: tuple[str, ...], start: float, as_json: bool) -> None:
+    """Predict the steady errors of EXPERIMENT, exactly; of a schedule, their means over time."""
     from msg_analysis.report.theory_text import print_prediction
 
-    document = load_experiment(experiment, changes).predict().to_json()
+    document = load_experiment(experiment, changes).predict(start=start).to_json()
     print_result(document, print_prediction, as_json=as_json)
 
 

@@ -187,8 +187,15 @@ class Experiment(Variants):
             document["protocol"] = self.spec.protocol.model_dump(mode="json")
         return document
 
-    def predict(self) -> Prediction:
+    def predict(self, *, start: float = 0.0) -> Prediction:
         """The exact steady second moments; each law has errors, certainty, covariance.
+
+        Of a schedule, their means over the times of the run, given its graphs.
+
+        Parameters
+        ----------
+        start
+            with a schedule: only times after this one count [units of simulated time]; else 0
 
         Returns
         -------
@@ -200,12 +207,12 @@ class Experiment(Variants):
         NotAvailableError
             the experiment asks for something that cannot be predicted
         InputError
-            too large, or without finite steady errors
+            too large, without finite steady errors, or a ``start`` that is not in the run
         """
         from msg_analysis.theory.prediction import predict
 
         self.require_available("predict")
-        return predict(self)
+        return predict(self, start=start)
 
     def transient(self, times: ArrayLike, *, law: TransientLaw = "emulated", unreduced: bool = False) -> Transient:
         """The exact moments over time from the experiment's own start.

@@ -30,10 +30,18 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
         [number_text(law[key]) for law in laws.values()] for key in ("system_error", "system_certainty")
     )
     agents = (list(map(number_text, row)) for row in zip(*(law["node_errors"] for law in laws.values()), strict=True))
-    title = "Mean-square error in the steady state"
+    steps = document.get("emulated") or document["discrete"]
+    scheduled = "largest" in steps
+    title = (
+        "Mean-square error over the given sequence of graphs" if scheduled else "Mean-square error in the steady state"
+    )
     print_errors(console, title, list(laws), system, agents, document.get("names"), ["certainty", *certainty])
     shares = [(name, number_text(share)) for name, share in zip(document["modes"], document["stationary"], strict=True)]
     print_rows(console, "Graphs", ["graph", "share of time"], shares)
+    if scheduled:
+        worst = f"largest system error: {number_text(steps['largest'])} at time {number_text(steps['largest_time'])}"
+        console.print(worst.capitalize())
+        return
     for key, title in LAW_NAMES.items():
         if key in document and document[key] is None:
             why, apart = "not defined with this noise", document.get("disconnected")

@@ -304,6 +304,8 @@ def predict(experiment: Experiment, step: StepModel | None = None, *, start: flo
     step = step or build_step_model(experiment)
     if experiment.schedule:
         return _given(experiment, step, start)
+    if start:
+        raise InputError(f"from: {start:g}: expected with a schedule; a steady state has no time: leave it out")
     continuous = paper = None
     if not experiment.noise.steps_only:
         if experiment.time == "continuous" and not experiment.protocol:
@@ -319,7 +321,7 @@ def predict(experiment: Experiment, step: StepModel | None = None, *, start: flo
 
 def _given(experiment: Experiment, step: StepModel, start: float) -> Prediction:
     """Of a schedule."""
-    first = round(start / experiment.step_length)
+    first = round(start / experiment.step_length) if math.isfinite(start) else -1
     if not 0 <= first < experiment.steps:
         wanted = f"expected a time from 0 to below {experiment.run.duration:g}, the end of the run"
         raise InputError(f"from: {start:g}: {wanted}: correct it")
