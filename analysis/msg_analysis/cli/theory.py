@@ -57,7 +57,7 @@ def transient(experiment: Path, times: str, *, table: Path | None, as_json: bool
 
     require_place(table)
     loaded = load_experiment(experiment)
-    loaded.require_available("steady")
+    loaded.require_available("predict")
     document = describe_transient(loaded, _parse_times(times), **options)
     if table:
         write_transient_csv(document, table)

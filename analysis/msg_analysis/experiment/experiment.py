@@ -240,7 +240,7 @@ class Experiment(Variants):
         """
         from msg_analysis.theory.transient import solve_transient
 
-        self.require_available("steady")
+        self.require_available("predict")
         given = np.asarray(times, dtype=float)
         return replace(solve_transient(self, given, law=law, unreduced=unreduced).course, times=given)
 

@@ -170,8 +170,8 @@ class Schedule:
         return {"stretches": len(self.starts), "end": end, "repeat": self.repeat}
 
     def sampled(self, steps: int, dt: float) -> IntArray:
-        """(steps,) graphs at the times 0, dt, ..."""
-        modes, first = np.empty(steps, dtype=np.int64), 0
+        """(steps,) graphs at the times 0, dt, ...; after the end, the last one."""
+        modes, first = np.full(steps, self.order[-1], dtype=np.int64), 0
         for mode, end in self.stretches(dt):
             modes[first:end], first = mode, max(first, end)
             if first >= steps:

@@ -128,7 +128,10 @@ def describe_transient(
     }
     system, nodes = _mean_squares(document)
     document |= {system: found.system_error.tolist(), nodes: found.node_errors.tolist()}
-    document |= _settling(experiment, solved.system, solved.steady, solved.unit or 1.0, fraction)
+    if experiment.schedule:
+        document |= {"steady_system_error": None, "settling": None, "rates": None}
+    else:
+        document |= _settling(experiment, solved.system, solved.steady, solved.unit or 1.0, fraction)
     note = simplification(solved.system)
     document["notes"] = [note] if note else []
     if moments:

@@ -111,6 +111,8 @@ def print_transient(document: dict[str, Any], console: Console) -> None:
     rows = [list(map(number_text, (time, error, *(law if few else ())))) for time, error, law in found]
     print_rows(console, title, heads, rows, "times", "--json or --csv")
     settling, rates = document["settling"], document["rates"]
+    if settling is None:  # of a given sequence of graphs
+        return
     share = f"{100 * settling['fraction']:g} %"
     facts = fact_table(console, "Steady state and rates")
     facts.add_row("system error in the steady state", number_text(document["steady_system_error"]))

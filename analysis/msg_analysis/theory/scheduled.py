@@ -49,7 +49,7 @@ def path_moments(system: JumpSystem, start: FloatArray, modes: IntArray, first: 
     errors = np.empty(len(modes))
     by_mode = np.zeros((_step(system).modes, system.dimension, system.dimension))
     weights = system.output.T @ system.output  # so that tr(weights M) is the system error
-    for k, moments in enumerate(_course(system, start, modes)):
+    for k, (_, moments) in enumerate(course(system, start, modes)):
         if k % STEPS_PER_REPORT == 0:
             tell("moments given the graphs", k, len(modes))
         if k:
@@ -63,7 +63,7 @@ def path_moments(system: JumpSystem, start: FloatArray, modes: IntArray, first: 
 def mean_given(system: JumpSystem, start: FloatArray, modes: IntArray) -> FloatArray:
     """(d, d): mean of the second moments of y(0), ..., y(N - 1)."""
     total = np.zeros((system.dimension, system.dimension))
-    for moments in islice(_course(system, start, modes), len(modes)):
+    for _, moments in islice(course(system, start, modes), len(modes)):
         total += moments
     return total / len(modes)
 
@@ -73,8 +73,8 @@ def _step(system: JumpSystem) -> StepModel:
     return system.step
 
 
-def _course(system: JumpSystem, start: FloatArray, modes: IntArray) -> Iterator[FloatArray]:
-    """(d, d) second moments of y(0), ..., y(N)."""
+def course(system: JumpSystem, start: FloatArray, modes: IntArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """(d,) means and (d, d) second moments of y(0), ..., y(N), from ``start`` (m, R) with the graphs ``modes`` (N,)."""
     step = _step(system)
     states = system.modes // step.modes  # of the channels
     channels = system.chain[:states, :states]
@@ -95,13 +95,14 @@ def _course(system: JumpSystem, start: FloatArray, modes: IntArray) -> Iterator[
     law = np.kron(np.eye(count + 1)[0], shares)
     known = known_start(begin, (start - step.reference).T, law)
     for now in known[: len(modes) + 1]:
-        yield now.moments.sum(axis=0)
+        yield now.means.sum(axis=0), now.moments.sum(axis=0)
     here = slice((len(known) - 1) * states, len(known) * states)
-    moments, law = known[-1].moments[here], known[-1].law[here]
+    means, moments, law = known[-1].means[here], known[-1].moments[here], known[-1].law[here]
     of_graph = {mode: only(np.array([mode]), np.ones((1, 1))) for mode in np.unique(modes).tolist()}
     for mode in modes[len(known) - 1 :].tolist():
+        means = channels.T @ np.einsum("sab,sb->sa", of_graph[mode].matrices, means)
         moments, law = of_graph[mode].advance(moments, law)
-        yield moments.sum(axis=0)
+        yield means.sum(axis=0), moments.sum(axis=0)
 
 
 def _of_graphs(step: StepModel, graphs: IntArray, chain: FloatArray) -> StepModel:

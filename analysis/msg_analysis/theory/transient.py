@@ -26,6 +26,7 @@ from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.propagator import Flow
 from msg_analysis.theory.rational_krylov import RationalFlow, slowest_rate
+from msg_analysis.theory.scheduled import course
 from msg_analysis.theory.solvers import mean_propagator, second_moment_propagator
 
 if TYPE_CHECKING:
@@ -141,18 +142,51 @@ def solve_transient(
     InputError: times or a law that do not fit, too large, or no finite steady errors.
     """
     system, unit = _system(experiment, law)
+    if experiment.schedule:
+        return _given(experiment, system, times, unreduced=unreduced)
     steady = MomentSolver(system).steady()
     if not unreduced:
         found = transient(system, start_of(experiment, system, system.lifted(steady)), _steps(times, unit), steady)
         return SolvedTransient(found, system, steady, unit)
-    if experiment.problem != "consensus":
-        raise InputError("unreduced: expected problem: consensus (tracking has no reduction): leave it out")
+    _require_consensus(experiment)
     if unit is None:
         whole = unreduced_consensus(experiment)
     else:
         whole = systems.emulated(build_run_model(experiment), "tracking")
     start = start_of(experiment, whole, system.lifted(steady))
     return SolvedTransient(transient(whole, start, _steps(times, unit)), system, steady, unit)
+
+
+def _given(experiment: Experiment, system: JumpSystem, times: FloatArray, *, unreduced: bool) -> SolvedTransient:
+    """With a schedule, which has no steady state."""
+    if unreduced:
+        _require_consensus(experiment)
+        system = systems.emulated(build_run_model(experiment), "tracking")
+    unit = experiment.step_length
+    steps = _steps(times, unit)
+    _check_times(system, steps)
+    last = round(float(steps[-1]))
+    if last > experiment.steps:
+        raise InputError(f"times: {times[-1]:g}: expected at most {experiment.run.duration:g}, the end of the run")
+    place, schedule = experiment.known_start, experiment.schedule
+    assert place is not None
+    assert schedule is not None
+    graphs = schedule.sampled(last + 1, unit)
+    states = system.modes // schedule.modes  # of channels
+    n, d = system.modes, system.dimension
+    found = Transient(
+        system, steps, *(np.zeros((len(steps), *shape)) for shape in ((n,), (n, d), (n, d, d)))
+    )  # all moments are those of the graph that is active
+    for k, (means, moments) in enumerate(course(system, place[:, None], graphs[: max(last, 1)])):
+        for row in np.flatnonzero(steps == k).tolist():
+            mode = graphs[k] * states
+            found.laws[row, mode], found.means[row, mode], found.moments[row, mode] = 1.0, means, moments
+    return SolvedTransient(found, system, np.zeros_like(system.matrices), unit)
+
+
+def _require_consensus(experiment: Experiment) -> None:
+    if experiment.problem != "consensus":
+        raise InputError("unreduced: expected problem: consensus (tracking has no reduction): leave it out")
 
 
 def unreduced_consensus(experiment: Experiment) -> JumpSystem:

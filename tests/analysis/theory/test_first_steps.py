@@ -188,6 +188,9 @@ def test_with_a_schedule(case):
     place = np.array(experiment.run.start) - experiment.reference
     expected = by_outcomes(experiment, [(path, 1.0)], np.array([np.outer(place, place)] * 2))
     nodes = np.diagonal(expected, axis1=1, axis2=2)[1:]
+    times = 0.3 * np.arange(len(path) + 1)
+    course = solve_transient(experiment, times).course
+    np.testing.assert_allclose(course.mode_second_moments.sum(axis=1), expected, rtol=1e-9, atol=1e-12)
     found = predict(experiment, start=0.3)
     np.testing.assert_allclose(found.path.system_errors, nodes.sum(axis=1), rtol=1e-9)
     np.testing.assert_allclose(found.emulated.node_errors, nodes[1:].mean(axis=0), rtol=1e-9, atol=1e-12)
