@@ -18,8 +18,9 @@ import numpy as np
 from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.bags.stored_file import Batch, gather
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray, column, large_zeros, pieces, release
+from msg_analysis.common.resources import available_memory
+from msg_analysis.common.text import amount
 from msg_analysis.errors import BagError
-from msg_analysis.experiment.loading import amount, available_memory
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import LITTLE_ENDIAN, CdrError
 from msg_analysis.messages.messages import STATE_HEAD, STATE_SIZE, AgentState

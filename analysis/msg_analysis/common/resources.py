@@ -138,3 +138,14 @@ def require_pyarrow(what: str) -> None:
     """NotAvailableError where pyarrow cannot be loaded, which something needs."""
     if problem := pyarrow_problem():
         raise NotAvailableError(f"{what}: pyarrow cannot be loaded ({problem}): install a version that fits")
+
+
+def available_memory() -> int:
+    """Available bytes: what Linux estimates as available, elsewhere all physical memory."""
+    try:
+        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass  # not Linux: all physical memory is the next best number
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -121,3 +121,12 @@ _SHOWN = {
 def visible(text: str) -> str:
     """The text with its control characters written as escapes; line ends and tabs stay."""
     return text.translate(_SHOWN)
+
+
+def amount(size: float) -> str:
+    """A number of bytes as text with a unit: ``1.5 GB``."""
+    units = ["B", "kB", "MB", "GB", "TB"]
+    while size >= 1000 and len(units) > 1:
+        size /= 1000
+        units.pop(0)
+    return f"{size:.3g} {units[0]}"

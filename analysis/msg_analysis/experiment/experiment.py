@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.common.text import markdown_table, number_text
+from msg_analysis.common.text import listed, markdown_table, number_text
 from msg_analysis.errors import NotAvailableError
-from msg_analysis.experiment import loading, protocols, validation
+from msg_analysis.experiment import protocols, validation
 from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.loading import Sections, other_kind, read_yaml
@@ -83,16 +83,14 @@ class Experiment(Variants):
     __hash__ = None  # type: ignore[assignment]  # the document has lists in it
 
     def __repr__(self) -> str:
-        graphs = ", ".join(graph.name for graph in self.graph_list[:SHOWN_GRAPHS])
-        more = ", ..." if len(self.graph_list) > SHOWN_GRAPHS else ""
+        graphs = listed([graph.name for graph in self.graph_list], SHOWN_GRAPHS)
         what = f"{self.name!r}: {self.problem} of {self.agents} agents in {self.time} time"
-        return f"<Experiment {what}, graphs {graphs}{more}; {self.steps} steps of {self.step_length:g}>"
+        return f"<Experiment {what}, graphs {graphs}; {self.steps} steps of {self.step_length:g}>"
 
     def _repr_markdown_(self) -> str:
-        shares = self.switching_law.stationary
         rows = [
-            (graph.name, str(len(graph.edges if graph.symmetric else graph.arcs)), number_text(share))
-            for graph, share in zip(self.graph_list, shares, strict=True)
+            (graph.name, str(graph.links), number_text(share))
+            for graph, share in zip(self.graph_list, self.switching_law.stationary, strict=True)
         ]
         run = self.run
         return (
@@ -174,8 +172,8 @@ class Experiment(Variants):
         )
         bound, found = protocols.bind(self.protocol, network, self.run, self.names, recorded)
         experiment = replace(self, protocol=bound)
-        graphs, numbers = len(self.graph_list), experiment.width
-        found += loading.memory_problems(self.agents, graphs, self.steps, numbers, 0, experiment.truth)
+        size = len(self.graph_list), self.steps, experiment.width
+        found += validation.memory_problems(self.agents, *size, 0, experiment.truth)
         if found:
             raise ExperimentError(self.source, found)
         return experiment
@@ -188,9 +186,7 @@ class Experiment(Variants):
         return document
 
     def predict(self, *, start: float = 0.0) -> Prediction:
-        """The exact steady second moments; each law has errors, certainty, covariance.
-
-        Of a schedule, their means over the times of the run, given its graphs.
+        """The exact steady second moments, of a schedule means over time; each law has errors, certainty, covariance.
 
         Parameters
         ----------
@@ -462,14 +458,12 @@ class Experiment(Variants):
     @property
     def width(self) -> int:
         """Numbers in an agent's state: the number of replicas, times the numbers in the state of a protocol."""
-        protocol = self.protocol
-        return self.run.replicas * (protocol.info.states if protocol else 1)
+        return self.run.replicas * (self.protocol.info.states if self.protocol else 1)
 
     @property
     def truth(self) -> bool:
         """Whether agents publish something else than their whole state, which then has a topic of its own."""
-        protocol = self.protocol
-        return self.noise.broadcast > 0 or (protocol is not None and protocol.info.hidden)
+        return self.noise.broadcast > 0 or (self.protocol is not None and self.protocol.info.hidden)
 
     @property
     def leader_gains(self) -> FloatArray:

@@ -82,6 +82,11 @@ class Graph:
         return np.asarray(np.bincount(self.targets, self.weights, self.agents), dtype=float)
 
     @property
+    def links(self) -> int:
+        """Number of edges of an undirected graph, of arcs of a directed one."""
+        return len(self.weights) // 2 if self.symmetric else len(self.weights)
+
+    @property
     def parts(self) -> int:
         """Number of parts that no link connects, whatever its direction."""
         linked, found, left = self.adjacency > 0, 0, set(range(self.agents))

@@ -6,8 +6,6 @@
 from __future__ import annotations
 
 import functools
-import math
-import os
 import re
 from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
@@ -20,15 +18,13 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.files import SAFE_LOADER, load_yaml, read_text
 from msg_analysis.common.text import listed
 from msg_analysis.errors import InputError
-from msg_analysis.experiment import graph_files, graph_sources, protocols, validation
+from msg_analysis.experiment import graph_files, graph_sources, protocols, traces, validation
 from msg_analysis.experiment.graph_files import ForeignGraph, GraphError
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
 from msg_analysis.experiment.problems import WEIGHT, problem, show, translate
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
 from msg_analysis.experiment.spec import BESIDE, ExperimentSpec, GraphSpec, NoiseSpec, RunSpec, SwitchingSpec
-from msg_analysis.experiment.traces import read_trace
-from msg_analysis.experiment.validation import STEP_TOLERANCE
 
 
 class _StrictLoader(SAFE_LOADER):  # type: ignore[misc]  # one of two classes: see there
@@ -150,55 +146,6 @@ def parse_yaml(text: str, source: str) -> Any:
         raise InputError(f"{source}: not YAML: {' '.join(str(error).split())}") from error
 
 
-_MATRICES_PER_GRAPH = 8  # adjacency, W, its coupling, F, B, N, the variance of loss, and the product that makes N
-
-
-def memory_needed(
-    agents: int, modes: int, steps: int, replicas: int, delay: int = 0, truth: bool = False
-) -> tuple[int, int]:
-    """Bytes for the states of a run, and for the matrices of all graphs; ``replicas``: numbers in an agent's state."""
-    # A delay [steps] makes the matrices larger. With truth, states are kept twice: as they are and as published.
-    states = (steps + 1) * agents * replicas * 8 * (2 if truth else 1)
-    return states, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
-
-
-def available_memory() -> int:
-    """Available bytes: what Linux estimates as available, elsewhere all physical memory."""
-    try:
-        for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) * 1024
-    except OSError:
-        pass  # not Linux: all physical memory is the next best number
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
-def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: int, truth: bool = False) -> list[str]:
-    """Problems if states and matrices do not fit in memory; arguments as in ``memory_needed``."""
-    available = available_memory()
-    states, matrices = memory_needed(agents, modes, steps, replicas, delay, truth)
-    if states + matrices <= available:
-        return []
-    room = f"expected at most {amount(available)}, the memory available"
-    if matrices > states:
-        if delay:
-            text = f"{delay} steps with {modes} graphs of {agents} agents need {amount(matrices)}"
-            return [problem("noise.delay", text, room, "lower the delay, or the number of agents or graphs")]
-        text = f"{modes} graphs of {agents} agents need {amount(matrices)}"
-        return [problem("graphs", text, room, "lower the number of agents or graphs")]
-    text = f"{steps} steps of {agents} agents with {replicas} replicas need {amount(states)}"
-    return [problem("run", text, room, "lower run.duration or run.replicas, or raise run.dt")]
-
-
-def amount(size: float) -> str:
-    """A number of bytes as text with a unit: ``1.5 GB``."""
-    units = ["B", "kB", "MB", "GB", "TB"]
-    while size >= 1000 and len(units) > 1:
-        size /= 1000
-        units.pop(0)
-    return f"{size:.3g} {units[0]}"
-
-
 @functools.cache
 def _adapter(key: str) -> TypeAdapter[Any]:
     """The validator of one section; cached, since making it takes longer than using it."""
@@ -252,7 +199,6 @@ class Sections:
         self._count_agents(directory)
         self._name_leaders()
         self._name_start()
-        self._fit_run()
         run = self.values["run"]
         leaders = self.values["leaders"]
         leaders_good = self.values["problem"] is not None and "leaders" in self.known
@@ -313,62 +259,23 @@ class Sections:
         graphs: dict[str, GraphSpec] | None = self.values["graphs"]
         if switching is None or graphs is None:
             return
-        key = "switching.trace"
-        if switching.trace is None:
-            if not graphs:
-                self.problems.append(
-                    problem(
-                        "graphs", "missing", "expected named graphs, or a trace", "for example line: {path: [1, 2, 3]}"
-                    )
-                )
-                self.values["graphs"] = None
-            return
         try:
-            file, directed = directory / switching.trace, not switching.undirected
-            trace = read_trace(key, file, hold=switching.hold, radius=switching.radius, directed=directed)
-            if switching.schedule is not None or bool(graphs) == bool(trace.graphs):
-                wanted = "none with a trace of links" if trace.graphs else "the graphs that the trace names"
+            if switching.trace is not None:
+                switching, self._foreign, notes = traces.resolved(switching, graphs, directory)
+                self.notes += notes
+                graphs |= {name: GraphSpec.model_construct(edges=[]) for name in self._foreign}
+                self.keys |= dict.fromkeys(self._foreign, "switching.trace")
+            if not graphs:
                 raise GraphError(
-                    "graphs", listed(list(graphs)) or "missing", f"expected {wanted}", "correct one of the two"
+                    "graphs", "missing", "expected named graphs, or a trace", "add line: {path: [1, 2, 3]}"
                 )
         except GraphError as error:
             self.problems.append(str(error))
-            self.values["graphs"] = self.values["switching"] = None
-            return
-        names = trace.nodes
-        if trace.graphs:
-            names = [f"g{number}" for number in range(1, len(trace.graphs) + 1)]
-            weight, nodes = switching.weight or 1.0, trace.nodes
-            for name, links in zip(names, trace.graphs, strict=True):
-                found = [(nodes[a], nodes[b], weight * each) for a, b, each in links]
-                self._foreign[name] = ForeignGraph(nodes if name == "g1" else (), found, trace.directed)
-                graphs[name], self.keys[name] = GraphSpec.model_construct(edges=[]), key
-        keys = ("trace", "hold", "radius", "undirected", "weight")
-        schedule = [(start, names[graph]) for start, graph in zip(trace.starts, trace.which, strict=True)]
-        given = {"schedule": schedule, "end": None if math.isinf(trace.end) else trace.end}
-        self.values["switching"] = switching.model_copy(update=dict.fromkeys(keys) | given)
-        if trace.first != 0.0:
-            self.notes.append(f"{key}: time 0 of the run is {trace.first:.12g} in the file")
-
-    def _fit_run(self) -> None:
-        """A run of a schedule begins at known places, and ends with it at the latest."""
-        run: RunSpec | None = self.values["run"]
-        switching: SwitchingSpec | None = self.values["switching"]
-        if run is None or switching is None or switching.schedule is None:
-            return
-        changes: dict[str, Any] = {}
-        if run.start == "stationary":
-            changes["start"] = "zero"
-            if "start" in run.model_fields_set:
-                wanted = "expected 'zero' or values, since a schedule has no steady state"
-                self.problems.append(problem("run.start", "stationary", wanted, "say where the agents are"))
-        if switching.end is not None and not switching.repeat:
-            if "duration" not in run.model_fields_set:
-                changes["duration"] = max(1, math.floor(switching.end / run.dt * (1.0 + STEP_TOLERANCE))) * run.dt
-            elif run.duration > switching.end * (1.0 + STEP_TOLERANCE):
-                wanted = f"expected at most {switching.end:.12g}, where the schedule ends"
-                self.problems.append(problem("run.duration", run.duration, wanted, "lower it, or add `repeat: true`"))
-        self.values["run"] = run.model_copy(update=changes)
+            switching = graphs = None
+        self.values |= {"switching": switching, "graphs": graphs}
+        if self.values["run"] and switching and switching.schedule:
+            self.values["run"], found = validation.scheduled_run(self.values["run"], switching)
+            self.problems += found
 
     def _count_agents(self, directory: Path) -> None:
         """The number of agents and their names, if every graph is valid; files with graphs are read here."""
@@ -538,7 +445,7 @@ class Sections:
         steps, replicas = (run.steps, run.replicas) if run else (1, 1)
         noise: NoiseSpec | None = self.values["noise"]
         delay, truth = (noise.delay, noise.broadcast > 0) if noise else (0, False)
-        found = memory_problems(self.agents, len(self.values["graphs"]), steps, replicas, delay, truth)
+        found = validation.memory_problems(self.agents, len(self.values["graphs"]), steps, replicas, delay, truth)
         self.problems += found
         return not found
 

@@ -187,9 +187,7 @@ class SwitchingSpec(Section):
     """What switches between the graphs: a Markov chain, or a schedule. May be left out where there is one graph."""
 
     generator: Matrix | None = Field(
-        None,
-        description="continuous time: rates between the graphs in file order; every row sums to 0",
-        examples=[[[-0.5, 0.5], [0.5, -0.5]]],
+        None, description="continuous time: rates in file order; rows sum to 0", examples=[[[-0.5, 0.5], [0.5, -0.5]]]
     )
     rates: dict[str, dict[str, NonNegative]] | None = Field(
         None,
@@ -198,40 +196,24 @@ class SwitchingSpec(Section):
     )
     scale: Positive = Field(1.0, description="multiplies the rates", examples=[0.5])
     transition: Matrix | None = Field(
-        None,
-        description="discrete time: probabilities between the graphs in file order; every row sums to 1",
-        examples=[[[0.9, 0.1], [0.2, 0.8]]],
+        None, description="discrete time: probabilities; rows sum to 1", examples=[[[0.9, 0.1], [0.2, 0.8]]]
     )
     initial: str = Field("stationary", description="'stationary' or a graph's name", examples=["stationary"])
-    schedule: Annotated[list[tuple[NonNegative, GraphName]], Field(min_length=1)] | None = Field(
-        None,
-        description="instead of a chain: [time, graph], when each graph begins, from 0 on",
-        examples=[[[0, "line"], [2.5, "ring"]]],
+    schedule: list[tuple[NonNegative, GraphName]] | None = Field(
+        None, min_length=1, description="instead of a chain: when each graph begins", examples=[[[0, "line"]]]
     )
-    end: Positive | None = Field(
-        None, description="when the last graph of the schedule ends; by default with the run", examples=[10.0]
-    )
+    end: Positive | None = Field(None, description="when the last graph ends; by default with the run", examples=[10])
     repeat: bool | None = Field(None, description="whether the schedule then begins again", examples=[True])
     trace: str | None = Field(
         None,
         min_length=1,
-        description="instead of graphs and a chain: a CSV file, relative to the experiment file, of what was recorded, "
-        "with the columns time,source,target or start,end,source,target (target listens to source), and weight; or "
-        "time,agent,x,y and z; or, with graphs, time,graph. Its first time is time 0 of the run",
+        description="instead of graphs: a CSV file of contacts, intervals or positions, or of times of graphs",
         examples=["contacts.csv"],
     )
-    hold: Positive | None = Field(
-        None, description="with a trace: how long a contact, a position or the last graph is valid", examples=[1.0]
-    )
-    radius: Positive | None = Field(
-        None, description="with a trace of positions: up to which distance agents are linked", examples=[2.5]
-    )
-    undirected: bool | None = Field(
-        None, description="with a trace: whether the source of a link listens to its target, too", examples=[True]
-    )
-    weight: Positive | None = Field(
-        None, description="with a trace: multiplies the weights of its links, which are 1 by default", examples=[0.2]
-    )
+    hold: Positive | None = Field(None, description="how long a contact, position or last graph is valid", examples=[1])
+    radius: Positive | None = Field(None, description="distance up to which agents are linked", examples=[2.5])
+    undirected: bool | None = Field(None, description="whether the source of a link listens, too", examples=[True])
+    weight: Positive | None = Field(None, description="multiplies the weights of all links", examples=[0.2])
 
 
 LARGEST_BURST = 1e6  # messages: what an agent that restarts has to draw again grows with it

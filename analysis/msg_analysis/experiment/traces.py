@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 from operator import itemgetter
@@ -16,9 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
-from msg_analysis.experiment.graph_files import GraphError, file_content, node_name
+from msg_analysis.common.text import listed
+from msg_analysis.experiment.graph_files import ForeignGraph, GraphError, file_content, node_name
 from msg_analysis.experiment.problems import show
-from msg_analysis.experiment.spec import LARGEST_NUMBER
+from msg_analysis.experiment.spec import LARGEST_NUMBER, SwitchingSpec
 
 ROUNDING = 1e-9  # of times: what differs by less, relative to its size, is the same time
 
@@ -107,6 +108,34 @@ def read_trace(
             _joined(key, _intervals(key, rows, nodes, hold), directed=directed, refreshed=hold is not None)
         )
     return _trace(nodes, moments, directed=directed and radius is None)
+
+
+def resolved(
+    switching: SwitchingSpec, graphs: Collection[str], directory: Path
+) -> tuple[SwitchingSpec, dict[str, ForeignGraph], list[str]]:
+    """The section with the schedule of its trace, the graphs of the trace by name, and notes. GraphError: a mistake.
+
+    ``graphs``: names of those in the experiment; ``directory``: base of the path.
+    """
+    key, directed = "switching.trace", not switching.undirected
+    file = directory / (switching.trace or "")
+    trace = read_trace(key, file, hold=switching.hold, radius=switching.radius, directed=directed)
+    if switching.schedule is not None or bool(graphs) == bool(trace.graphs):
+        wanted = "none with a trace of links" if trace.graphs else "the graphs that the trace names"
+        raise GraphError("graphs", listed(list(graphs)) or "missing", f"expected {wanted}", "correct one of the two")
+    names, nodes, weight = trace.nodes, trace.nodes, switching.weight or 1.0
+    found: dict[str, ForeignGraph] = {}
+    if trace.graphs:
+        names = [f"g{number}" for number in range(1, len(trace.graphs) + 1)]
+        for name, links in zip(names, trace.graphs, strict=True):
+            arcs = [(nodes[a], nodes[b], weight * each) for a, b, each in links]
+            found[name] = ForeignGraph(() if found else nodes, arcs, trace.directed)  # all nodes are known by the first
+    changes = dict.fromkeys(("trace", "hold", "radius", "undirected", "weight")) | {
+        "schedule": [(start, names[graph]) for start, graph in zip(trace.starts, trace.which, strict=True)],
+        "end": None if math.isinf(trace.end) else trace.end,
+    }
+    notes = [f"{key}: time 0 of the run is {trace.first:.12g} in the file"] if trace.first else []
+    return switching.model_copy(update=changes), found, notes
 
 
 def _rows(key: str, file: Path) -> tuple[str, Iterator[_Row]]:

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from msg_analysis.common.arrays import BoolArray, FloatArray
-from msg_analysis.common.text import agent_name, agent_text, listed
+from msg_analysis.common.resources import available_memory
+from msg_analysis.common.text import agent_name, agent_text, amount, listed
 from msg_analysis.experiment.graphs import Graph, hops, widest_reaching
 from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
 from msg_analysis.experiment.problems import problem, show
@@ -74,6 +75,23 @@ def switching_of(
     numbers = {name: mode for mode, name in enumerate(names)}
     path = np.array(starts), np.array([numbers[name] for name in order])
     return Schedule(*path, len(names), end, bool(switching.repeat)), []
+
+
+def scheduled_run(run: RunSpec, switching: SwitchingSpec) -> tuple[RunSpec, list[str]]:
+    """A run of a schedule, which begins at known places and ends with it at the latest; and what is wrong with it."""
+    changes, found = dict[str, Any](), []
+    if run.start == "stationary":
+        changes["start"] = "zero"
+        if "start" in run.model_fields_set:
+            wanted = "expected 'zero' or values, since a schedule has no steady state"
+            found.append(problem("run.start", "stationary", wanted, "say where the agents are"))
+    if switching.end is not None and not switching.repeat:
+        if "duration" not in run.model_fields_set:
+            changes["duration"] = max(1, math.floor(switching.end / run.dt * (1.0 + STEP_TOLERANCE))) * run.dt
+        elif run.duration > switching.end * (1.0 + STEP_TOLERANCE):
+            wanted = f"expected at most {switching.end:.12g}, where the schedule ends"
+            found.append(problem("run.duration", run.duration, wanted, "lower it, or add `repeat: true`"))
+    return run.model_copy(update=changes), found
 
 
 def _chain_of(switching: SwitchingSpec, names: Sequence[str], time: Time) -> tuple[MarkovChain | None, list[str]]:
@@ -334,6 +352,35 @@ def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
         wanted = f"expected one value for each of the {agents} agents"
         found.append(problem("run.start", f"{len(run.start)} values", wanted, "give as many as there are agents"))
     return found
+
+
+_MATRICES_PER_GRAPH = 8  # adjacency, W, its coupling, F, B, N, the variance of loss, and the product that makes N
+
+
+def memory_needed(
+    agents: int, modes: int, steps: int, replicas: int, delay: int = 0, truth: bool = False
+) -> tuple[int, int]:
+    """Bytes for the states of a run, and for the matrices of all graphs; ``replicas``: numbers in an agent's state."""
+    # A delay [steps] makes the matrices larger. With truth, states are kept twice: as they are and as published.
+    states = (steps + 1) * agents * replicas * 8 * (2 if truth else 1)
+    return states, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
+
+
+def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: int, truth: bool = False) -> list[str]:
+    """Problems if states and matrices do not fit in memory; arguments as in ``memory_needed``."""
+    available = available_memory()
+    states, matrices = memory_needed(agents, modes, steps, replicas, delay, truth)
+    if states + matrices <= available:
+        return []
+    room = f"expected at most {amount(available)}, the memory available"
+    if matrices > states:
+        if delay:
+            text = f"{delay} steps with {modes} graphs of {agents} agents need {amount(matrices)}"
+            return [problem("noise.delay", text, room, "lower the delay, or the number of agents or graphs")]
+        text = f"{modes} graphs of {agents} agents need {amount(matrices)}"
+        return [problem("graphs", text, room, "lower the number of agents or graphs")]
+    text = f"{steps} steps of {agents} agents with {replicas} replicas need {amount(states)}"
+    return [problem("run", text, room, "lower run.duration or run.replicas, or raise run.dt")]
 
 
 def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:

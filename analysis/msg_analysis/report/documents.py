@@ -24,7 +24,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import agent_name
 from msg_analysis.errors import InputError
-from msg_analysis.experiment import loading, validation
+from msg_analysis.experiment import validation
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.autocovariance import (
     LoggedAutocovariance,
@@ -223,7 +223,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     """The document of ``info EXPERIMENT``, also of one that cannot be run; None: infinite or not known."""
     document = experiment.to_document()
     switching, schedule = experiment.switching_law, experiment.schedule
-    states, matrices = loading.memory_needed(
+    states, matrices = validation.memory_needed(
         experiment.agents, switching.modes, experiment.steps, experiment.width, experiment.noise.delay, experiment.truth
     )
     limits: list[float | None] = [None] * switching.modes

@@ -254,7 +254,7 @@ def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
     return [
         {
             "name": graph.name,
-            "links": len(graph.edges if graph.symmetric else graph.arcs),
+            "links": graph.links,
             "directed": not graph.symmetric,
             "connectivity": algebraic_connectivity(graph),
             "share": float(share),

@@ -197,7 +197,7 @@ def trajectory_plots(
     many = len(names) > MOST_LANES
     lane, colour = np.arange(len(names)), [graph_colour(mode) for mode in range(len(names))]
     if many:
-        lane = np.array([len(graph.edges if graph.symmetric else graph.arcs) for graph in experiment.graph_list])
+        lane = np.array([graph.links for graph in experiment.graph_list])
         parts = [graph.parts for graph in experiment.graph_list]
         colour = [SKY if each == 1 else GREY for each in parts]
         names = [f"{name}: {n} links, {each} parts" for name, n, each in zip(names, lane, parts, strict=True)]

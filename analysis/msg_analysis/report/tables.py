@@ -20,6 +20,7 @@ from rich.text import Text
 from msg_analysis.common.text import (
     agent_name,
     agent_text,
+    amount,
     counted,
     half_width_text,
     listed,
@@ -27,7 +28,6 @@ from msg_analysis.common.text import (
     p_text,
     z_text,
 )
-from msg_analysis.experiment.loading import amount
 from msg_analysis.runs import RunEntry
 from msg_analysis.sweeps.grid import SweepGrid
 from msg_analysis.sweeps.points import FAILED, JobResults
