@@ -33,6 +33,7 @@ LAWS: dict[str, dict[str, Any]] = {
     "metropolis": {"protocol": {"name": "metropolis", "laziness": 0.3}},
     "saturated": {"protocol": {"name": "saturated"}},
     "integral_action": {"protocol": {"name": "integral_action"}},
+    "schedule": {"switching": {"schedule": [[0, "line"], [0.35, "ring"], [2, "line"]], "end": 4, "repeat": True}},
 }
 PROCESSES = ("one_per_agent", 2, 1)
 Cells = list[tuple[str, str, int | str]]  # law, messages, processes
@@ -63,6 +64,7 @@ def assert_equal(trajectory: Run) -> None:
             ("grounded", "hold", 2),
             ("metropolis", "late", 2),
             ("integral_action", "all", 2),
+            ("schedule", "all", 2),
         ]
     ),
 )
@@ -81,6 +83,7 @@ def test_lockstep(network: Any, law: str, messages: str, processes: Any) -> None
             ("grounded", "all", 2),
             ("saturated", "plain", 2),
             ("integral_action", "all", "one_per_agent"),
+            ("schedule", "own", 2),
         ]
     ),
 )
