@@ -8,7 +8,7 @@ Only sums are kept; a step takes O(m^2), and while the effect of a start that is
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,6 +26,7 @@ from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.theory.scheduled import course
 
 TUNING_STEPS = 500  # before the interval is given: their variances say how it is tuned
 
@@ -124,6 +125,8 @@ class LiveEstimate:
         self._note = reason
         if prediction is not None and not lockstep:
             self._note = "in real time the expected errors depend on the lateness of the agents: compare the bag"
+        elif prediction is not None and prediction.path:
+            self._note = "of a given sequence of graphs, intervals need the whole run: compare the bag"
         elif prediction is not None and prediction.system.readout is not None:
             self._note = "where values are kept from step to step, intervals need the whole run: compare the bag"
         elif prediction is not None and prediction.fourth_moment.finite is not True:
@@ -210,7 +213,8 @@ class RunningErrors:
         if prediction is not None:
             self._expected = _Expected(prediction)
             heavy = prediction.fourth_moment.finite is not True
-            if experiment.run.pace == "lockstep" and prediction.system.readout is None and not heavy:
+            steady = prediction.system.readout is None and not heavy and prediction.path is None
+            if experiment.run.pace == "lockstep" and steady:
                 self._variances = _ErrorVariances(prediction, self._replicas, most_bytes if nodes else 0)
                 self.nodes_tested = self._variances.nodes
 
@@ -331,6 +335,7 @@ class _Expected:
     def __init__(self, prediction: Prediction) -> None:
         self._prediction = prediction
         self._steady = np.diag(prediction.system.lifted(prediction.steady.sum(axis=0)))
+        self._given: Iterator[tuple[FloatArray, FloatArray]] | None = None  # of a schedule: moments of the next step
         self._away: FloatArray | None = None  # (n, d, d) from the steady state, of the next step
         self._law = np.empty(0)
         self._scale = 0.0
@@ -340,6 +345,14 @@ class _Expected:
     def add(self, steps: IntArray, record: RunRecord, first_mode: int | None) -> None:
         """Add steps; ``first_mode`` is g(0), which counts if it is known in the first call."""
         system, last = self._prediction.system, int(steps.max())
+        if schedule := record.experiment.schedule:
+            if self._given is None:
+                graphs = schedule.sampled(record.experiment.steps, record.experiment.step_length)
+                self._given = course(system, record.start, graphs)
+            while len(self._series) <= last:
+                self._series.append(np.diag(system.lifted(next(self._given)[1])))
+            self.total += np.sum([self._series[step] for step in steps.tolist()], axis=0)
+            return
         if self._away is None:
             steady = self._prediction.steady
             *before, now = start_of_run(self._prediction, record.start, first_mode)

@@ -93,6 +93,19 @@ def test_the_same_numbers_as_a_comparison(case: str) -> None:
     np.testing.assert_allclose(numbers(report.system, *report.nodes), numbers(system, *nodes), rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("more", [{}, {"noise": {"delay": 2, "link": 0.3}}], ids=["plain", "late"])
+def test_of_a_schedule_the_expectation_so_far(more: dict[str, Any]) -> None:
+    schedule = {"schedule": [[0, "line"], [1.5, "ring"], [9, "line"]], "end": 20, "repeat": True}
+    trajectory = four(switching=schedule, **more)
+    whole = observed(trajectory)
+    report = report_of(trajectory)
+    system, nodes = estimates(time_means(whole), whole.prediction.system)
+    found = np.array([(e.measured, e.predicted) for e in (report.system, *report.nodes)], dtype=float)
+    wanted = np.array([(e.measured, e.predicted) for e in (system, *nodes)], dtype=float)
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+    assert report.system.standard_error is None
+
+
 @pytest.mark.parametrize("start", ["stationary", "zero"])
 def test_who_comes_late_expects_what_is_left(start: str) -> None:
     """Nothing before step 20, and nothing of some steps: measured and expected are means over the same steps."""

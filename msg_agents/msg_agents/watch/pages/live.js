@@ -1,5 +1,5 @@
 "use strict";
-const HALF = 1.96, COLOURS = 8, DASHES = ["", "6 3", "2 3"];
+const HALF = 1.96, COLOURS = 8, MOST_KEYS = 16, DASHES = ["", "6 3", "2 3"];
 let setting = null, points = [], balls = [], links = new Map(), rows = [], scale = 0, over = false, newest = null, recent = null, off = new Set(), happened = [];
 
 const number = (value, digits = 4) => value === null || value === undefined ? "–" : Number(value).toPrecision(digits);
@@ -78,7 +78,8 @@ function begin(data) {
     return row;
   });
   at("agent-keys").replaceChildren();
-  at("graph-keys").replaceChildren(...data.graphs.map((graph, mode) => {
+  const named = data.graphs.length > MOST_KEYS ? [] : data.graphs;  // of more, the drawing has the name
+  at("graph-keys").replaceChildren(...named.map((graph, mode) => {
     const key = Object.assign(document.createElement("span"), { className: "graph", textContent: graph.name });
     key.style.setProperty("--own", graphColour(mode));
     return key;
