@@ -98,7 +98,7 @@ def test_of_a_schedule_the_expectation_so_far(more: dict[str, Any]) -> None:
     schedule = {"schedule": [[0, "line"], [1.5, "ring"], [9, "line"]], "end": 20, "repeat": True}
     trajectory = four(switching=schedule, **more)
     whole = observed(trajectory)
-    report = report_of(trajectory)
+    report = report_of(trajectory, evidence=False)
     system, nodes = estimates(time_means(whole), whole.prediction.system)
     found = np.array([(e.measured, e.predicted) for e in (report.system, *report.nodes)], dtype=float)
     wanted = np.array([(e.measured, e.predicted) for e in (system, *nodes)], dtype=float)
