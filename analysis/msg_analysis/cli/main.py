@@ -69,7 +69,7 @@ def main() -> None:
 )
 @json_option
 def predict(experiment: Path, *, changes: tuple[str, ...], start: float, as_json: bool) -> None:
-    """Predict the steady errors of EXPERIMENT, exactly; of a schedule, their means over time."""
+    """Predict the steady errors of EXPERIMENT, exactly."""
     from msg_analysis.report.theory_text import print_prediction
 
     document = load_experiment(experiment, changes).predict(start=start).to_json()

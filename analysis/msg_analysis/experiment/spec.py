@@ -190,9 +190,7 @@ class SwitchingSpec(Section):
         None, description="continuous time: rates in file order; rows sum to 0", examples=[[[-0.5, 0.5], [0.5, -0.5]]]
     )
     rates: dict[str, dict[str, NonNegative]] | None = Field(
-        None,
-        description="continuous time: rates by name, from: {to: rate}; left out = 0",
-        examples=[{"line": {"ring": 1.0}, "ring": {"line": 1.0}}],
+        None, description="continuous time: rates by name, from: {to: rate}", examples=[{"line": {"ring": 1.0}}]
     )
     scale: Positive = Field(1.0, description="multiplies the rates", examples=[0.5])
     transition: Matrix | None = Field(
@@ -207,8 +205,8 @@ class SwitchingSpec(Section):
     trace: str | None = Field(
         None,
         min_length=1,
-        description="instead of graphs: a CSV file of contacts, intervals or positions, or of times of graphs",
-        examples=["contacts.csv"],
+        description="a CSV file of contacts, intervals, positions or times of graphs",
+        examples=["c.csv"],
     )
     hold: Positive | None = Field(None, description="how long a contact, position or last graph is valid", examples=[1])
     radius: Positive | None = Field(None, description="distance up to which agents are linked", examples=[2.5])
