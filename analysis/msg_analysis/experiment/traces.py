@@ -10,7 +10,8 @@ import io
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, pairwise
+from decimal import Decimal, InvalidOperation
+from itertools import chain, groupby, pairwise
 from operator import itemgetter
 from pathlib import Path
 
@@ -39,7 +40,8 @@ Link = tuple[int, int, float]
 """Source, target (which listens to it) and weight; agents by their place in ``Trace.nodes``."""
 
 _Interval = tuple[float, float, Link]
-_Row = tuple[str, float, Sequence[str]]  # where it stands, its time, and its other cells in the order of the columns
+_Row = tuple[str, Sequence[float], Sequence[str]]
+"""Where it stands, its time, or start and end, after the first one, and its other cells in the order of the columns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +91,7 @@ def read_trace(
     directed
         whether only the target of a contact or interval hears the other
     """
-    kind, rows = _rows(key, file)
+    kind, first, rows = _rows(key, file)
     if kind == "contacts" and hold is None:
         raise GraphError("switching.hold", "missing", "expected with contacts", "add how long one is valid")
     if kind == "intervals" and hold is not None:
@@ -99,7 +101,7 @@ def read_trace(
     if kind != "positions" and radius is not None:
         raise GraphError("switching.radius", radius, f"expected with positions, and this is {kind}", "remove it")
     if kind == "schedule":
-        return _schedule(key, rows, hold)
+        return _schedule(key, rows, hold, first)
     nodes: dict[str, int] = {}
     if radius is not None:
         moments = _near(key, rows, nodes, radius, hold)
@@ -107,7 +109,7 @@ def read_trace(
         moments = _moments(
             _joined(key, _intervals(key, rows, nodes, hold), directed=directed, refreshed=hold is not None)
         )
-    return _trace(nodes, moments, directed=directed and radius is None)
+    return _trace(nodes, moments, first, directed=directed and radius is None)
 
 
 def resolved(
@@ -138,8 +140,8 @@ def resolved(
     return switching.model_copy(update=changes), found, notes
 
 
-def _rows(key: str, file: Path) -> tuple[str, Iterator[_Row]]:
-    """The kind of trace, and its rows in the order of time."""
+def _rows(key: str, file: Path) -> tuple[str, float, Iterator[_Row]]:
+    """The kind of trace, its first time, and its rows in the order of time."""
     try:
         text = file_content(key, file).decode("utf-8-sig")
         names: list[str] = []
@@ -156,42 +158,49 @@ def _rows(key: str, file: Path) -> tuple[str, Iterator[_Row]]:
     wanted = [*COLUMNS[found], *([OPTIONAL[found]] if OPTIONAL.get(found) in names else [])]
     if twice := next((name for name in wanted if names.count(name) > 1), None):
         raise GraphError(key, f"{file}, line 1: {twice} twice", "expected it once", "remove one")
-    pick = itemgetter(*map(names.index, wanted))
+    pick, times = itemgetter(*map(names.index, wanted)), 2 if found == "intervals" else 1
 
-    def rows() -> Iterator[_Row]:
-        before = -math.inf
+    def cells() -> Iterator[tuple[str, Sequence[Decimal], Sequence[str]]]:
+        before = Decimal("-Infinity")
         try:
             for row in table:
                 if not any(row):
                     continue
                 place = f"{file}, line {table.line_num}"
                 try:
-                    first, *others = pick(row)
+                    values = pick(row)
                 except IndexError:
                     shown = f"{place}: {show(separator.join(row))}"
                     raise GraphError(key, shown, f"expected {len(names)} values as in the header", _CORRECT) from None
-                time = _number(key, place, wanted[0], first)
-                if time < before:
-                    expected = f"expected at least {before:.12g}, the one before"
-                    raise GraphError(key, f"{place}: {wanted[0]} {time:.12g}", expected, "sort the file by it")
-                before = time
-                yield place, time, others
+                now = [_number(key, place, column, text) for column, text in zip(wanted[:times], values, strict=False)]
+                if now[0] < before:
+                    expected = f"expected at least {before}, the one before"
+                    raise GraphError(key, f"{place}: {wanted[0]} {now[0]}", expected, "sort the file by it")
+                before = now[0]
+                yield place, now, values[times:]
         except csv.Error as error:
             raise GraphError(key, f"{file}, line {table.line_num}", f"expected CSV ({error})", _CORRECT) from error
-        if before == -math.inf:
-            raise GraphError(key, str(file), "expected rows below the header", "record something")
 
-    return found, rows()
+    rows = cells()
+    head = next(rows, None)
+    if head is None:
+        raise GraphError(key, str(file), "expected rows below the header", "record something")
+    first = head[1][0]  # subtracted as it is written: a double of seconds since 1970 has a rounding of its own
+    return (
+        found,
+        float(first),
+        ((place, [float(time - first) for time in now], others) for place, now, others in chain([head], rows)),
+    )
 
 
-def _number(key: str, place: str, column: str, text: str) -> float:
+def _number(key: str, place: str, column: str, text: str) -> Decimal:
     try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not abs(value) <= LARGEST_NUMBER:
-        raise GraphError(key, f"{place}: {column} {show(text)}", "expected a finite number", _CORRECT)
-    return value
+        value = Decimal(text)
+        if abs(value) <= LARGEST_NUMBER:
+            return value
+    except InvalidOperation:
+        pass
+    raise GraphError(key, f"{place}: {column} {show(text)}", "expected a finite number", _CORRECT)
 
 
 def _agent(key: str, text: str, nodes: dict[str, int]) -> int:
@@ -204,32 +213,29 @@ def _same(one: float, other: float) -> bool:
     return abs(one - other) <= ROUNDING * max(1.0, abs(one))
 
 
-def _schedule(key: str, rows: Iterable[_Row], hold: float | None) -> Trace:
+def _schedule(key: str, rows: Iterable[_Row], hold: float | None, first: float) -> Trace:
     nodes: dict[str, int] = {}
     starts: list[float] = []
     which: list[int] = []
-    for place, time, (graph, *_) in rows:
+    for place, (time,), (graph, *_) in rows:
         if starts and _same(time, starts[-1]):
-            raise GraphError(key, f"{place}: time {time:.12g} twice", "expected one graph at a time", _CORRECT)
+            raise GraphError(key, f"{place}: a time twice", "expected one graph at a time", _CORRECT)
         starts.append(time)
         which.append(nodes.setdefault(graph.strip(), len(nodes)))
-    end = math.inf if hold is None else starts[-1] - starts[0] + hold
-    return Trace(list(nodes), (), [time - starts[0] for time in starts], which, end, starts[0], directed=False)
+    end = math.inf if hold is None else starts[-1] + hold
+    return Trace(list(nodes), (), starts, which, end, first, directed=False)
 
 
 def _intervals(
     key: str, rows: Iterable[_Row], nodes: dict[str, int], hold: float | None
 ) -> Iterator[tuple[str, _Interval]]:
     """When each row says that a link was there."""
-    for place, begin, cells in rows:
-        if hold is None:
-            end, cells = _number(key, place, "end", cells[0]), cells[1:]
-            if end <= begin or _same(begin, end):
-                raise GraphError(key, f"{place}: end {end:.12g}", f"expected more than start {begin:.12g}", _CORRECT)
-        else:
-            end = begin + hold
+    for place, (begin, *others), cells in rows:
+        end = begin + hold if hold is not None else others[0]
+        if end <= begin or _same(begin, end):
+            raise GraphError(key, place, "expected the end of an interval after its start", _CORRECT)
         a, b = (_agent(key, cell, nodes) for cell in cells[:2])
-        weight = _number(key, place, "weight", cells[2]) if cells[2:] else 1.0
+        weight = float(_number(key, place, "weight", cells[2])) if cells[2:] else 1.0
         if a == b or weight <= 0.0:
             shown, wanted = (
                 (show(cells[0]), "two different agents") if a == b else (f"weight {weight:g}", "a number > 0")
@@ -249,8 +255,8 @@ def _joined(
         if pair in open_:
             since, until, link = open_[pair]
             if not refreshed and begin < until and not _same(begin, until):
-                shown, wanted = f"{place}: start {begin:.12g}", f"expected at least {until:.12g}, where this link ended"
-                raise GraphError(key, shown, wanted, "correct one of the two")
+                wanted = f"expected no start {until - begin:.6g} before the same link has ended"
+                raise GraphError(key, place, wanted, "correct one of the two")
             if begin > until and not _same(begin, until):
                 yield since, until, link
             elif link[2] == weight:
@@ -294,26 +300,27 @@ def _near(
                 del places[agent]
             yield end, links()
 
-    for time, group in groupby(rows, key=itemgetter(1)):
+    for (time,), group in groupby(rows, key=itemgetter(1)):
         yield from forget(time)
         for place, _, (name, *cells) in group:
             agent = _agent(key, name, nodes)
-            where = [_number(key, place, column, cell) for column, cell in zip("xyz", cells, strict=False)]
+            where = [float(_number(key, place, column, cell)) for column, cell in zip("xyz", cells, strict=False)]
             places[agent] = (time + hold if hold else math.inf, where)
         yield time, links()
     yield from forget(time + (hold or 0.0))
     yield time + (hold or 0.0), frozenset()
 
 
-def _trace(nodes: Mapping[str, int], moments: Iterable[tuple[float, frozenset[Link]]], *, directed: bool) -> Trace:
+def _trace(
+    nodes: Mapping[str, int], moments: Iterable[tuple[float, frozenset[Link]]], first: float, *, directed: bool
+) -> Trace:
     numbers: dict[frozenset[Link], int] = {}
     starts: list[float] = []
     which: list[int] = []
-    first = end = math.nan
+    end = 0.0
     for (time, links), (end, _) in pairwise(moments):
-        first = time if not which else first
         number = numbers.setdefault(links, len(numbers))
         if not _same(time, end) and which[-1:] != [number]:
-            starts.append(time - first)
+            starts.append(time)
             which.append(number)
-    return Trace(list(nodes), [sorted(links) for links in numbers], starts, which, end - first, first, directed)
+    return Trace(list(nodes), [sorted(links) for links in numbers], starts, which, end, first, directed)

@@ -2,6 +2,7 @@
 
 import csv
 import random
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -40,9 +41,10 @@ def links(found: Experiment, step: int) -> dict[tuple[str, str], float]:
 def test_contacts(tmp_path: Path, hold: float, undirected: bool | None) -> None:
     """A link is there from a contact on until ``hold`` later."""
     rng = random.Random(f"contacts {hold}")
-    rows = [(float(t), *rng.sample(NAMES, 2)) for t in sorted(rng.choices(range(12), k=30))]
+    rows = [(t / 10, *rng.sample(NAMES, 2)) for t in sorted(rng.choices(range(120), k=30))]
     rows = [(0.0, *pair) for pair in RING] + rows
-    found = recorded(tmp_path, "time,source,target", rows, hold=hold, undirected=undirected, weight=0.5)
+    stamped = [(1_764_000_000 + Decimal(str(t)), *pair) for t, *pair in rows]
+    found = recorded(tmp_path, "time,source,target", stamped, hold=hold, undirected=undirected, weight=0.5)
     assert found.steps == round((rows[-1][0] + hold) / DT)
     for k in range(found.steps):
         there = [(a, b) for time, a, b in rows if time - 1e-6 < k * DT < time + hold - 1e-6]
@@ -116,14 +118,14 @@ CONTACTS = "time,source,target"
         (CONTACTS, [(0, "a", "b")], {}, "switching.hold: missing: expected with contacts"),
         (CONTACTS, [(0, "a", "b")], {"hold": 1, "radius": 2}, "switching.radius: 2.0: expected with positions"),
         (CONTACTS + ",weight", [(0, "a", "b", -1)], {"hold": 1}, "weight -1: expected a number > 0"),
-        ("start,end,source,target", [(0, 2, "a", "b"), (1, 3, "a", "b")], {}, "line 3: start 1: expected at least 2"),
-        ("start,end,source,target", [(1, 1, "a", "b")], {}, "line 2: end 1: expected more than start 1"),
+        ("start,end,source,target", [(0, 2, "a", "b"), (1, 3, "a", "b")], {}, "line 3: expected no start 1 before"),
+        ("start,end,source,target", [(1, 1, "a", "b")], {}, "line 2: expected the end of an interval after its start"),
         ("start,end,source,target", [(0, 1, "a", "b")], {"hold": 1}, "switching.hold: 1.0: expected none"),
         ("time,agent,x,y", [(0, "a", 0, 0)], {}, "switching.radius: missing"),
         ("time,agent,x,y", [(0, "a", 0, "inf")], {"radius": 1}, 'line 2: y "inf": expected a finite number'),
         ("when,who", [(0, "a")], {}, "expected the columns start,end,source,target or time,source,target or"),
         ("time,graph", [(0, "line")], {}, "graphs: missing: expected the graphs that the trace names"),
-        ("time,graph", [(0, "line"), (0, "ring")], {"graphs": {"line": {"path": NAMES}}}, "line 3: time 0 twice"),
+        ("time,graph", [(0, "line"), (0, "ring")], {"graphs": {"line": {"path": NAMES}}}, "line 3: a time twice"),
         ("time,graph", [(0, "ring")], {"graphs": {"line": {"path": NAMES}}}, '"ring": expected one of the graphs line'),
         (CONTACTS, [(0, "a", "b")], {"hold": 1, "graphs": {"line": {"path": NAMES}}}, "graphs: line: expected none"),
         (CONTACTS, [(0, "a", "b")], {"hold": 1}, "cannot be reached from"),
