@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import xlogy
 
 from msg_analysis.common.arrays import AnyArray, FloatArray, IntArray
-from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, stationary_law
+from msg_analysis.experiment.markov_chain import MarkovChain, stationary_law
 from msg_analysis.inference.candidates import Cause, Rate, find_rates, numbers_text
 from msg_analysis.inference.counts import likelihood_ratio
 from msg_analysis.inference.e_values import proportion_evidence, row_evidence
@@ -259,7 +259,7 @@ class SecondOrder(SummedDiagnostic):
         n = law.step.modes
         self._transition = law.step.transition
         # With two graphs, the one before is known; what is left is the question of the holding times.
-        self._asked = 2 < n <= MOST_GRAPHS and not isinstance(law.step.switching, Schedule)
+        self._asked = 2 < n <= MOST_GRAPHS and bool((np.diag(self._transition) < 1.0).any())
         self.sums = [np.zeros((n, 2, n, n) if self._asked else (0,), np.int64)]  # before, first or later, graph, next
         self._last = self._before = -1  # graph of the step before the next block, and the graph before that one
 

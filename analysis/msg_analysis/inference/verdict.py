@@ -81,12 +81,11 @@ class Evidence:
                 position = order.position
                 means, laws = measure_laws(observation, order, timing, level)
             else:
+                chain = None if observation.prediction.path else time_means(observation)
                 kept = observation.prediction.system.readout is not None
                 given = means_in_lockstep(observation) if kept else means_given_path(observation)
-                if observation.prediction.path:
-                    means, given = given or time_means(observation), None
-                else:
-                    means = time_means(observation)
+                means = chain or given or time_means(observation)
+                given = given if chain else None
             residuals = ResidualSums(observation, position, watched)
         return cls(
             steps=observation.steps,

@@ -247,7 +247,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
         "switching": {
             "matrix": None if schedule else experiment.chain.matrix.tolist(),
             "initial": experiment.switching.initial,
-            "schedule": schedule and schedule.to_json(),
+            **({"schedule": schedule.to_json()} if schedule else {}),
         },
         "graphs": [
             {
