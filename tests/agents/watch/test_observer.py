@@ -1,5 +1,6 @@
 """Reading the states of a running network out of its agents' checkpoints: what was written, whole, each once."""
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 from networks import experiment
 
 from msg_agents.recovery import Checkpoint, entry_size
-from msg_agents.watch.observer import BLOCK, CheckpointReader, RunObserver
+from msg_agents.watch.observer import BLOCK, CheckpointReader, EarlyEnd, RunObserver
 from msg_analysis.arithmetic.update_law import to_payload
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.online_steps import StateLog
@@ -17,7 +18,7 @@ from msg_analysis.messages.messages import StateCodec
 from msg_analysis.messages.topics import agent_node_name
 from msg_analysis.model.reception import LOST, neighbour_tables
 from msg_analysis.model.run import Run
-from msg_analysis.model.run_record import RunRecord
+from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.twin.simulate import simulate
 
 
@@ -159,3 +160,13 @@ def test_stamps(tmp_path: Path) -> None:
     steps = np.array([0, 7, 50, 51])
     wanted = [[0] * 3, [350_000_000] * 3, [2_500_000_000] * 3, [-1] * 3]  # dt = 0.05, in ns
     assert reader.stamps(steps).tolist() == wanted
+
+
+def test_of_an_observer_that_fails_a_run_says_so_once(tmp_path: Path) -> None:
+    record = dataclasses.replace(simulate(_experiment()).record, until=Until(0.5))
+    ending, notes = EarlyEnd(record, tmp_path), list[str]()
+    ending.observer.note = "the errors cannot be followed any more"
+    assert [ending.look(step, notes.append) for step in (1, 2)] == [False, False]
+    assert notes == [
+        f"--until {record.until}: {ending.observer.note}: the run goes on to step {record.experiment.steps}"
+    ]
