@@ -125,6 +125,9 @@ def resolved(
     if switching.schedule is not None or bool(graphs) == bool(trace.graphs):
         wanted = "none with a trace of links" if trace.graphs else "the graphs that the trace names"
         raise GraphError("graphs", listed(list(graphs)) or "missing", f"expected {wanted}", "correct one of the two")
+    for name in ("end",) if trace.graphs else ("end", "undirected", "weight"):
+        if (value := getattr(switching, name)) is not None:
+            raise GraphError(f"switching.{name}", value, "expected without this trace", "remove it")
     names, nodes, weight = trace.nodes, trace.nodes, switching.weight or 1.0
     found: dict[str, ForeignGraph] = {}
     if trace.graphs:

@@ -51,9 +51,9 @@ def switching_of(
         chain, found = _chain_of(switching, names, time)
         return (None if lines else chain), lines + found
     found = []
-    for key in ("generator", "rates", "transition"):
-        if getattr(switching, key) is not None:
-            found.append(problem(f"switching.{key}", "given", "expected a chain or a schedule", "remove one of them"))
+    for key in ("generator", "rates", "transition", "scale", "initial", "hold", "radius", "undirected", "weight"):
+        if getattr(switching, key) != type(switching).model_fields[key].default:
+            found.append(problem(f"switching.{key}", "given", "expected without a schedule", "remove one of them"))
     before = -1.0
     for place, (start, name) in enumerate(switching.schedule, start=1):
         key = f"switching.schedule[{place}]"

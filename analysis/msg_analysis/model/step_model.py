@@ -57,7 +57,7 @@ class Wiring:
 
     @property
     def chain(self) -> MarkovChain:
-        """The Markov chain; ValueError where there is a schedule."""
+        """The Markov chain; NotAvailableError where there is a schedule."""
         return require_chain(self.switching)
 
     @property
