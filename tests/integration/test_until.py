@@ -166,11 +166,12 @@ def test_network_of_a_sweep(network: Any) -> None:
     assert all(500 < point["steps"] < PLANNED for point in points)
 
 
-def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [MemoryError("too little"), ZeroDivisionError("a fault")])
+def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
     """The run goes on to its planned end, and says that it was not watched."""
 
     def fail(_: object) -> None:
-        raise MemoryError("too little")
+        raise error
 
     monkeypatch.setattr(online_errors.LiveEstimate, "report", fail)
     four_seconds = {"pace": "realtime", "duration": 40, "speed": 10.0}  # the errors are looked at once a second
@@ -178,7 +179,9 @@ def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert_equal_to_twin(result.trajectory)
     assert len(result.trajectory.modes) == 800
     assert not result.until["ended_early"]
-    assert result.until["reason"].startswith("not known: the errors cannot be followed any more (MemoryError")
+    assert result.until["reason"].startswith(
+        f"not known: the errors cannot be followed any more ({type(error).__name__}"
+    )
 
 
 def test_too_late(network: Any, monkeypatch: pytest.MonkeyPatch) -> None:
