@@ -30,7 +30,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import read_yaml
 from msg_analysis.experiment.problems import ExperimentError, problem, show, translate
-from msg_analysis.experiment.spec import expected
+from msg_analysis.experiment.values import expected
 from msg_analysis.messages.topics import agent_node_name
 
 RECORDER, SWITCHER, CHANNEL = "recorder", "switcher", "channel"

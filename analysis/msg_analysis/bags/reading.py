@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import re
@@ -28,6 +29,8 @@ from msg_analysis.common.arrays import AnyArray, IntArray
 from msg_analysis.common.resources import tell
 from msg_analysis.errors import BagError, InputError
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.experiment.graphs import Graph
+from msg_analysis.experiment.links import with_logged
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.messages.cdr import CdrError
 from msg_analysis.messages.messages import (
@@ -264,7 +267,11 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Run:
     if end is not None:
         record = record.ended(end)
     experiment = record.experiment
-    modes = _modes(contents, record.run.bytes, experiment.steps, planned, len(experiment.graph_list))
+    graphs = _logged_graphs(contents, record) if experiment.links else list(experiment.graph_list)
+    modes = _modes(contents, record.run.bytes, experiment.steps, planned, len(graphs))
+    if experiment.links and [graph.arcs for graph in graphs] != [graph.arcs for graph in experiment.graph_list]:
+        record = dataclasses.replace(record, experiment=with_logged(experiment, graphs, modes), matrices=None)
+        experiment = record.experiment
     published, widths = None, _widths(experiment)
     truth = contents.states.finish(record, widths[0])
     if experiment.truth:
@@ -295,6 +302,17 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Run:
         wrong_stamp=min((part.wrong_stamp for part in parts if part.wrong_stamp), default=None),
         published=published.states if published else None,
     )
+
+
+def _logged_graphs(contents: _Contents, record: RunRecord) -> list[Graph]:
+    """The graphs by their numbers in the log, where links switch by themselves: it may have others than the record."""
+    graphs, agents = list(record.experiment.graph_list), record.experiment.agents
+    for found in contents.graphs.values():
+        known = all(1 <= end <= agents for arc in found.arcs for end in arc[:2])
+        if found.run == record.run.bytes and 1 <= found.mode <= record.experiment.steps and known:
+            graphs += [Graph.of("", np.zeros((agents, agents)))] * (found.mode - len(graphs))
+            graphs[found.mode - 1] = Graph.of_arcs(found.name, agents, found.arcs)
+    return graphs
 
 
 def _end(contents: _Contents, record: RunRecord) -> int | None:

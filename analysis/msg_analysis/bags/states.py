@@ -227,7 +227,7 @@ class Collected:
         experiment = record.experiment
         self._shape = experiment.steps + 1, experiment.agents
         self._width = width
-        self._graphs = len(experiment.graph_list)
+        self._graphs = experiment.steps if experiment.links else len(experiment.graph_list)  # most that it may have
         self._realtime = experiment.run.pace == "realtime"
         self._record = record
         self._holds = experiment.noise.holds and not self._realtime

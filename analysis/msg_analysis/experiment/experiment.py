@@ -19,6 +19,7 @@ from msg_analysis.errors import NotAvailableError
 from msg_analysis.experiment import protocols, validation
 from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.graphs import Graph
+from msg_analysis.experiment.links import IndependentLinks, LinkSchedule, expanded
 from msg_analysis.experiment.loading import Sections, other_kind, read_yaml
 from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time, require_chain
 from msg_analysis.experiment.problems import ExperimentError, problem, show
@@ -53,7 +54,7 @@ class Experiment(Variants):
     graph_list
         the n graphs, in the order of the modes
     switching_law
-        what switches between the graphs: a Markov chain, or a schedule
+        what switches between the graphs: a Markov chain, or a schedule, which may be drawn from the seed
     noise_gain
         (n, m, m) F_i; Q_i = F_i F_i^T
     loss
@@ -384,7 +385,7 @@ class Experiment(Variants):
         from msg_analysis.theory.leaders import select_leaders
 
         self.require_available("steady")
-        return select_leaders(self, count, method=method, law=law, gain=gain, top=top, watch=watch)
+        return select_leaders(expanded(self), count, method=method, law=law, gain=gain, top=top, watch=watch)
 
     def require_available(self, purpose: Purpose = "run") -> None:
         """Refuse an experiment that asks for something that this version cannot do.
@@ -429,6 +430,11 @@ class Experiment(Variants):
     def schedule(self) -> Schedule | None:
         """The given sequence of the graphs; None where a chain switches between them."""
         return self.switching_law if isinstance(self.switching_law, Schedule) else None
+
+    @property
+    def links(self) -> IndependentLinks | None:
+        """The law of links that switch by themselves, from which the schedule was drawn; None where there is none."""
+        return self.switching_law.law if isinstance(self.switching_law, LinkSchedule) else None
 
     @property
     def agents(self) -> int:

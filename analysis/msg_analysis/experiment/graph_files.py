@@ -22,7 +22,7 @@ import numpy as np
 from msg_analysis.common.files import read_bytes
 from msg_analysis.common.text import counted, listed
 from msg_analysis.experiment.problems import problem, show
-from msg_analysis.experiment.spec import NAME_PATTERN, is_number
+from msg_analysis.experiment.values import NAME_PATTERN, is_number
 
 _NODE = f"expected a node's name of the form {NAME_PATTERN.strip('^$')}"
 _NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")

@@ -24,7 +24,8 @@ from msg_analysis.experiment.graph_files import (
 )
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.problems import problem, show
-from msg_analysis.experiment.spec import GraphSpec, Link, WrittenLink
+from msg_analysis.experiment.spec import GraphSpec
+from msg_analysis.experiment.values import Link, WrittenLink
 
 _PLAIN = {str, int, float, bool, type(None)}
 

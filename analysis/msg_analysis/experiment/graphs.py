@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,6 +62,13 @@ class Graph:
         """The graph with this ``adjacency`` (m, m)."""
         targets, sources = np.nonzero(adjacency)
         return cls(name, len(adjacency), targets, sources, adjacency[targets, sources])
+
+    @classmethod
+    def of_arcs(cls, name: str, agents: int, arcs: Iterable[tuple[int, int, float]]) -> Graph:
+        """The graph with these ``arcs``, as the property has them."""
+        listed = sorted(arcs, key=lambda arc: (arc[1], arc[0]))
+        sources, targets = (np.array([arc[end] for arc in listed], dtype=np.int64) - 1 for end in (0, 1))
+        return cls(name, agents, targets, sources, np.array([weight for *_, weight in listed], dtype=float))
 
     @property
     def adjacency(self) -> FloatArray:

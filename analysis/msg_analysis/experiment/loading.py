@@ -11,6 +11,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
@@ -21,6 +22,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.experiment import graph_files, graph_sources, protocols, traces, validation
 from msg_analysis.experiment.graph_files import ForeignGraph, GraphError
 from msg_analysis.experiment.graphs import Graph
+from msg_analysis.experiment.links import links_of
 from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
 from msg_analysis.experiment.problems import WEIGHT, problem, show, translate
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
@@ -230,6 +232,36 @@ class Sections:
         if time == "continuous" and run and built_in:
             gains = validation.leader_gains(leaders, self.agents)
             self.problems += validation.stability_problems(self.graphs, gains, run.dt)
+        if self.values["switching"] and self.values["switching"].links and time and run and not self.problems:
+            self._draw_links(self.values["switching"], time, run)
+
+    def _draw_links(self, switching: SwitchingSpec, time: Time, run: RunSpec) -> None:
+        """The graphs of a run whose links switch by themselves, from the seed, in place of the one with all links."""
+        assert switching.links is not None
+        assert self.noise_gain is not None
+        values = {}
+        for kind in ("up", "down"):
+            given = getattr(switching.links, kind)
+            found = {
+                ends: [
+                    (*(self._number(f"switching.links.{kind}.{ends}", agent) for agent in (i, j)), value)
+                    for i, j, value in getattr(given, ends)
+                ]
+                for ends in ("edges", "arcs")
+            }
+            values[kind] = given.model_copy(update=found)
+        if self.problems:
+            return
+        spec = switching.links.model_copy(update=values)
+        self.values["switching"] = switching.model_copy(update={"links": spec})
+        links, self.problems = links_of(spec, self.graphs[0], time, run.dt, self.values["names"])
+        if links:
+            self.problems += validation.path_problems(len(links), run.steps)
+        if self.problems or not links:
+            return
+        graphs, self.switching = links.drawn(run.seed, run.steps)
+        self.graphs = tuple(graphs)
+        self.noise_gain = np.broadcast_to(self.noise_gain[0], (len(graphs), *self.noise_gain.shape[1:]))
 
     def parts(self) -> dict[str, Any]:
         """The fields of an ``Experiment``, once there are no problems."""
@@ -273,7 +305,7 @@ class Sections:
             self.problems.append(str(error))
             switching = graphs = None
         self.values |= {"switching": switching, "graphs": graphs}
-        if self.values["run"] and switching and switching.schedule:
+        if self.values["run"] and switching and (switching.schedule or switching.links):
             self.values["run"], found = validation.scheduled_run(self.values["run"], switching)
             self.problems += found
 

@@ -9,11 +9,9 @@ Only what one value can tell by itself is checked here; ``validation`` checks wh
 from __future__ import annotations
 
 import math
-import re
-from typing import Annotated, Any, Literal, TypeGuard
+from typing import Annotated, Any, Literal
 
 from pydantic import (
-    BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -24,68 +22,33 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-LARGEST_NUMBER = 1e100  # so that no sum or product of two numbers overflows
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST_NUMBER, le=LARGEST_NUMBER)]
-Positive = Annotated[Number, Field(gt=0)]
-NonNegative = Annotated[Number, Field(ge=0)]
-LARGEST_COUNT = 2**32 - 1  # messages carry agents as uint32
-Count = Annotated[int, Field(strict=True, ge=1, le=LARGEST_COUNT)]
-Label = Count
-NAME_PATTERN = r"^\S(.{0,62}\S)?$"
-GraphName = Annotated[str, Field(pattern=NAME_PATTERN)]
-AgentName = Annotated[str, Field(pattern=NAME_PATTERN)]
-Probability = Annotated[Number, Field(ge=0, lt=1)]
-Matrix = list[list[Number]]
-
-
-def _agent(value: object, number: ValidatorFunctionWrapHandler) -> Any:
-    """A number, or the name of an agent, which becomes its number once the names are known."""
-    return value if isinstance(value, str) and re.match(NAME_PATTERN, value) else number(value)
-
-
-Agent = Annotated[Label, WrapValidator(_agent, json_schema_input_type=Label | AgentName)]
-
-
-def expected(text: str) -> PydanticCustomError:
-    """The error of a value that is not what ``text`` says, such as "a number > 0"."""
-    return PydanticCustomError("expected", "{text}", {"text": text})
-
-
-def is_number(value: object) -> TypeGuard[float]:
-    """Whether a value is a number, not a boolean, of at most ``LARGEST_NUMBER``."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
-
-
-def is_count(value: object) -> bool:
-    """Whether a value is a whole number from 1 to ``LARGEST_COUNT``."""
-    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= LARGEST_COUNT
-
-
-class Section(BaseModel):
-    """A part of the file; a key that it does not have is an error."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-Link = tuple[int, int, float]
-WrittenLink = tuple[int | str, int | str, float]  # with names of agents, too
-
-
-def is_agent(value: object) -> bool:
-    """Whether it is the number of an agent, or may be its name."""
-    return is_count(value) or (isinstance(value, str) and re.match(NAME_PATTERN, value) is not None)
-
-
-def _parts(value: object, counts: tuple[int, ...], wanted: str) -> list[Any]:
-    """A list of so many entries that begins with two agents; else ``wanted`` says what was expected."""
-    if not isinstance(value, list | tuple) or len(value) not in counts or not all(map(is_agent, value[:2])):
-        raise expected(wanted)
-    return list(value)
+from msg_analysis.experiment.values import (
+    LARGEST_COUNT,
+    Agent,
+    AgentName,
+    Count,
+    End,
+    GraphName,
+    Loss,
+    LossSpec,
+    Matrix,
+    NonNegative,
+    Number,
+    Positive,
+    Rate,
+    Section,
+    WrittenLink,
+    expected,
+    is_agent,
+    is_count,
+    is_number,
+    parts,
+)
 
 
 def _link(value: object) -> WrittenLink:
     wanted = "[agent, agent] or [agent, agent, weight], agents by number from 1 or name, the weight a number > 0"
-    first, second, weight = (*_parts(value, (2, 3), wanted), 1.0)[:3]
+    first, second, weight = (*parts(value, (2, 3), wanted), 1.0)[:3]
     if not is_number(weight) or weight <= 0:
         raise expected("a weight > 0 as the third entry")
     return (first, second, float(weight))
@@ -98,8 +61,7 @@ def _grid(value: object) -> object:
     return value
 
 
-_End = Label | AgentName
-_WrittenLinks = tuple[_End, _End] | tuple[_End, _End, Positive]
+_WrittenLinks = tuple[End, End] | tuple[End, End, Positive]
 Links = list[Annotated[WrittenLink, BeforeValidator(_link, json_schema_input_type=_WrittenLinks)]]
 
 
@@ -183,8 +145,15 @@ class GraphSpec(Section):
         return [key for key in given if key not in BESIDE]
 
 
+class LinksSpec(Section):
+    """Links that switch independently of each other: each of them is up or down, a Markov chain of its own."""
+
+    up: Rate = Field(description="rate at which a link that is down comes up; a number, or by link", examples=[2.0])
+    down: Rate = Field(description="rate at which a link that is up goes down; a number, or by link", examples=[0.5])
+
+
 class SwitchingSpec(Section):
-    """What switches between the graphs: a Markov chain, or a schedule. May be left out where there is one graph."""
+    """What switches the graphs: a chain, links by themselves, or a schedule. May be left out with one graph."""
 
     generator: Matrix | None = Field(
         None, description="continuous time: rates in file order; rows sum to 0", examples=[[[-0.5, 0.5], [0.5, -0.5]]]
@@ -197,6 +166,12 @@ class SwitchingSpec(Section):
         None, description="discrete time: probabilities; rows sum to 1", examples=[[[0.9, 0.1], [0.2, 0.8]]]
     )
     initial: str = Field("stationary", description="'stationary' or a graph's name", examples=["stationary"])
+    links: LinksSpec | None = Field(
+        None,
+        description="instead of a chain: the links of the one graph switch independently; in discrete time the values "
+        "are probabilities of a step",
+        examples=[{"up": 2.0, "down": 0.5}],
+    )
     schedule: list[tuple[NonNegative, GraphName]] | None = Field(
         None, min_length=1, description="instead of a chain: when each graph begins", examples=[[[0, "line"]]]
     )
@@ -216,25 +191,6 @@ class SwitchingSpec(Section):
 
 LARGEST_BURST = 1e6  # messages: what an agent that restarts has to draw again grows with it
 NoiseGain = float | list[float] | list[list[float]]
-
-
-def _lossy_link(value: object) -> tuple[int | str, int | str, float]:
-    wanted = "[agent, agent, probability], agents by number or name, 0 <= probability < 1"
-    first, second, probability = _parts(value, (3,), wanted)
-    if not is_number(probability) or not 0 <= probability < 1:
-        raise expected(wanted)
-    return (first, second, float(probability))
-
-
-def _loss(value: object, section: ValidatorFunctionWrapHandler) -> Any:
-    """The section; a number stands for one with nothing but a default."""
-    if isinstance(value, dict | LossSpec):
-        return section(value)
-    if not is_number(value):
-        raise expected("a probability, or keys with probabilities: default, edges, arcs")
-    if not 0 <= value < 1:
-        raise expected("a number >= 0" if value < 0 else "a number < 1")
-    return section({"default": value})
 
 
 def _process(value: object) -> NoiseGain | dict[str, NoiseGain]:
@@ -266,38 +222,6 @@ def _noise_gain(value: object) -> NoiseGain:
     raise expected("a finite number, one per agent, or a square matrix F (Q = F F^T)")
 
 
-LossyLinks = list[
-    Annotated[
-        tuple[int | str, int | str, float],
-        BeforeValidator(_lossy_link, json_schema_input_type=tuple[_End, _End, Probability]),
-    ]
-]
-
-
-class LossSpec(Section):
-    """The probability that a message is lost, by link."""
-
-    default: Probability = Field(0.0, description="of all links that are not listed", examples=[0.1])
-    edges: LossyLinks = Field(
-        [], description="of links in both directions: [agent, agent, probability]", examples=[[[1, 2, 0.5]]]
-    )
-    arcs: LossyLinks = Field(
-        [],
-        description="of links in one direction: [1, 2, 0.5] means messages from agent 1 to agent 2",
-        examples=[[[1, 2, 0.5]]],
-    )
-
-    @property
-    def any(self) -> bool:
-        """Whether a message of some link can be lost."""
-        return self.default > 0 or any(probability > 0 for *_, probability in (*self.edges, *self.arcs))
-
-    def short(self) -> Any:
-        """What a file would have: the number alone where all links have the same."""
-        links = {key: found for key in ("edges", "arcs") if (found := getattr(self, key))}
-        return {"default": self.default, **links} if links else self.default
-
-
 _Gain = NonNegative | list[NonNegative] | Matrix
 
 
@@ -315,11 +239,7 @@ class NoiseSpec(Section):
     )
     broadcast: NonNegative = Field(0.0, description="standard deviation added to each published value", examples=[0.0])
     link: NonNegative = Field(0.0, description="standard deviation added by each receiver", examples=[0.0])
-    loss: Annotated[
-        LossSpec,
-        WrapValidator(_loss, json_schema_input_type=Probability | LossSpec),
-        PlainSerializer(LossSpec.short, return_type=Any),
-    ] = Field(
+    loss: Loss = Field(
         LossSpec(), description="probability that a directed message is lost; a number, or by link", examples=[0.0]
     )
     on_loss: Literal["own", "hold"] = Field(

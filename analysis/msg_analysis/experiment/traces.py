@@ -20,7 +20,8 @@ import numpy as np
 from msg_analysis.common.text import listed
 from msg_analysis.experiment.graph_files import ForeignGraph, GraphError, file_content, node_name
 from msg_analysis.experiment.problems import show
-from msg_analysis.experiment.spec import LARGEST_NUMBER, SwitchingSpec
+from msg_analysis.experiment.spec import SwitchingSpec
+from msg_analysis.experiment.values import LARGEST_NUMBER
 
 ROUNDING = 1e-9  # of times: what differs by less, relative to its size, is the same time
 

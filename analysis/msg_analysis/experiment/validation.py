@@ -17,7 +17,8 @@ from msg_analysis.common.text import agent_name, agent_text, amount, listed
 from msg_analysis.experiment.graphs import Graph, hops, widest_reaching
 from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
 from msg_analysis.experiment.problems import problem, show
-from msg_analysis.experiment.spec import LeadersSpec, LossSpec, NoiseGain, NoiseSpec, Purpose, RunSpec, SwitchingSpec
+from msg_analysis.experiment.spec import LeadersSpec, NoiseGain, NoiseSpec, Purpose, RunSpec, SwitchingSpec
+from msg_analysis.experiment.values import LossSpec
 
 if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
@@ -48,12 +49,15 @@ def switching_of(
             problem(f"switching.{key}", getattr(switching, key), "expected with a schedule or a trace", "remove it")
             for key in given
         ]
+        if switching.links is not None:
+            lines += _alone(switching, "links that switch by themselves")
+            if len(names) > 1:
+                wanted = "expected one graph, with all links that switch by themselves"
+                lines.append(problem("graphs", listed(names), wanted, "remove the others"))
+            return None, lines
         chain, found = _chain_of(switching, names, time)
         return (None if lines else chain), lines + found
-    found = []
-    for key in ("generator", "rates", "transition", "scale", "initial", "hold", "radius", "undirected", "weight"):
-        if getattr(switching, key) != type(switching).model_fields[key].default:
-            found.append(problem(f"switching.{key}", "given", "expected without a schedule", "remove one of them"))
+    found = _alone(switching, "a schedule", "links", "hold", "radius", "undirected", "weight")
     before = -1.0
     for place, (start, name) in enumerate(switching.schedule, start=1):
         key = f"switching.schedule[{place}]"
@@ -77,13 +81,20 @@ def switching_of(
     return Schedule(*path, len(names), end, bool(switching.repeat)), []
 
 
+def _alone(switching: SwitchingSpec, beside: str, *more: str) -> list[str]:
+    """Keys of a chain, and ``more``, which cannot be given with something else."""
+    keys = ("generator", "rates", "transition", "scale", "initial", *more)
+    given = [key for key in keys if getattr(switching, key) != type(switching).model_fields[key].default]
+    return [problem(f"switching.{key}", "given", f"expected without {beside}", "remove one of them") for key in given]
+
+
 def scheduled_run(run: RunSpec, switching: SwitchingSpec) -> tuple[RunSpec, list[str]]:
     """A run of a schedule, which begins at known places and ends with it at the latest; and what is wrong with it."""
     changes, found = dict[str, Any](), []
     if run.start == "stationary":
         changes["start"] = "zero"
         if "start" in run.model_fields_set:
-            wanted = "expected 'zero' or values, since a schedule has no steady state"
+            wanted = "expected 'zero' or values, since the graphs of the run are known before it"
             found.append(problem("run.start", "stationary", wanted, "say where the agents are"))
     if switching.end is not None and not switching.repeat:
         if "duration" not in run.model_fields_set:
@@ -366,6 +377,15 @@ def memory_needed(
     return states, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
 
 
+def path_problems(links: int, steps: int) -> list[str]:
+    """Problems if the states of so many links in all steps do not fit in memory."""
+    if (needed := 2 * links * steps) <= (available := available_memory()):
+        return []
+    text = f"{steps} steps of {links} links that switch by themselves need {amount(needed)}"
+    room = f"expected at most {amount(available)}, the memory available"
+    return [problem("run.duration", text, room, "lower it, or raise run.dt")]
+
+
 def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: int, truth: bool = False) -> list[str]:
     """Problems if states and matrices do not fit in memory; arguments as in ``memory_needed``."""
     available = available_memory()
@@ -394,7 +414,11 @@ def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
 def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
     """What the experiment asks for that this version cannot do, one line each."""
     lines = _too_large_to_predict(experiment) if purpose != "run" else []
-    if purpose == "steady" and experiment.schedule:
+    states = 2.0 ** len(experiment.links or ())
+    if purpose != "run" and states > MOST_STATES:
+        wanted = f"has no exact prediction: 2^{len(experiment.links or ())} graphs, expected at most {MOST_STATES}"
+        lines.append(problem("switching.links", "links that switch by themselves", wanted, "use fewer links"))
+    if purpose == "steady" and experiment.schedule and not experiment.links:
         wanted = "has no steady state, expected a Markov chain for this"
         lines.append(
             problem("switching.schedule", "a given sequence of graphs", wanted, "use predict, run and compare")

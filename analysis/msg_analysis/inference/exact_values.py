@@ -17,6 +17,7 @@ import numpy as np
 
 from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.experiment.links import LinkSchedule
 from msg_analysis.experiment.markov_chain import Schedule
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.question import Block, Diagnostic, Finding, Law, Place, Statistics, Test, agent_words
@@ -89,7 +90,7 @@ class Stamps(Exact):
 
 
 class GivenGraphs(Exact):
-    """Whether the graphs follow the schedule of the file."""
+    """Whether the graphs follow the schedule of the file, or have its links only."""
 
     name = "schedule"
     meaning = "the graphs are not those of the schedule"
@@ -99,9 +100,10 @@ class GivenGraphs(Exact):
     @classmethod
     def words(cls, found: Finding, names: Sequence[str]) -> str:
         """The first step with another graph."""
-        assert found.graph is not None
-        assert found.other is not None
         when = found.place.words if found.place else ""
+        if found.graph is None or found.other is None:
+            sender = agent_words(found.sender)
+            return f"{agent_words(found.agent)} was linked to {sender} {when}, which no link of the file does"
         return f"graph {names[found.graph]} was active {when}, where the schedule has {names[found.other]}"
 
 
@@ -174,7 +176,16 @@ def exact_findings(
 ) -> dict[str, Finding]:
     """By name of the question, from x(0) (m, R) of log and record, ``Run.wrong_stamp``, and the graphs (N,)."""
     found = {}
-    if isinstance(step.switching, Schedule):
+    if isinstance(step.switching, LinkSchedule):
+        law = step.switching.law
+        known = np.zeros((step.agents, step.agents), dtype=np.bool_)
+        known[law.mesh.targets, law.mesh.sources] = True
+        for mode, target, source in np.argwhere(step.links & ~known & ~np.eye(step.agents, dtype=bool)).tolist():
+            if (modes == mode).any():
+                first = int(np.argmax(modes == mode))
+                found[GivenGraphs.name] = Finding(-math.inf, agent=target, sender=source, place=Place(first, first))
+                break
+    elif isinstance(step.switching, Schedule):
         expected = step.switching.sampled(len(modes), step.dt)
         for at in np.flatnonzero(modes != expected)[:1].tolist():
             graph, other = int(modes[at]), int(expected[at])

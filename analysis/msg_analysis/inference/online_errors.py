@@ -25,7 +25,7 @@ from msg_analysis.inference.time_means import Value, forms_of, packed_moments, s
 from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.theory import packed_symmetric
-from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.theory.prediction import Prediction, predict_run
 from msg_analysis.theory.scheduled import course
 
 TUNING_STEPS = 500  # before the interval is given: their variances say how it is tuned
@@ -96,7 +96,7 @@ class LiveEstimate:
         lockstep = experiment.run.pace == "lockstep"
         self.record = record
         reason = unpredictable(experiment)
-        prediction = None if reason else predict(experiment, record.step_model)
+        prediction = None if reason else predict_run(experiment, record.step_model)
         self._errors = RunningErrors(record, prediction, nodes=nodes)
         self._plain: RunningEvidence | None = None
         self._received: ReceivedEvidence | None = None

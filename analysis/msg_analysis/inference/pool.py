@@ -23,7 +23,7 @@ from msg_analysis.inference.statistics import chi2_tail
 from msg_analysis.inference.verdict import MIN_STEPS, Evidence, compare_run, evaluate, without_numbers
 from msg_analysis.model.run import Completeness, Run
 from msg_analysis.model.run_record import RunRecord
-from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.theory.prediction import Prediction, predict_run
 
 
 def compare(*runs: Run | str | Path, level: float = 0.01, max_missed: float = MAX_MISSED) -> Comparison:
@@ -86,7 +86,7 @@ def compare_pooled(
             reason = unpredictable(experiment)
             if reason:
                 raise InputError(f"{name}: {reason}, so there is nothing to pool: compare one bag at a time")
-            prediction, trajectory = predict(experiment, run.record.step_model), _without_data(run)
+            prediction, trajectory = predict_run(experiment, run.record.step_model), _without_data(run)
         prediction = prediction.for_run(experiment)
         member, evidence = _examine(name, run, prediction, level, max_missed)
         members.append(member)

@@ -16,6 +16,7 @@ from msg_analysis.inference.dependence import ConstantState, LongLags, Replicas,
 from msg_analysis.inference.exact_values import GivenGraphs, Stamps, Start, WithoutNoise
 from msg_analysis.inference.graph_names import SwappedGraphs
 from msg_analysis.inference.graphs import HoldingTimes, SecondOrder, Switching
+from msg_analysis.inference.link_states import LinkRates
 from msg_analysis.inference.messages import Broadcast, CommonGain, Gains, MessageLosses, StaleValues
 from msg_analysis.inference.noise import LargestResidual, Noise, NoiseByGraph, NoiseOverTime
 from msg_analysis.inference.question import Diagnostic, Question, Search, Statistics, Test
@@ -47,6 +48,7 @@ QUESTIONS: tuple[type[Question], ...] = (
     Start,
     Stamps,
     GivenGraphs,
+    LinkRates,
     RunsAlike,
 )
 

@@ -36,7 +36,7 @@ from msg_analysis.inference.timing import Timing, measure_timing
 from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import Wiring
-from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.theory.prediction import Prediction, predict_run
 
 ANALYSES = 20, 80  # at the evidence over time, in short and in long runs: each takes as long as some hundred steps
 STEPS_PER_ANALYSIS = 100  # between these
@@ -178,7 +178,7 @@ def compare_run(
     unpredicted = unpredictable(trajectory.record.experiment)
     if unpredicted:
         return _measured(trajectory, level, unpredicted, block_numbers)
-    prediction = predict(trajectory.record.experiment, trajectory.record.step_model)
+    prediction = predict_run(trajectory.record.experiment, trajectory.record.step_model)
     if trajectory.prefix < MIN_STEPS and not trajectory.completeness.complete:
         return without_numbers(trajectory, level, prediction, max(trajectory.prefix, 0))
     observation = Observation.of(trajectory, prediction, block_numbers)

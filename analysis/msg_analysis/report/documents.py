@@ -26,6 +26,7 @@ from msg_analysis.common.text import agent_name
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import validation
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.experiment.links import expanded, given_graphs
 from msg_analysis.inference.autocovariance import (
     LoggedAutocovariance,
     LoggedDensity,
@@ -85,7 +86,7 @@ def measure_spectrum(bag: Path, level: float) -> MeasuredSpectrum:
     """Of the run in a bag, of a torn one of what is before the first gap."""
     trajectory = read_bag(bag)
     experiment = trajectory.record.experiment
-    experiment.require_available("steady")
+    given_graphs(experiment).require_available("steady")
     prediction = predict(experiment, trajectory.record.step_model)
     observation = Observation.of(trajectory, prediction)
     reason = why_not_tested(observation)
@@ -114,6 +115,7 @@ def describe_transient(
     fraction: float = 0.05,  # of the steady system error, for the settling time
 ) -> dict[str, Any]:
     """The document of ``transient``, with the arguments of ``solve_transient``; ``moments``: of every mode, too."""
+    experiment = expanded(experiment)
     solved = solve_transient(experiment, times, law=law, unreduced=unreduced)
     found = solved.course
     document: dict[str, Any] = {
@@ -166,6 +168,7 @@ def _settling(
 
 def describe_facts(experiment: Experiment) -> dict[str, Any]:
     """The document of ``facts``; None: of a graph, of another number of graphs, or too large (``notes``)."""
+    experiment = expanded(experiment)
     prediction = predict(experiment)
     laws = {"discrete" if experiment.time == "discrete" else "emulated": prediction.system}
     if prediction.continuous_moments is not None:

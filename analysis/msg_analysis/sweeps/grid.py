@@ -24,8 +24,8 @@ from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import other_kind, read_yaml
 from msg_analysis.experiment.problems import ExperimentError, problem, show, translate
-from msg_analysis.experiment.spec import Count, expected, is_number
 from msg_analysis.experiment.validation import unavailable
+from msg_analysis.experiment.values import Count, expected, is_number
 from msg_analysis.model.run_record import Until
 from msg_analysis.sweeps.points import Job, JobKind
 

@@ -16,7 +16,7 @@ from msg_analysis.common.resources import require_pyarrow
 from msg_analysis.common.text import markdown_table
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graph_sources import plain
-from msg_analysis.experiment.spec import is_number
+from msg_analysis.experiment.values import is_number
 from msg_analysis.sweeps import grid
 from msg_analysis.sweeps.points import JobKind, evaluate, options
 from msg_analysis.sweeps.results import ResultStore, Row, SweepVerdict, arrow_table, evaluate_sweep, rows_of

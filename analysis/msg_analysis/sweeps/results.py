@@ -24,7 +24,7 @@ from msg_analysis.common.resources import pyarrow_problem
 from msg_analysis.common.text import HALF_WIDTH_95, agent_text, json_text
 from msg_analysis.errors import ExitCode, InputError
 from msg_analysis.experiment.problems import show
-from msg_analysis.experiment.spec import is_number
+from msg_analysis.experiment.values import is_number
 from msg_analysis.inference.statistics import holm
 from msg_analysis.sweeps.grid import SweepGrid
 from msg_analysis.sweeps.points import DONE, FAILED, Outcome

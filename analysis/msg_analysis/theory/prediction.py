@@ -23,6 +23,7 @@ from msg_analysis.common.resources import blas_threads, few_blas_threads, one_bl
 from msg_analysis.common.text import agent_text, finite, markdown_table, number_text
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment.graphs import hops, widest_reaching
+from msg_analysis.experiment.links import expanded
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.step_model import StepLaw, StepModel, build_run_model, build_step_model, step_law
 from msg_analysis.theory import jump_system as systems
@@ -301,6 +302,7 @@ def predict(experiment: Experiment, step: StepModel | None = None, *, start: flo
     Of a schedule, the means over the times after ``start`` [units of simulated time], given its graphs. ``step``: its
     step model, if it is known. InputError: too large, or without finite steady errors.
     """
+    experiment = expanded(experiment)
     step = step or build_step_model(experiment)
     if experiment.schedule:
         return _given(experiment, step, start)
@@ -317,6 +319,12 @@ def predict(experiment: Experiment, step: StepModel | None = None, *, start: flo
     solver, steady = _steady(step, build_run_model(experiment, step), experiment.problem)
     emulated = dataclasses.replace(_moments(solver, steady, experiment.names), law=step_law(experiment))
     return Prediction(experiment, step, solver.system, steady, emulated, continuous, paper, chain_solver=solver)
+
+
+@few_blas_threads
+def predict_run(experiment: Experiment, step: StepModel) -> Prediction:
+    """The same for a run with this ``step``: given its graphs, where these are not those of one chain."""
+    return _given(experiment, step, 0.0) if experiment.schedule else predict(experiment, step)
 
 
 def _given(experiment: Experiment, step: StepModel, start: float) -> Prediction:

@@ -18,6 +18,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.resources import few_blas_threads
 from msg_analysis.common.text import markdown_table, number_text
 from msg_analysis.errors import InputError
+from msg_analysis.experiment.links import expanded
 from msg_analysis.model.step_model import build_run_model, first_graph
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory import packed_symmetric
@@ -141,6 +142,7 @@ def solve_transient(
 
     InputError: times or a law that do not fit, too large, or no finite steady errors.
     """
+    experiment = expanded(experiment)
     system, unit = _system(experiment, law)
     if experiment.schedule:
         return _given(experiment, system, times, unreduced=unreduced)

@@ -20,7 +20,7 @@ from msg_analysis.common.arrays import BoolArray, FloatArray
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.loading import read_yaml
 from msg_analysis.experiment.problems import ExperimentError, problem
-from msg_analysis.experiment.spec import expected, is_number
+from msg_analysis.experiment.values import expected, is_number
 
 BASE = "base"  # the host of recorder and switcher
 MOST_HOSTS = 250  # of agents
