@@ -179,14 +179,15 @@ _Informations = dict[tuple[int | None, int | None], list[StepInformation]]
 
 def _noise(step: StepModel, factor: float, replicas: int) -> _Informations:
     """Per agent with noise: the likelihood ratio of the covariance of the residuals."""
-    same = bool((step.noise == step.noise[0]).all())
+    same = bool((step.noise == step.noise[0]).all() and (step.noise_gain == step.noise_gain[0]).all())
     found: _Informations = {}
-    bases = [Correlations(noise, 0.0).whitener() for noise in step.noise]
+    graphs = slice(1 if same else step.modes)
+    bases, shares = [Correlations(noise, 0.0).whitener() for noise in step.noise[graphs]], step.stationary
     dof = sum(rank * (rank + 1) // 2 for rank in (len(base) for base in (bases[:1] if same else bases)))
     larger = math.sqrt(factor) - 1.0
     for agent in range(step.agents):
         divergence = 0.0
-        for share, whitener, gain in zip(step.stationary, bases, step.noise_gain, strict=True):
+        for share, whitener, gain in zip([1.0] if same else shares, bases, step.noise_gain[graphs], strict=True):
             # The covariance changes by c (e w^T + w e^T) + c^2 w_a e e^T, with c = larger, e a unit vector, w = own.
             own = gain @ gain[agent]
             pair = np.stack([whitener[:, agent], whitener @ own])

@@ -14,12 +14,13 @@ import numpy as np
 from scipy.special import xlogy
 
 from msg_analysis.common.arrays import AnyArray, FloatArray, IntArray
-from msg_analysis.experiment.markov_chain import MarkovChain, stationary_law
+from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, stationary_law
 from msg_analysis.inference.candidates import Cause, Rate, find_rates, numbers_text
 from msg_analysis.inference.counts import likelihood_ratio
 from msg_analysis.inference.e_values import proportion_evidence, row_evidence
 from msg_analysis.inference.question import Block, Finding, Law, Question, RunningSums, Search, SummedDiagnostic
 from msg_analysis.inference.statistics import binomial_interval, log_chi2_tail
+from msg_analysis.model.step_model import Wiring
 
 
 class Switching(Question):
@@ -49,7 +50,7 @@ class Switching(Question):
 
     @property
     def _left(self) -> IntArray:
-        return np.flatnonzero(np.diag(self.law.step.transition) < 1.0)
+        return np.flatnonzero(_leaving(self.law.step))
 
     @classmethod
     def classes(cls, search: Search) -> int:
@@ -104,6 +105,11 @@ def _rate_cause(rate: Rate, chain: MarkovChain, names: Sequence[str]) -> Cause:
     return Cause("switching", words, None, None, where, estimate, interval, expected, p, log_p=rate.log_p)
 
 
+def _leaving(step: Wiring) -> FloatArray:
+    """(n,) probability that a step is the last one in its graph; 0 where there is a schedule."""
+    return np.zeros(step.modes) if isinstance(step.switching, Schedule) else 1.0 - np.diag(step.transition)
+
+
 PARTS = 8  # of the ages of a holding time, with as nearly as steps allow the same share of the ends of holding times
 JOINED = (1, 2, 4)  # parts that are one in the evidence: many parts cost evidence, few hide a deviation
 MIN_EXPECTED = 15.0  # fewest steps with, and fewest without, a switch in a part, for the chi-square law
@@ -122,8 +128,7 @@ class HoldingTimes(SummedDiagnostic):
 
     def __init__(self, law: Law) -> None:
         super().__init__(law)
-        self._transition = law.step.transition
-        self._leaving = 1.0 - np.diag(self._transition)
+        self._leaving = _leaving(law.step)
         self._left = np.flatnonzero((self._leaving > 0.0) & (self._leaving < 1.0))  # graphs that are asked about
         self._edges = [_edges(float(p)) for p in self._leaving]  # ages at which the parts 1, 2, ... begin
         self.sums = list(np.zeros((2, law.step.modes, PARTS), np.int64))  # steps, and those that left their graph
@@ -151,7 +156,7 @@ class HoldingTimes(SummedDiagnostic):
         all_steps, all_left = self.sums
         if not len(self._left):
             return None
-        visits = float(all_steps.sum()) * stationary_law(self._transition)
+        visits = float(all_steps.sum()) * stationary_law(self.law.step.transition)
         statistic, dof, clearest, found = 0.0, 0, -1.0, Finding(0.0)
         for graph, p in enumerate(self._leaving.tolist()):
             groups = _joined(visits[graph], p, self._edges[graph])
@@ -257,9 +262,9 @@ class SecondOrder(SummedDiagnostic):
     def __init__(self, law: Law) -> None:
         super().__init__(law)
         n = law.step.modes
-        self._transition = law.step.transition
         # With two graphs, the one before is known; what is left is the question of the holding times.
-        self._asked = 2 < n <= MOST_GRAPHS and bool((np.diag(self._transition) < 1.0).any())
+        self._asked = 2 < n <= MOST_GRAPHS and bool(_leaving(law.step).any())
+        self._transition = law.step.transition if self._asked else np.empty((0, 0))
         self.sums = [np.zeros((n, 2, n, n) if self._asked else (0,), np.int64)]  # before, first or later, graph, next
         self._last = self._before = -1  # graph of the step before the next block, and the graph before that one
 

@@ -64,9 +64,15 @@ class LinkRates(SummedDiagnostic):
         terms = z[alone] ** 2
         if planned[~alone].sum() >= MIN_EXPECTED and variance[~alone].any():
             terms = np.append(terms, excess[~alone].sum() ** 2 / variance[~alone].sum())
+        # One link that is far off, or many that are a little.
+        log_p = None
+        if len(terms):
+            largest = math.log(len(terms)) + log_chi2_tail(float(terms.max()), 1)
+            log_p = min(0.0, math.log(2.0) + min(largest, log_chi2_tail(float(terms.sum()), len(terms))))
         impossible = (variance == 0.0) & (excess != 0.0)
         link, up = np.unravel_index(int(np.argmax(np.where(impossible, np.inf, np.abs(z)))), z.shape)
-        log_p = -math.inf if impossible.any() else log_chi2_tail(float(terms.sum()), len(terms)) if len(terms) else None
+        if impossible.any():
+            log_p = -math.inf
         if log_p is None:
             return None
         source, target, _ = self._links.ends[link]

@@ -94,9 +94,13 @@ class NoiseByGraph(SummedDiagnostic):
     def between(self, block: Block) -> list[AnyArray]:
         """Every agent by the graph that it used."""
         size, analyses = (block.white**2).sum(axis=2), block.analyses
-        there = [block.reception.graphs == graph for graph in range(self.law.step.modes)]
-        samples = np.stack([analyses.counts(each) for each in there], axis=1) * block.white.shape[2]  # (T, n, m)
-        return [samples, np.stack([analyses.sums(size * each) for each in there], axis=1)]
+        shape = analyses.count, *self.sums[0].shape
+        samples, squares = np.zeros(shape, np.int64), np.zeros(shape)
+        for graph in np.unique(block.reception.graphs).tolist():
+            there = block.reception.graphs == graph
+            samples[:, graph] = analyses.counts(there) * block.white.shape[2]
+            squares[:, graph] = analyses.sums(size * there)
+        return [samples, squares]
 
     def finding(self) -> Finding | None:
         """The graph and the agent, or all agents, whose variance is furthest from that of the law."""

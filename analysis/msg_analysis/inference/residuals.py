@@ -214,7 +214,8 @@ def received_residuals(step: StepModel, reception: ReceivedValues, after: FloatA
 
 def _correlated(step: StepModel) -> bool:
     """Whether the process noise of two agents can be correlated, under any graphs that they use."""
-    together = np.einsum("gik,hjk->ij", np.abs(step.noise_gain), np.abs(step.noise_gain))
+    any_graph = np.abs(step.noise_gain).sum(axis=0)
+    together = any_graph @ any_graph.T
     return bool((together - np.diag(np.diag(together))).any())
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Wiring:
     """Which agent uses the values of which agents in which graph, and the law of the graphs; all count from 0."""
 
@@ -83,7 +83,7 @@ class Wiring:
         used = self.inputs(mode, agent)
         return np.asarray(used[used != agent])
 
-    @property
+    @cached_property
     def most_neighbours(self) -> int:
         """Largest number D of neighbours that any agent has in any graph."""
         return int(self.links.sum(axis=2, where=~np.eye(self.agents, dtype=bool)).max())
@@ -95,7 +95,7 @@ class Wiring:
         return used
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class StepModel(Wiring):
     """x(k+1) = W_g(k) x(k) + offset_g(k) + noise, then g jumps with P."""
 
