@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -66,6 +66,14 @@ class IndependentLinks:
         """A link in words."""
         source, target, both = self.ends[link]
         return ("-" if both else " to ").join(agent_name(agent + 1, names) for agent in (source, target))
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """What ``info`` says of each link."""
+        rows = zip(self.ends, self.up.tolist(), self.down.tolist(), self.shares.tolist(), strict=True)
+        return [
+            {"agents": [source + 1, target + 1], "directed": not both, "up": up, "down": down, "share": share}
+            for (source, target, both), up, down, share in rows
+        ]
 
     def chain(self, link: int) -> MarkovChain:
         """The chain of one link: state 0 is down, 1 is up."""

@@ -229,9 +229,17 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     states, matrices = validation.memory_needed(
         experiment.agents, switching.modes, experiment.steps, experiment.width, experiment.noise.delay, experiment.truth
     )
-    limits: list[float | None] = [None] * switching.modes
+    links, graphs = experiment.links, experiment.graph_list
+    shares, holding_times = switching.stationary.tolist(), experiment.holding_times
+    if links:  # the graph with all links says what there is; those of the run are drawn
+        graphs, shares, holding_times = (
+            (dataclasses.replace(links.mesh, name=next(iter(experiment.spec.graphs))),),
+            [None],
+            [None],
+        )
+    limits: list[float | None] = [None] * len(graphs)
     if experiment.time != "discrete" and not experiment.noise.delay and not experiment.protocol:
-        found = (validation.stability_limit(graph, experiment.leader_gains) for graph in experiment.graph_list)
+        found = (validation.stability_limit(graph, experiment.leader_gains) for graph in graphs)
         limits = [limit if math.isfinite(limit) else None for limit in found]
     predicted = None
     with suppress(InputError):  # experiments without a prediction are described, too
@@ -250,7 +258,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
         "switching": {
             "matrix": None if schedule else experiment.chain.matrix.tolist(),
             "initial": experiment.switching.initial,
-            **({"schedule": schedule.to_json()} if schedule else {}),
+            **({"links": links.to_json()} if links else {"schedule": schedule.to_json()} if schedule else {}),
         },
         "graphs": [
             {
@@ -258,13 +266,11 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
                 "edges": graph.edges if graph.symmetric else None,
                 "arcs": None if graph.symmetric else graph.arcs,
                 "algebraic_connectivity": algebraic_connectivity(graph),
-                "stationary": float(share),
+                "stationary": share,
                 "mean_holding_time": holding_time,
                 "stability_limit": limit,
             }
-            for graph, share, holding_time, limit in zip(
-                experiment.graph_list, switching.stationary, experiment.holding_times, limits, strict=True
-            )
+            for graph, share, holding_time, limit in zip(graphs, shares, holding_times, limits, strict=True)
         ],
         "stability_limit": min((limit for limit in limits if limit is not None), default=None),
         "predicted_system_error": predicted,

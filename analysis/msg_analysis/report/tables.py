@@ -173,8 +173,9 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     facts.add_row("replicas", str(run["replicas"]))
     facts.add_row("seed", str(run["seed"]))
     schedule = document["switching"].get("schedule")
+    links = document["switching"].get("links")
     first = document["graphs"][0]["name"] if schedule else document["switching"]["initial"]
-    facts.add_row("start", f"{_short(run['start'])}, first graph {first}")
+    facts.add_row("start", _short(run["start"]) + ("" if links else f", first graph {first}"))
     if schedule:
         end = "with the run" if schedule["end"] is None else f"at {number_text(schedule['end'])}"
         then = ", then again" if schedule["repeat"] else ""
@@ -188,9 +189,18 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     graphs = number_table(console, "Graphs", "graph", "connectivity", "share", "held for", "dt limit")
     graphs.add_column("links", overflow="fold")
     keys = ("algebraic_connectivity", "stationary", "mean_holding_time", "stability_limit")
-    for graph in document["graphs"]:
+    for graph in first_rows(graphs, document["graphs"], "graphs"):
         graphs.add_row(Text(graph["name"]), *(number_text(graph[key]) for key in keys), Text(_links(graph, names)))
     console.print(graphs)
+    if links:
+        switching = [
+            ((">" if link["directed"] else "-").join(agent_name(agent, names) for agent in link["agents"]), *numbers)
+            for link in links
+            for numbers in [[number_text(link[key]) for key in ("share", "up", "down")]]
+        ]
+        print_rows(
+            console, "Links that switch by themselves", ["link", "share of time", "up", "down"], switching, "links"
+        )
     title = "Switching rates" if document["time"] == "continuous" else "Switching probabilities"
     modes = [graph["name"] for graph in document["graphs"]]
     if 1 < len(modes) <= ROWS and not schedule:

@@ -37,7 +37,7 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
     )
     print_errors(console, title, list(laws), system, agents, document.get("names"), ["certainty", *certainty])
     shares = [(name, number_text(share)) for name, share in zip(document["modes"], document["stationary"], strict=True)]
-    print_rows(console, "Graphs", ["graph", "share of time"], shares)
+    print_rows(console, "Graphs", ["graph", "share of time"], shares, "graphs")
     if scheduled:
         worst = f"largest system error: {number_text(steps['largest'])} at time {number_text(steps['largest_time'])}"
         console.print(worst.capitalize())
