@@ -34,6 +34,10 @@ LAWS: dict[str, dict[str, Any]] = {
     "saturated": {"protocol": {"name": "saturated"}},
     "integral_action": {"protocol": {"name": "integral_action"}},
     "schedule": {"switching": {"schedule": [[0, "line"], [0.35, "ring"], [2, "line"]], "end": 4, "repeat": True}},
+    "links": {
+        "graphs": {"mesh": {"edges": [[1, 2], [2, 3], [3, 4], [4, 5], [1, 5], [2, 4, 0.5]]}},
+        "switching": {"links": {"up": 2.0, "down": {"default": 0.5, "edges": [[3, 4, 1e-6]]}}},
+    },
 }
 PROCESSES = ("one_per_agent", 2, 1)
 Cells = list[tuple[str, str, int | str]]  # law, messages, processes
@@ -65,6 +69,7 @@ def assert_equal(trajectory: Run) -> None:
             ("metropolis", "late", 2),
             ("integral_action", "all", 2),
             ("schedule", "all", 2),
+            ("links", "all", 2),
         ]
     ),
 )
@@ -84,6 +89,7 @@ def test_lockstep(network: Any, law: str, messages: str, processes: Any) -> None
             ("saturated", "plain", 2),
             ("integral_action", "all", "one_per_agent"),
             ("schedule", "own", 2),
+            ("links", "own", 2),
         ]
     ),
 )

@@ -255,9 +255,7 @@ class Sections:
         spec = switching.links.model_copy(update=values)
         self.values["switching"] = switching.model_copy(update={"links": spec})
         links, self.problems = links_of(spec, self.graphs[0], time, run.dt, self.values["names"])
-        if links:
-            self.problems += validation.path_problems(len(links), run.steps)
-        if self.problems or not links:
+        if not links:
             return
         graphs, self.switching = links.drawn(run.seed, run.steps)
         self.graphs = tuple(graphs)

@@ -377,15 +377,6 @@ def memory_needed(
     return states, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
 
 
-def path_problems(links: int, steps: int) -> list[str]:
-    """Problems if the states of so many links in all steps do not fit in memory."""
-    if (needed := 2 * links * steps) <= (available := available_memory()):
-        return []
-    text = f"{steps} steps of {links} links that switch by themselves need {amount(needed)}"
-    room = f"expected at most {amount(available)}, the memory available"
-    return [problem("run.duration", text, room, "lower it, or raise run.dt")]
-
-
 def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: int, truth: bool = False) -> list[str]:
     """Problems if states and matrices do not fit in memory; arguments as in ``memory_needed``."""
     available = available_memory()
