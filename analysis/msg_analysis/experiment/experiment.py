@@ -21,10 +21,10 @@ from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.links import IndependentLinks, LinkSchedule, expanded
 from msg_analysis.experiment.loading import Sections, other_kind, read_yaml
-from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time, require_chain
+from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, require_chain
 from msg_analysis.experiment.problems import ExperimentError, problem, show
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
-from msg_analysis.experiment.spec import ExperimentSpec, NoiseSpec, Purpose, RunSpec, SwitchingSpec, json_schema
+from msg_analysis.experiment.spec import ExperimentSpec, Purpose, json_schema
 from msg_analysis.experiment.variants import Variants
 from msg_analysis.protocol import Network
 
@@ -407,21 +407,6 @@ class Experiment(Variants):
             raise NotAvailableError("\n  ".join([f"{self.source}: not available in this version", *lines]))
 
     @property
-    def name(self) -> str:
-        """Name of the experiment."""
-        return self.spec.name
-
-    @property
-    def problem(self) -> str:
-        """Either "consensus" or "tracking"."""
-        return self.spec.problem
-
-    @property
-    def time(self) -> Time:
-        """Either "continuous" or "discrete"."""
-        return self.spec.time
-
-    @property
     def chain(self) -> MarkovChain:
         """The Markov chain that switches between the graphs; NotAvailableError where they have a schedule."""
         return require_chain(self.switching_law)
@@ -442,26 +427,6 @@ class Experiment(Variants):
         return self.graph_list[0].agents
 
     @property
-    def names(self) -> list[str] | None:
-        """Names of the agents, in the order of their numbers; None where they have only numbers."""
-        return self.spec.names
-
-    @property
-    def switching(self) -> SwitchingSpec:
-        """Section ``switching``."""
-        return self.spec.switching
-
-    @property
-    def noise(self) -> NoiseSpec:
-        """Section ``noise``."""
-        return self.spec.noise
-
-    @property
-    def run(self) -> RunSpec:
-        """Section ``run``."""
-        return self.spec.run
-
-    @property
     def width(self) -> int:
         """Numbers in an agent's state: the number of replicas, times the numbers in the state of a protocol."""
         return self.run.replicas * (self.protocol.info.states if self.protocol else 1)
@@ -477,11 +442,6 @@ class Experiment(Variants):
         return validation.leader_gains(self.spec.leaders, self.agents)
 
     @property
-    def reference(self) -> float:
-        """The value that tracking agents should reach; 0 for consensus."""
-        return self.spec.leaders.reference if self.spec.leaders else 0.0
-
-    @property
     def known_start(self) -> FloatArray | None:
         """(m,) x(0); None where it is drawn from the steady state."""
         start = self.run.start
@@ -490,17 +450,7 @@ class Experiment(Variants):
         return np.zeros(self.agents) if start == "zero" else np.array(start, dtype=float)
 
     @property
-    def steps(self) -> int:
-        """Number of steps N of a run, which has the states x(0), ..., x(N)."""
-        return self.run.steps
-
-    @property
     def holding_times(self) -> list[float | None]:
         """Mean time in each graph before it is left [units of simulated time]; None where it is never left."""
         unit = self.step_length if self.time == "discrete" and not self.schedule else 1.0
         return [None if time is None else unit * time for time in self.switching_law.holding_times]
-
-    @property
-    def step_length(self) -> float:
-        """Simulated time of a step, ``run.dt`` [units of simulated time]; 1 in discrete time."""
-        return self.run.dt

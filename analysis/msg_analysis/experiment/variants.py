@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The same experiment with other values, and where its agents are in arrays."""
+"""The values of an experiment file, the same experiment with others, and where its agents are in arrays."""
 
 from __future__ import annotations
 
@@ -10,18 +10,20 @@ from typing import TYPE_CHECKING, Any, Self
 
 from msg_analysis.common.text import listed
 from msg_analysis.errors import InputError
+from msg_analysis.experiment.markov_chain import Time
 from msg_analysis.experiment.problems import ExperimentError, show
+from msg_analysis.experiment.spec import ExperimentSpec, NoiseSpec, RunSpec, SwitchingSpec
 
 
 class Variants:
-    """Methods of ``Experiment`` that give another one."""
+    """Methods of ``Experiment`` that read its document, or give another one."""
 
     __slots__ = ()
 
     if TYPE_CHECKING:
         source: str
         agents: Any
-        names: Any
+        spec: ExperimentSpec
 
         def to_document(self) -> dict[str, Any]:
             """See ``Experiment``."""
@@ -29,6 +31,56 @@ class Variants:
         @classmethod
         def parse(cls, mapping: Any, *, source: str = "experiment") -> Self:
             """See ``Experiment``."""
+
+    @property
+    def name(self) -> str:
+        """Name of the experiment."""
+        return self.spec.name
+
+    @property
+    def problem(self) -> str:
+        """Either "consensus" or "tracking"."""
+        return self.spec.problem
+
+    @property
+    def time(self) -> Time:
+        """Either "continuous" or "discrete"."""
+        return self.spec.time
+
+    @property
+    def names(self) -> list[str] | None:
+        """Names of the agents, in the order of their numbers; None where they have only numbers."""
+        return self.spec.names
+
+    @property
+    def switching(self) -> SwitchingSpec:
+        """Section ``switching``."""
+        return self.spec.switching
+
+    @property
+    def noise(self) -> NoiseSpec:
+        """Section ``noise``."""
+        return self.spec.noise
+
+    @property
+    def run(self) -> RunSpec:
+        """Section ``run``."""
+        return self.spec.run
+
+    @property
+    def reference(self) -> float:
+        """The value that tracking agents should reach; 0 for consensus."""
+        return self.spec.leaders.reference if self.spec.leaders else 0.0
+
+    @property
+    def steps(self) -> int:
+        """Number of steps N of a run, which has the states x(0), ..., x(N)."""
+        return self.run.steps
+
+    @property
+    def step_length(self) -> float:
+        """Simulated time of a step, ``run.dt`` [units of simulated time]; 1 in discrete time."""
+        return self.run.dt
 
     def with_run(self, **changes: Any) -> Self:
         """The same experiment with other values of ``run``, checked again.
