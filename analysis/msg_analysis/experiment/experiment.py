@@ -422,6 +422,13 @@ class Experiment(Variants):
         return self.switching_law.law if isinstance(self.switching_law, LinkSchedule) else None
 
     @property
+    def written_graphs(self) -> tuple[Graph, ...]:
+        """The graphs of the file: where links switch by themselves, the one with all links, else all n."""
+        if self.links is None:
+            return self.graph_list
+        return (replace(self.links.mesh, name=next(iter(self.spec.graphs))),)
+
+    @property
     def agents(self) -> int:
         """Number of agents m."""
         return self.graph_list[0].agents

@@ -94,7 +94,7 @@ def scheduled_run(run: RunSpec, switching: SwitchingSpec) -> tuple[RunSpec, list
     if run.start == "stationary":
         changes["start"] = "zero"
         if "start" in run.model_fields_set:
-            wanted = "expected 'zero' or values, since the graphs of the run are known before it"
+            wanted = "expected 'zero' or values, since a stationary start needs a Markov chain of graphs"
             found.append(problem("run.start", "stationary", wanted, "say where the agents are"))
     if switching.end is not None and not switching.repeat:
         if "duration" not in run.model_fields_set:

@@ -229,14 +229,10 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     states, matrices = validation.memory_needed(
         experiment.agents, switching.modes, experiment.steps, experiment.width, experiment.noise.delay, experiment.truth
     )
-    links, graphs = experiment.links, experiment.graph_list
+    links, graphs = experiment.links, experiment.written_graphs
     shares, holding_times = switching.stationary.tolist(), experiment.holding_times
-    if links:  # the graph with all links says what there is; those of the run are drawn
-        graphs, shares, holding_times = (
-            (dataclasses.replace(links.mesh, name=next(iter(experiment.spec.graphs))),),
-            [None],
-            [None],
-        )
+    if links:
+        shares, holding_times = [None], [None]
     limits: list[float | None] = [None] * len(graphs)
     if experiment.time != "discrete" and not experiment.noise.delay and not experiment.protocol:
         found = (validation.stability_limit(graph, experiment.leader_gains) for graph in graphs)

@@ -86,7 +86,7 @@ _WEIGHTS = 5  # different line widths
 
 def graph_drawings(experiment: Experiment, candidates: Candidates = NOBODY) -> list[Markup]:
     """The first ``MOST_GRAPHS`` graphs, each agent at the same place in all of them; leaders are squares."""
-    found = places(experiment.graph_list)
+    found = places(experiment.written_graphs)
     where = np.array([found[agent] for agent in range(experiment.agents)], dtype=float)
     low, high = where.min(axis=0), where.max(axis=0)
     where = (where - (low + high) / 2) * (_SIDE - 44.0) / max(float((high - low).max()), 1e-9)
@@ -95,7 +95,7 @@ def graph_drawings(experiment: Experiment, candidates: Candidates = NOBODY) -> l
     leaders = set(experiment.spec.leaders.agents) if experiment.spec.leaders else set()
     return [
         _graph(graph, where, graph_variable(mode), leaders, candidates, experiment.names)
-        for mode, graph in enumerate(experiment.graph_list[:MOST_GRAPHS])
+        for mode, graph in enumerate(experiment.written_graphs[:MOST_GRAPHS])
     ]
 
 
@@ -249,15 +249,16 @@ def explain(experiment: Experiment) -> list[str]:
 
 
 def graph_facts(experiment: Experiment) -> list[dict[str, Any]]:
-    """Of every graph; ``share``: of time; ``held``: mean holding time [units of simulated time], None: never left."""
-    rows = zip(experiment.graph_list, experiment.switching_law.stationary, experiment.holding_times, strict=True)
+    """Of those that are drawn; ``share`` of time and ``held``, mean holding time [units of simulated time], or None."""
+    graphs, shares, held = experiment.written_graphs, experiment.switching_law.stationary, experiment.holding_times
+    rows = zip(graphs[:MOST_GRAPHS], *([[None], [None]] if experiment.links else [shares, held]), strict=False)
     return [
         {
             "name": graph.name,
             "links": graph.links,
             "directed": not graph.symmetric,
             "connectivity": algebraic_connectivity(graph),
-            "share": float(share),
+            "share": None if share is None else float(share),
             "held": held,
         }
         for graph, share, held in rows
@@ -289,6 +290,17 @@ def _switching(experiment: Experiment) -> str:
     modes = len(experiment.graph_list)
     if modes == 1:
         return f"The graph is always {experiment.graph_list[0].name}."
+    if links := experiment.links:
+        both = [
+            f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+            for rates in (links.up, links.down)
+            for low, high in [(rates.min(), rates.max())]
+        ]
+        what = "probabilities" if experiment.time == "discrete" else "rates"
+        return (
+            f"Each of {len(links)} links switches by itself: it comes up and goes down with the {what} {both[0]} and "
+            f"{both[1]}, whatever the others do. All predictions are given the {modes} graphs of the run."
+        )
     if schedule := experiment.schedule:
         stretches = f"{len(schedule.starts)} stretches of time" + (", again and again" if schedule.repeat else "")
         return f"The sequence of {modes} graphs is given: {stretches}. All predictions are given this sequence."

@@ -382,6 +382,8 @@ def _sequence(comparison: Comparison, document: dict[str, Any]) -> str:
     if given and given["node_errors"]:
         return f"Errors of the agents {CORRECTED}."
     modes = comparison.trajectory.modes[: max(document["steps"], 0)]
+    if experiment.schedule:
+        return "" if document["unpredicted"] else "Errors are expected given this run's graph sequence."
     if document["unpredicted"] or len(experiment.graph_list) == 1 or not len(modes):
         return ""
     shares = np.bincount(modes[modes >= 0], minlength=len(experiment.graph_list)) / len(modes)
