@@ -67,12 +67,19 @@ def main() -> None:
 @click.option(
     "--from", "start", type=float, metavar="TIME", default=0.0, help="Of a schedule: the mean of later times only."
 )
+@click.option(
+    "--outages",
+    type=click.IntRange(min=0),
+    metavar="K",
+    show_default="5, where that is fast",
+    help="Of a schedule: what the K longest outages cost.",
+)
 @json_option
-def predict(experiment: Path, *, changes: tuple[str, ...], start: float, as_json: bool) -> None:
+def predict(experiment: Path, *, changes: tuple[str, ...], start: float, outages: int | None, as_json: bool) -> None:
     """Predict the steady errors of EXPERIMENT, exactly."""
     from msg_analysis.report.theory_text import print_prediction
 
-    document = load_experiment(experiment, changes).predict(start=start).to_json()
+    document = load_experiment(experiment, changes).predict(start=start).to_json(outages)
     print_result(document, print_prediction, as_json=as_json)
 
 

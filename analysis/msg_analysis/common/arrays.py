@@ -24,6 +24,11 @@ BoolArray = NDArray[np.bool_]
 AnyArray = NDArray[Any]
 
 
+def once(stack: FloatArray) -> FloatArray:
+    """The first of the arrays in a stack, as a stack, where all are the same array (``numpy.broadcast_to``)."""
+    return stack if stack.strides[0] else stack[:1]
+
+
 LARGE = 2**27  # bytes from which an array is in a file,
 LARGE_VARIABLE = "MSG_ANALYSIS_LARGE"  # unless this environment variable has another number of bytes
 BLOCK_NUMBERS = 2_000_000  # numbers of a large array that are processed together: 16 MB

@@ -173,7 +173,7 @@ class Experiment(Variants):
         )
         bound, found = protocols.bind(self.protocol, network, self.run, self.names, recorded)
         experiment = replace(self, protocol=bound)
-        size = len(self.graph_list), self.steps, experiment.width
+        size = 1 if self.schedule else len(self.graph_list), self.steps, experiment.width
         found += validation.memory_problems(self.agents, *size, 0, experiment.truth)
         if found:
             raise ExperimentError(self.source, found)

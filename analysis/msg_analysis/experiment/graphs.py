@@ -96,12 +96,11 @@ class Graph:
     @property
     def parts(self) -> int:
         """Number of parts that no link connects, whatever its direction."""
-        linked, found, left = self.adjacency > 0, 0, set(range(self.agents))
-        linked |= linked.T
-        while left:
-            left -= set(np.flatnonzero(hops(linked, [min(left)]) >= 0).tolist())
-            found += 1
-        return found
+        from scipy.sparse import csr_array  # here, since every process of a run would wait for it
+        from scipy.sparse.csgraph import connected_components
+
+        links = csr_array((self.weights, (self.targets, self.sources)), (self.agents, self.agents))
+        return int(connected_components(links, directed=False)[0])
 
     @property
     def symmetric(self) -> bool:

@@ -475,7 +475,10 @@ class Sections:
         steps, replicas = (run.steps, run.replicas) if run else (1, 1)
         noise: NoiseSpec | None = self.values["noise"]
         delay, truth = (noise.delay, noise.broadcast > 0) if noise else (0, False)
-        found = validation.memory_problems(self.agents, len(self.values["graphs"]), steps, replicas, delay, truth)
+        switching, graphs = self.values["switching"], len(self.values["graphs"])
+        if switching and switching.schedule and not (noise and isinstance(noise.process, dict)):
+            graphs = 1  # matrices of all are made by some commands only
+        found = validation.memory_problems(self.agents, graphs, steps, replicas, delay, truth)
         self.problems += found
         return not found
 

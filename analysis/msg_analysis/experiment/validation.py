@@ -394,6 +394,12 @@ def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: i
     return [problem("run", text, room, "lower run.duration or run.replicas, or raise run.dt")]
 
 
+def matrix_problems(experiment: Experiment) -> list[str]:
+    """The same of an experiment with a schedule, which may have more graphs than matrices fit in memory."""
+    size = len(experiment.graph_list), experiment.steps, experiment.width, experiment.noise.delay, experiment.truth
+    return memory_problems(experiment.agents, *size) if experiment.schedule else []
+
+
 def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
     """(m,) kappa; 0 for followers, inf for grounded leaders."""
     gains = np.zeros(agents)
@@ -404,7 +410,7 @@ def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
 
 def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
     """What the experiment asks for that this version cannot do, one line each."""
-    lines = _too_large_to_predict(experiment) if purpose != "run" else []
+    lines = _too_large_to_predict(experiment) if purpose != "run" else matrix_problems(experiment)
     states = 2.0 ** len(experiment.links or ())
     if purpose != "run" and states > MOST_STATES:
         wanted = f"has no exact prediction: 2^{len(experiment.links or ())} graphs, expected at most {MOST_STATES}"

@@ -334,7 +334,7 @@ class _Expected:
 
     def __init__(self, prediction: Prediction) -> None:
         self._prediction = prediction
-        self._steady = np.diag(prediction.system.lifted(prediction.steady.sum(axis=0)))
+        self._steady = np.diag(prediction.emulated.covariance)
         self._given: Iterator[tuple[FloatArray, FloatArray]] | None = None  # of a schedule: moments of the next step
         self._away: FloatArray | None = None  # (n, d, d) from the steady state, of the next step
         self._law = np.empty(0)

@@ -21,9 +21,11 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from msg_analysis.arithmetic.reproducible import Stream, exponential, generator
-from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray, once
 from msg_analysis.common.resources import one_blas_thread
+from msg_analysis.errors import NotAvailableError
 from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, require_chain
+from msg_analysis.experiment.validation import matrix_problems
 
 if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
@@ -150,6 +152,7 @@ def build_model(experiment: Experiment, matrices: StepMatrices | None = None) ->
     """A ``StepModel`` where the law is linear, else the wiring alone; ``matrices`` are those of the run record."""
     if experiment.protocol is None or experiment.protocol.linear:
         return build_step_model(experiment, matrices)
+    _require_memory(experiment)
     return Wiring(
         links=_arcs(experiment),
         switching=experiment.switching_law,
@@ -170,13 +173,14 @@ def step_matrices(experiment: Experiment) -> StepMatrices:
         weights[:, grounded] = 0.0
     else:
         weights, gain = _built_in(experiment), step_noise_gain(experiment)
-    if experiment.time == "continuous":
-        gain[:, grounded] = 0.0  # a leader held at the reference has no noise either
+    if experiment.time == "continuous" and grounded.any():
+        gain = np.where(grounded[:, None], 0.0, gain)  # a leader held at the reference has no noise either
     return StepMatrices(weights, gain)
 
 
 def build_step_model(experiment: Experiment, matrices: StepMatrices | None = None) -> StepModel:
     """What one step of an experiment does; ``matrices`` are those of the run record, or of ``step_matrices``."""
+    _require_memory(experiment)
     if matrices is None:
         matrices = step_matrices(experiment)
     weights, gain = matrices.weights, matrices.noise_gain
@@ -186,16 +190,22 @@ def build_step_model(experiment: Experiment, matrices: StepMatrices | None = Non
     reference = experiment.reference
     offsets = reference * (1.0 - weights.sum(axis=2)) if reference else np.zeros(weights.shape[:2])
 
-    coupling = weights * ~np.eye(agents, dtype=bool)
-    loss = experiment.loss  # (m, m)
-    noise = gain @ gain.transpose(0, 2, 1)
-    for mode, a in enumerate(coupling):
-        kept = (1 - loss) * a
-        noise[mode] += experiment.noise.link**2 * np.diag((kept * a).sum(axis=1))
-        noise[mode] += experiment.noise.broadcast**2 * (kept @ kept.T + np.diag((loss * kept * a).sum(axis=1)))
-    lost = loss * coupling
-    mean = weights - lost
-    mean[:, range(agents), range(agents)] += lost.sum(axis=2)
+    loss, air = experiment.loss, experiment.noise  # (m, m)
+    mean, variance = weights, np.broadcast_to(np.zeros((agents, agents)), weights.shape)
+    noise = np.broadcast_to(once(gain) @ once(gain).transpose(0, 2, 1), weights.shape)
+    if air.on_air:
+        coupling = weights * ~np.eye(agents, dtype=bool)
+    if air.link or air.broadcast:
+        noise = noise.copy()
+        for mode, a in enumerate(coupling):
+            kept = (1 - loss) * a
+            noise[mode] += air.link**2 * np.diag((kept * a).sum(axis=1))
+            noise[mode] += air.broadcast**2 * (kept @ kept.T + np.diag((loss * kept * a).sum(axis=1)))
+    if air.loss.any:
+        lost = loss * coupling
+        mean = weights - lost
+        mean[:, range(agents), range(agents)] += lost.sum(axis=2)
+        variance = loss * (1 - loss) * coupling**2
     return StepModel(
         links=links,
         weights=mean,
@@ -206,7 +216,7 @@ def build_step_model(experiment: Experiment, matrices: StepMatrices | None = Non
         delay=experiment.noise.delay,
         losses=loss,
         burst=experiment.noise.burst,
-        loss_variance=loss * (1 - loss) * coupling**2,
+        loss_variance=variance,
         switching=experiment.switching_law,
         initial=first_graph(experiment),
         grounded=grounded,
@@ -218,9 +228,15 @@ def build_step_model(experiment: Experiment, matrices: StepMatrices | None = Non
     )
 
 
+def _require_memory(experiment: Experiment) -> None:
+    if found := matrix_problems(experiment):
+        raise NotAvailableError("\n".join(found))
+
+
 def step_noise_gain(experiment: Experiment) -> FloatArray:
     """(n, m, m) sqrt(dt) F_i: the noise that a step of the built-in law adds is this times N(0, I)."""
-    return np.asarray(np.sqrt(experiment.step_length) * experiment.noise_gain)
+    gain = experiment.noise_gain
+    return np.broadcast_to(np.sqrt(experiment.step_length) * once(gain), gain.shape)
 
 
 def _built_in(experiment: Experiment) -> FloatArray:
@@ -245,7 +261,7 @@ def first_graph(experiment: Experiment) -> FloatArray:
     """(n,): the law of g(0)."""
     first = experiment.switching.initial
     if experiment.schedule:
-        return np.asarray(np.eye(len(experiment.graph_list))[experiment.schedule.order[0]])
+        return np.asarray(np.arange(len(experiment.graph_list)) == experiment.schedule.order[0], dtype=float)
     if first == "stationary":
         return experiment.switching_law.stationary
     return np.array([float(graph.name == first) for graph in experiment.graph_list])

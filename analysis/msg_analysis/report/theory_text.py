@@ -41,6 +41,8 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
     if scheduled:
         worst = f"largest system error: {number_text(steps['largest'])} at time {number_text(steps['largest_time'])}"
         console.print(worst.capitalize())
+        if found := document.get("outages"):
+            _print_outages(found, console)
         return
     for key, title in LAW_NAMES.items():
         if key in document and document[key] is None:
@@ -53,6 +55,18 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
         console.print("Sequential steps: in real time, if no step is late and every message arrives at once.")
     for line in tails_words(document):
         console.print(Text(line, style="yellow"))
+
+
+def _print_outages(found: dict[str, Any], console: Console) -> None:
+    """What the longest outages cost."""
+    rows = [
+        (*(number_text(each[key]) for key in ("start", "end")), str(each["parts"]), number_text(each["adds"]))
+        for each in found["longest"]
+    ]
+    if rows:
+        print_rows(console, "Longest outages", ("from", "to", "parts", "adds to the mean error"), rows)
+        without = f"without {'this' if len(rows) == 1 else 'these'}: {number_text(found['error_without'])}"
+        console.print(f"{counted(found['count'], 'outage')}; mean system error {without}")
 
 
 def tails_words(document: dict[str, Any]) -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse.csgraph
 
-from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.common.arrays import FloatArray, IntArray, once
 from msg_analysis.experiment.markov_chain import Time
 from msg_analysis.theory.message_steps import LossEvents, message_steps
 
@@ -252,10 +252,12 @@ def part(
 
 def _reduced_noise(noise: FloatArray, lift: FloatArray) -> FloatArray:
     """lift^T N lift for every mode, without what rounding leaves of noise that is common to all agents."""
+    shape = len(noise), *(2 * lift.shape[1:])
+    noise = once(noise)
     reduced = lift.T @ noise @ lift
     rounding = len(lift) * np.finfo(float).eps * np.abs(noise).max(axis=(1, 2), keepdims=True)
     common = np.abs(reduced).max(axis=(1, 2), keepdims=True, initial=0.0) <= rounding
-    return np.where(common, 0.0, reduced)
+    return np.broadcast_to(np.where(common, 0.0, reduced), shape)
 
 
 CHANGE = 1e-12  # relative size of the changes that show how sensitive a rate is

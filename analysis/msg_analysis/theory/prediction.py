@@ -18,13 +18,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.arrays import BoolArray, FloatArray
 from msg_analysis.common.resources import blas_threads, few_blas_threads, one_blas_thread
 from msg_analysis.common.text import agent_text, finite, markdown_table, number_text
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment.graphs import hops, widest_reaching
 from msg_analysis.experiment.links import expanded
-from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.step_model import StepLaw, StepModel, build_run_model, build_step_model, step_law
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.coupled_equations import SolverReport
@@ -32,7 +31,7 @@ from msg_analysis.theory.first_steps import simplification
 from msg_analysis.theory.fourth_moments import FourthMoment, fourth_moment
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.moments import MomentSolver
-from msg_analysis.theory.scheduled import PathMoments, path_moments
+from msg_analysis.theory.scheduled import Matrices, Outages, PathMoments, given_path, outages, without_stacks
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,6 +48,8 @@ LAW_NAMES = {
     "sequential": "sequential steps",
     "pattern": "logged pattern",
 }  # of laws in texts
+OUTAGES = 5  # in a document
+CHEAP = 100_000  # steps times agents, up to which a prediction without some of the steps takes a second
 SHOWN_AGENTS = 30  # most agents in a notebook's table; the arrays have all of them
 WEAK_NOISE = 1e-6  # directions with less noise, relative to the noisiest one, do not show whether steps are stable
 
@@ -138,12 +139,8 @@ class Prediction:
     ----------
     experiment
         what is predicted
-    step
-        the experiment compiled to one step of an agent
-    system
-        the reduced system of the run's steps, in real time of its sequential law
-    steady
-        (n, d, d) steady second moments of ``system``
+    matrices
+        what has a matrix for every graph: ``step``, ``system`` and ``steady``
     emulated
         exact moments of the run's steps ("discrete" in the document of a discrete-time experiment); in real time if no
         agent is late
@@ -160,14 +157,27 @@ class Prediction:
     """
 
     experiment: Experiment
-    step: StepModel
-    system: JumpSystem
-    steady: FloatArray
+    matrices: Matrices
     emulated: Moments
     continuous_moments: Moments | None
     paper: JumpSystem | None
     path: PathMoments | None = None
     chain_solver: MomentSolver | None = None
+
+    @property
+    def step(self) -> StepModel:
+        """The experiment compiled to one step of an agent."""
+        return self.matrices.step
+
+    @property
+    def system(self) -> JumpSystem:
+        """The reduced system of the run's steps, in real time of its sequential law."""
+        return self.matrices.system
+
+    @property
+    def steady(self) -> FloatArray:
+        """(n, d, d) steady second moments of ``system``; of a schedule, means over time."""
+        return self.matrices.steady
 
     @property
     def continuous(self) -> Moments:
@@ -252,6 +262,26 @@ class Prediction:
         with blas_threads(self.experiment.agents):
             return fourth_moment(build_run_model(self.experiment, self.step), self.system)
 
+    def outages(self, most: int = OUTAGES) -> Outages:
+        """Of a schedule, its longest outages, and what they cost; NotAvailableError with a chain.
+
+        Parameters
+        ----------
+        most
+            how many of the longest ones
+        """
+        if self.path is None:
+            raise NotAvailableError("outages: expected a given sequence of graphs, not a Markov chain: leave it out")
+
+        def error(steps: BoolArray) -> float | None:
+            if steps.all():
+                return self.emulated.system_error
+            path = self.matrices.path(steps)
+            return float(np.trace(path.covariance)) if path.counted else None
+
+        with blas_threads(self.experiment.agents):
+            return outages(self.experiment, given_path(self.experiment)[1], most, error)
+
     def for_run(self, experiment: Experiment) -> Prediction:
         """The same for another run, with what was computed before.
 
@@ -264,13 +294,20 @@ class Prediction:
         object.__setattr__(other, "experiment", experiment)
         return other
 
-    def to_json(self) -> dict[str, Any]:
-        """The document of ``msg-analysis predict --json``."""
+    def to_json(self, outages: int | None = None) -> dict[str, Any]:
+        """The document of ``msg-analysis predict --json``.
+
+        Parameters
+        ----------
+        outages
+            of a schedule: how many of the longest ones it has. None: as many as commonly, or, where these would take
+            much longer than the prediction, none
+        """
         document: dict[str, Any] = {
             "agents": self.experiment.agents,
             "names": self.experiment.names,
             "modes": [graph.name for graph in self.experiment.graph_list],
-            "stationary": self.step.stationary.tolist(),
+            "stationary": self.experiment.switching_law.stationary.tolist(),
         }
         if self.experiment.time == "discrete":
             document["discrete"] = self.emulated.to_json()
@@ -281,10 +318,15 @@ class Prediction:
             largest, k = self.path.largest
             key = "discrete" if self.experiment.time == "discrete" else "emulated"
             document[key] |= {"largest": largest, "largest_time": k * self.experiment.step_length}
+        if outages is None:
+            size = self.experiment.steps * self.experiment.agents
+            outages = OUTAGES if self.path and size <= CHEAP and without_stacks(self.experiment) else 0
+        if outages:
+            document["outages"] = self.outages(outages).to_json()
         document["static"] = self.static_moments.to_json() if self.static_moments else None
         document["disconnected"] = self.disconnected
         document["fourth_moment"] = self.fourth_moment.to_json()
-        start = simplification(self.system)
+        start = simplification(self.system) if self.experiment.noise.delay else None
         document["notes"] = [*self.experiment.notes, *([start] if start else [])]
         return document
 
@@ -303,9 +345,9 @@ def predict(experiment: Experiment, step: StepModel | None = None, *, start: flo
     step model, if it is known. InputError: too large, or without finite steady errors.
     """
     experiment = expanded(experiment)
-    step = step or build_step_model(experiment)
     if experiment.schedule:
         return _given(experiment, step, start)
+    step = step or build_step_model(experiment)
     if start:
         raise InputError(f"from: {start:g}: expected with a schedule; a steady state has no time: leave it out")
     continuous = paper = None
@@ -318,7 +360,8 @@ def predict(experiment: Experiment, step: StepModel | None = None, *, start: flo
             paper = systems.emulated(step, experiment.problem)
     solver, steady = _steady(step, build_run_model(experiment, step), experiment.problem)
     emulated = dataclasses.replace(_moments(solver, steady, experiment.names), law=step_law(experiment))
-    return Prediction(experiment, step, solver.system, steady, emulated, continuous, paper, chain_solver=solver)
+    matrices = Matrices(experiment, step, solver.system, steady)
+    return Prediction(experiment, matrices, emulated, continuous, paper, chain_solver=solver)
 
 
 @few_blas_threads
@@ -327,20 +370,16 @@ def predict_run(experiment: Experiment, step: StepModel) -> Prediction:
     return _given(experiment, step, 0.0) if experiment.schedule else predict(experiment, step)
 
 
-def _given(experiment: Experiment, step: StepModel, start: float) -> Prediction:
+def _given(experiment: Experiment, step: StepModel | None, start: float) -> Prediction:
     """Of a schedule."""
     first = round(start / experiment.step_length) if math.isfinite(start) else -1
     if not 0 <= first < experiment.steps:
         wanted = f"expected a time from 0 to below {experiment.run.duration:g}, the end of the run"
         raise InputError(f"from: {start:g}: {wanted}: correct it")
-    run = build_run_model(experiment, step)
-    system = systems.emulated(run, experiment.problem)
-    places = experiment.known_start
-    assert places is not None, "a schedule has no steady state to start from"
-    path = path_moments(system, places[:, None], mode_path(experiment, step.initial), first)
-    covariance = system.lifted(path.by_mode.sum(axis=0))
-    emulated = Moments(covariance, names=experiment.names, law=step_law(experiment))
-    return Prediction(experiment, step, system, path.by_mode, emulated, None, None, path)
+    matrices = Matrices(experiment, step, first=first)
+    path = matrices.path()
+    emulated = Moments(path.covariance, names=experiment.names, law=step_law(experiment))
+    return Prediction(experiment, matrices, emulated, None, None, path)
 
 
 def stationary_start_factor(experiment: Experiment, mode: int) -> FloatArray:
