@@ -41,6 +41,7 @@ setup(
         PACKAGE: [
             "py.typed",
             "experiment/bundled/*.yaml",
+            "experiment/bundled/*.csv",
             "arithmetic/_kernel.pyi",
             "report/templates/*",
             "messages/definitions/*/msg/*.msg",

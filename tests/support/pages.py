@@ -10,7 +10,8 @@ import yaml
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-PRINTING = [page for page in PAGES if page.stem in {"README", "index", "quickstart", "tutorial", "examples", "leaders"}]
+PRINTS = {"README", "index", "quickstart", "tutorial", "examples", "leaders", "recorded"}
+PRINTING = [page for page in PAGES if page.stem in PRINTS]
 """Pages whose terminals are compared with what the commands print."""
 EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"
 FENCED = re.compile(r"^( *)```(\w*)\n(.*?)^\1```", re.MULTILINE | re.DOTALL)

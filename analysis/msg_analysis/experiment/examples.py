@@ -25,15 +25,25 @@ def names() -> list[str]:
     return sorted(file.stem for file in FOLDER.glob(f"*{SUFFIX}"))
 
 
+def trace_of(name: str) -> str | None:
+    """Name of the file that an example reads, beside its own; None: it reads none."""
+    file = FOLDER / f"{name}.csv"
+    return file.name if file.is_file() else None
+
+
 def text_of(name: str) -> str:
-    """The file of an example; InputError: there is none of this name."""
+    """The file of an example, or one that an example reads; InputError: there is none of this name."""
+    if name in map(trace_of, names()):
+        return (FOLDER / name).read_text(encoding="utf-8")
     if name not in names():
         raise InputError(f"{name}: no example of this name: expected one of {_listed(name)}")
     return (FOLDER / f"{name}{SUFFIX}").read_text(encoding="utf-8")
 
 
 def shows(name: str) -> str:
-    """What an example shows: the first sentence of the comment at its top."""
+    """What an example shows: the first sentence of the comment at its top; of another file, what reads it."""
+    if name not in names() and name in map(trace_of, names()):
+        return f"The trace of {Path(name).stem}"
     comment = []
     for line in text_of(name).splitlines():
         if not line.startswith("#"):

@@ -17,6 +17,7 @@ import click
 from msg_analysis.cli.console import examples as example_lines
 from msg_analysis.cli.console import print_json, print_text, result_console
 from msg_analysis.cli.options import PATH, choice_option, json_option, positive_option
+from msg_analysis.common.console import print_note
 from msg_analysis.errors import ExitCode, InputError
 from msg_analysis.experiment.examples import (
     FOLDER,
@@ -29,6 +30,7 @@ from msg_analysis.experiment.examples import (
     names,
     shows,
     text_of,
+    trace_of,
 )
 
 if TYPE_CHECKING:
@@ -65,8 +67,10 @@ def demo_of(run: click.Command) -> click.Command:
 def examples(name: str | None, *, as_json: bool) -> None:
     """List the examples, or print the file of one.
 
-    Every command that takes an experiment takes these names.
+    Every command that takes an experiment takes these names. A trace that an example reads is printed by its own name.
     """
+    if name is not None and (trace := trace_of(name)):
+        print_note(f"{name} reads {trace}, which has to be beside it: msg-agents examples {trace} > {trace}")
     if name is None and as_json:
         print_json({"examples": [{"name": each, "shows": shows(each)} for each in names()]})
     elif name is None:

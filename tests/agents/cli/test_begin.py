@@ -14,7 +14,7 @@ from terminal import Terminal
 
 pytest.importorskip("rclpy")
 
-from msg_analysis.experiment.examples import names, text_of
+from msg_analysis.experiment.examples import FOLDER, names, text_of
 from msg_analysis.experiment.experiment import Experiment
 
 PROGRAM = Path(sys.executable).with_name("msg-agents")
@@ -39,6 +39,11 @@ def test_examples() -> None:
     assert call("examples", "tracking").stdout == text_of("tracking")
     assert json.loads(call("examples", "tracking", "--json").stdout)["text"] == text_of("tracking")
     assert json.loads(call("prepare", "tracking").stdout)["experiment"]["name"] == "tracking"
+    for file in ("recorded_robots", "recorded_robots.csv"):
+        Path(file).with_suffix(Path(file).suffix or ".yaml").write_text(call("examples", file).stdout)
+    words = "recorded_robots reads recorded_robots.csv, which has to be beside it: msg-agents examples recorded_rob"
+    assert words in call("examples", "recorded_robots").stderr
+    assert Experiment.load("recorded_robots.yaml") == Experiment.load(FOLDER / "recorded_robots.yaml")
     wrong = call("examples", "trakcing")
     assert (wrong.exit_code, wrong.stdout) == (2, "")
     assert wrong.stderr.startswith("error: trakcing: no example of this name: expected one of discrete, ")

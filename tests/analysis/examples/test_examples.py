@@ -1,6 +1,7 @@
 """The examples, by which rule commands find an experiment, and new experiment files."""
 
 import json
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import yaml
 from click.testing import CliRunner
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from pages import EXPERIMENTS
+from pages import EXPERIMENTS, ROOT
 
 from msg_analysis import Experiment
 from msg_analysis.cli.main import main
@@ -38,11 +39,16 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_every_example_says_what_it_shows_in_one_line() -> None:
-    assert names() == sorted(file.stem for file in EXPERIMENTS.iterdir())
+    assert names() == sorted(file.stem for file in EXPERIMENTS.glob("*.yaml"))
     for name in names():
         assert 20 < len(shows(name)) < 120
         assert yaml.safe_load(text_of(name))["name"] == name
     assert shows("fast_switching") == "The network of slow_switching.yaml, switching a hundred times as fast"
+
+
+def test_the_recorded_robots_are_made_by_their_script() -> None:
+    rows = runpy.run_path(str(ROOT / "benchmarks/recorded_robots.py"))["rows"]()
+    assert list(rows) == (EXPERIMENTS / "recorded_robots.csv").read_text().splitlines()
 
 
 def test_a_name_is_an_example(here: Path) -> None:

@@ -65,8 +65,17 @@ def agree(found: Any, golden: Any, place: str, scale: float = 0.0) -> None:
         assert found == golden, place
 
 
-@pytest.mark.parametrize("name", names())
-@pytest.mark.parametrize("command", COMMANDS)
+def test_what_needs_a_chain() -> None:
+    """Each command has numbers of each example, or says why there are none."""
+    missing = [(command, name) for name in names() for command in COMMANDS if command not in GOLDEN[name]]
+    assert missing == [(command, "recorded_robots") for command in ("leaders", "plan", "spectrum", "facts")]
+    for command, name in missing:
+        result = CliRunner().invoke(main, [command, name, *COMMANDS[command]])
+        assert result.exit_code == 2
+        assert "has no steady state, expected a Markov chain for this" in result.stderr
+
+
+@pytest.mark.parametrize(("command", "name"), [(c, n) for c in COMMANDS for n in names() if c in GOLDEN[n]])
 def test_numbers(command: str, name: str) -> None:
     result = CliRunner().invoke(main, [command, name, *COMMANDS[command], "--json"])
     assert result.exit_code == 0, result.output
