@@ -134,7 +134,7 @@ CONTACTS = "time,source,target"
         (CONTACTS, [(0, *p) for p in RING], {"hold": 1, "initial": "g1"}, "switching.initial: given: expected without"),
         ("time,graph", [(0, "x")], {"weight": 2, "graphs": {"x": {"path": NAMES}}}, "switching.weight: 2.0: expected"),
         (CONTACTS, [(0, *p) for p in RING], {"hold": 1, "run": {"duration": 9}}, "9.0: expected at most 1"),
-        (CONTACTS, [(0, *p) for p in RING], {"hold": 1, "run": {"start": "stationary"}}, "a stationary start needs a Markov chain"),
+        (CONTACTS, [(0, *p) for p in RING], {"hold": 1, "run": {"start": "stationary"}}, "needs a Markov chain"),
     ],
 )  # fmt: skip
 def test_mistakes(tmp_path: Path, header: str, rows: list[Any], keys: dict[str, Any], wanted: str) -> None:
