@@ -217,7 +217,7 @@ class _SparseSteps:
         if noise.link or noise.broadcast:
             links = scipy.sparse.csr_array((mean, (targets, sources)), (m, m))
             air = np.bincount(targets, (noise.link**2 + noise.broadcast**2 * loss) * mean * sure, m)
-            added = added + scipy.sparse.diags_array(air) + noise.broadcast**2 * (links @ links.T)
+            added = added + scipy.sparse.diags_array(np.asarray(air, dtype=float)) + noise.broadcast**2 * (links @ links.T)
         ahead = self._rank[sources] < self._rank[targets]
         if ahead.any():  # agents that step first are heard with their new states: W = I + (I - ahead)^-1 D
             power = scipy.sparse.csr_array((mean[ahead], (targets[ahead], sources[ahead])), (m, m))
