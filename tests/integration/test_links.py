@@ -21,6 +21,7 @@ BY_LINK = {"default": 0.1, "edges": [[2, 3, 0.7]], "arcs": [[1, 2, 0.4]]}
 MESSAGES: dict[str, dict[str, Any]] = {
     "plain": {},
     "own": {"broadcast": 0.3, "link": 0.2, "loss": 0.3},
+    "whole": {"loss": 0.4, "whole_link": True},
     "hold": {"broadcast": 0.3, "link": 0.2, "loss": 0.4, "on_loss": "hold"},
     "late": {"broadcast": 0.3, "delay": 2},
     "bursts": {"link": 0.2, "loss": 0.4, "burst": 12},
@@ -65,6 +66,7 @@ def assert_equal(trajectory: Run) -> None:
         [
             ("consensus", "all", "one_per_agent"),
             ("leaders", "bursts", 2),
+            ("leaders", "whole", 2),
             ("grounded", "hold", 2),
             ("metropolis", "late", 2),
             ("integral_action", "all", 2),

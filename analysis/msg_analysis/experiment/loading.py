@@ -466,6 +466,8 @@ class Sections:
         loss = noise.loss.model_copy(update=links)
         self.values["noise"] = noise.model_copy(update={"loss": loss})
         self.loss, found = validation.loss_matrix(loss, self.graphs, time, self.values["names"])
+        if noise.whole_link and not found:
+            found = validation.whole_link_problems(self.loss, noise)
         if noise.burst is not None and not found:
             found = validation.burst_problems(noise.burst, loss)
         self.problems += found

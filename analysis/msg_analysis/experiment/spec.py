@@ -252,6 +252,11 @@ class NoiseSpec(Section):
         description="mean number of messages of a link that are lost in a row; by default losses are independent",
         examples=[5],
     )
+    whole_link: bool | None = Field(
+        None,
+        description="whether a loss takes both directions of a link; by default each direction by itself",
+        examples=[True],
+    )
     delay: Annotated[int, Field(strict=True, ge=0, le=LARGEST_COUNT)] = Field(
         0, description="age, in steps, of the values of others that a step uses", examples=[0]
     )

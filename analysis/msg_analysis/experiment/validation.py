@@ -286,6 +286,17 @@ def burst_problems(burst: float, loss: LossSpec) -> list[str]:
     return found
 
 
+def whole_link_problems(loss: FloatArray, noise: NoiseSpec) -> list[str]:
+    """Losses (m, m) that cannot take both directions of a link."""
+    if not noise.loss.any:
+        return [problem("noise.whole_link", True, "expected with noise.loss", "add it, or remove this")]
+    if np.array_equal(loss, loss.T):
+        return []
+    i, j = (np.argwhere(loss != loss.T)[0] + 1).tolist()
+    wanted = f"expected one probability for both directions, not two between the agents {i} and {j}"
+    return [problem("noise.whole_link", True, wanted, "give noise.loss.edges in place of arcs")]
+
+
 def leader_problems(
     problem_kind: str, leaders: LeadersSpec | None, agents: int | None, names: Sequence[str] | None = None
 ) -> list[str]:
@@ -437,6 +448,11 @@ def _too_large_to_predict(experiment: Experiment) -> list[str]:
         wanted = f"has no prediction: 2^{lossy} states of {lossy} links that lose messages, expected at most "
         wanted += f"{MOST_STATES} with those of the graph"
         lines.append(problem("noise.burst", noise.burst, wanted, "remove it, or give fewer links a loss"))
+    others = [key for key in ("broadcast", "link", "delay", "burst") if getattr(noise, key)]
+    others += ["on_loss: hold"] * noise.holds + ["run.pace: realtime"] * (experiment.run.pace == "realtime")
+    if noise.whole_link and others:
+        wanted = f"has no prediction with {', '.join(others)}"
+        lines.append(problem("noise.whole_link", True, wanted, "remove one of them"))
     kept = len(gains) * (noise.delay + 2) + lossy * (noise.delay + 1) * noise.holds
     by_message = noise.holds or (experiment.run.pace == "realtime" and noise.steps_only)
     if by_message and kept > MOST_VALUES:

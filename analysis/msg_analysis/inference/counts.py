@@ -171,6 +171,7 @@ class LossTally:
         self.persistence = after_lost - after_kept
         self._bursts = step.burst is not None
         self._products = observation.timers is None
+        self.split = 0  # links of which only one direction was lost, where a loss takes both
         self.messages, self.lost = np.zeros(links, np.int64), np.zeros(links, np.int64)
         self.repeated = np.zeros(links, np.int64)  # in real time: uses of a message that was used before
         # Of messages after a lost one, after one that was not, and without one just before: chance, number, lost ones.
@@ -181,7 +182,10 @@ class LossTally:
         self._successive, self._same_step = np.zeros(3), np.zeros(3)
         before = np.zeros((1, links), np.bool_), np.zeros((1, links), np.bool_)
         for first, last in observation.blocks(4 * links, "loss"):
-            before = self._add(*_uses(observation, links, first, last), before)
+            sent, lost, again = _uses(observation, links, first, last)
+            if step.whole_link:
+                self._join(sent, lost)
+            before = self._add(sent, lost, again, before)
 
     @classmethod
     def of(cls, observation: Observation | Measurement) -> LossTally | None:
@@ -195,7 +199,16 @@ class LossTally:
 
     def merge(self, other: LossTally) -> None:
         """Add the tally of another run of the same experiment, with another seed."""
-        add_sums(self, other, "messages", "lost", "repeated", "_tried", "_failed", "_successive", "_same_step")
+        add_sums(self, other, "messages", "lost", "repeated", "split", "_tried", "_failed", "_successive", "_same_step")
+
+    def _join(self, sent: BoolArray, lost: BoolArray) -> None:
+        """Count a link once, in place, whose directions (b, links) are lost together."""
+        places = {(i, j): place for place, (i, j) in enumerate(self.pairs.tolist())}
+        for (i, j), one in places.items():
+            if i < j and (other := places.get((j, i))) is not None:
+                both = sent[:, one] & sent[:, other]
+                self.split += int((both & (lost[:, one] != lost[:, other])).sum())
+                sent[both, other] = lost[both, other] = False
 
     def score(self) -> tuple[FloatArray, FloatArray]:
         """(links,) each: losses beyond the expected ones, and their information, of what says most about the chance."""
@@ -228,7 +241,7 @@ class LossTally:
             return LossTest(0, 0.0, None)
         expected = float(self.probability @ self.messages)
         lost = int(self.lost.sum())
-        if self.lost[self.probability == 0.0].any():
+        if self.split or self.lost[self.probability == 0.0].any():
             return LossTest(lost, expected, 0.0)
         chi2, dof = self._counts()
         if self._products:

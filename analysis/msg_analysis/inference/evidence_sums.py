@@ -78,7 +78,11 @@ class EvidenceSums:
             lockstep=not real_time,
             gains=np.argwhere((step.listens() | np.diag(pull)) & usable[:, None]),
             pairs=np.column_stack([first[paired], second[paired]]),
-            lossy=np.argwhere(step.listens() & (step.losses > 0.0) & independent_losses),
+            # Where a loss takes both directions, one of them says all.
+            lossy=np.argwhere(
+                (step.listens() & ~(np.tril(step.listens()) & step.listens().T & step.whole_link))
+                & ((step.losses > 0.0) & independent_losses)
+            ),
         )
         asked = [kind for kind in QUESTIONS if in_detail or not issubclass(kind, Diagnostic)]
         self.questions = {kind.name: kind(law) for kind in asked}

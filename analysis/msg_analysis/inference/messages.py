@@ -44,6 +44,14 @@ class MessageLosses(Question):
         return f"losses from agent {other} to agent {agent}"
 
     @classmethod
+    def causes(cls, search: Search) -> list[Cause]:
+        """Directions of links that were not lost together, though they must be; else probabilities."""
+        if search.loss is None or not search.loss.split:
+            return super().causes(search)
+        words = f"one direction of a link was lost without the other {search.loss.split} times, where a loss takes both"
+        return [Cause("loss", words, estimate=float(search.loss.split), expected=0.0, p=0.0)]
+
+    @classmethod
     def cause_of(cls, one: Selected, search: Search) -> Cause:
         """A probability that explains the counted losses, of a link, a receiver, a sender or all."""
         part, what, tally = one.part, one.what, search.loss

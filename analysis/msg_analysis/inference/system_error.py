@@ -107,7 +107,7 @@ class ErrorMartingale:
 
     def __init__(self, prediction: Prediction, replicas: int) -> None:
         system = prediction.system
-        if system.loss_variance is not None:
+        if system.lossy:
             raise ValueError("lost messages: the next state is not normal given this one")
         forms, _, trace = forms_of(system, "system")
         values = [value for value in values_of(prediction, forms) if isinstance(value, Value)]

@@ -77,7 +77,7 @@ class Losses:
     # more evenly than independent ones): the newest number that decides alone is all that must be known of the past.
 
     def __init__(self, experiment: Experiment) -> None:
-        self._seed = experiment.run.seed
+        self._seed, self._whole = experiment.run.seed, bool(experiment.noise.whole_link)
         after_kept, after_lost = loss_probabilities(experiment)
         self._low, self._high = np.minimum(after_kept, after_lost), np.maximum(after_kept, after_lost)
         self._opposite = after_kept > after_lost
@@ -102,7 +102,8 @@ class Losses:
 
     def _drawn(self, link: tuple[int, int], number: int) -> tuple[BoolArray, BoolArray]:
         """Of every message of a block, whether its number alone makes it lost, and whether it decides alone."""
-        drawn = uniforms(self._seed, Stream.LOSS, link_number(*link), number, STEPS_PER_BLOCK)
+        of = (max(link), min(link)) if self._whole else link
+        drawn = uniforms(self._seed, Stream.LOSS, link_number(*of), number, STEPS_PER_BLOCK)
         lost: BoolArray = drawn < self._low[link]
         return lost, lost | (drawn >= self._high[link])
 

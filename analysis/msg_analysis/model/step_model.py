@@ -41,6 +41,7 @@ class Wiring:
     dt: float  # simulated time of a step
     losses: FloatArray  # (m, m) probability that a message from agent j (column) to agent i (row) is lost
     burst: float | None  # mean number of messages of a link that are lost in a row; None: losses are independent
+    whole_link: bool  # whether a loss takes both directions of a link
 
     @property
     def loss(self) -> float:
@@ -160,6 +161,7 @@ def build_model(experiment: Experiment, matrices: StepMatrices | None = None) ->
         dt=experiment.step_length,
         losses=experiment.loss,
         burst=experiment.noise.burst,
+        whole_link=bool(experiment.noise.whole_link),
     )
 
 
@@ -216,6 +218,7 @@ def build_step_model(experiment: Experiment, matrices: StepMatrices | None = Non
         delay=experiment.noise.delay,
         losses=loss,
         burst=experiment.noise.burst,
+        whole_link=bool(experiment.noise.whole_link),
         loss_variance=variance,
         switching=experiment.switching_law,
         initial=first_graph(experiment),

@@ -78,9 +78,13 @@ def random_steps(step: StepModel, system: JumpSystem) -> RandomSteps:
     stages = []
     for mode, matrix in enumerate(system.matrices):
         possible = step.loss_variance[mode] > 0.0
+        if step.whole_link:  # the other direction is lost at the same time
+            possible &= np.triu(possible) | ~possible.T
         i, j = np.nonzero(possible)
         into, differences = np.zeros((2, len(i), size))
         into[:, :d] = step.nominal[mode][possible][:, None] * lift[i]
+        if step.whole_link:
+            into[:, :d] -= step.nominal[mode].T[possible][:, None] * lift[j]
         differences[:, :d] = lift[older + j] - lift[i]
         both, noise = np.zeros((2, size, size))
         both[:d, :d], noise[:d, :d] = matrix, system.noise[mode]

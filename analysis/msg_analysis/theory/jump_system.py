@@ -18,7 +18,7 @@ import scipy.sparse.csgraph
 
 from msg_analysis.common.arrays import FloatArray, IntArray, once
 from msg_analysis.experiment.markov_chain import Time
-from msg_analysis.theory.message_steps import LossEvents, message_steps
+from msg_analysis.theory.message_steps import LossEvents, message_steps, whole_link_events
 
 if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
@@ -185,7 +185,7 @@ def emulated(step: StepModel, problem: str) -> JumpSystem:
         noise[:, own, own] = step.noise
         loss_variance[:, own, old] = step.loss_variance
     lift = scipy.linalg.helmert(weights.shape[1]).T if consensus else np.eye(weights.shape[1])
-    losses = whole.losses if whole else None
+    losses = whole.losses if whole else whole_link_events(step) if step.whole_link else None
     return JumpSystem(
         time="discrete",
         matrices=lift.T @ weights @ lift,
@@ -193,7 +193,7 @@ def emulated(step: StepModel, problem: str) -> JumpSystem:
         chain=whole.chain if whole else step.transition,
         stationary=whole.stationary if whole else step.stationary,
         lift=lift,
-        loss_variance=loss_variance if step.loss and not whole else None,
+        loss_variance=loss_variance if step.loss and losses is None and not whole else None,
         readout=lift[:m] - (lift[:m].mean(axis=0) if consensus else 0.0) if whole or step.delay else None,
         unreduced=weights if consensus else None,
         losses=losses and losses.projected(lift),

@@ -73,6 +73,17 @@ class LossEvents:
         return LossEvents(self.into @ basis, self.differences @ basis, self.chain)
 
 
+def whole_link_events(step: StepModel) -> LossEvents:
+    """Of losses that take both directions of a link: with w_ij (x_j - x_i) goes w_ji (x_i - x_j), at the same time."""
+    pairs = np.argwhere(np.triu((step.losses > 0.0) & (step.listens() | step.listens().T), 1))
+    into, differences = np.zeros((2, step.modes, len(pairs), step.agents))
+    for event, (i, j) in enumerate(pairs.tolist()):
+        deviation = np.sqrt(step.losses[i, j] * (1.0 - step.losses[i, j]))
+        into[:, event, i], into[:, event, j] = deviation * step.nominal[:, i, j], -deviation * step.nominal[:, j, i]
+        differences[:, event, i], differences[:, event, j] = -1.0, 1.0
+    return LossEvents(into, differences, None)
+
+
 _Loss = tuple[int, int, int, float, float]
 """Entry that it changes; the entries that the message brings, and that take its place; probability; weight."""
 

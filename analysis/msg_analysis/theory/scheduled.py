@@ -130,7 +130,7 @@ def outages(experiment: Experiment, modes: IntArray, most: int, error: Callable[
 def without_stacks(experiment: Experiment) -> bool:
     """Whether ``sparse_moments`` has its law: built in, in continuous time, with no values kept from step to step."""
     noise = experiment.noise
-    kept = noise.delay or noise.holds or (noise.loss.any and noise.burst is not None)
+    kept = noise.whole_link or noise.delay or noise.holds or (noise.loss.any and noise.burst is not None)
     alone = step_law(experiment) == "synchronous" or not noise.steps_only
     return experiment.time == "continuous" and not experiment.protocol and not kept and alone
 
@@ -217,7 +217,9 @@ class _SparseSteps:
         if noise.link or noise.broadcast:
             links = scipy.sparse.csr_array((mean, (targets, sources)), (m, m))
             air = np.bincount(targets, (noise.link**2 + noise.broadcast**2 * loss) * mean * sure, m)
-            added = added + scipy.sparse.diags_array(np.asarray(air, dtype=float)) + noise.broadcast**2 * (links @ links.T)
+            added = (
+                added + scipy.sparse.diags_array(np.asarray(air, dtype=float)) + noise.broadcast**2 * (links @ links.T)
+            )
         ahead = self._rank[sources] < self._rank[targets]
         if ahead.any():  # agents that step first are heard with their new states: W = I + (I - ahead)^-1 D
             power = scipy.sparse.csr_array((mean[ahead], (targets[ahead], sources[ahead])), (m, m))
