@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from msg_analysis.sweeps.in_python import Sweep, sweep
     from msg_analysis.theory.leaders import Selection
     from msg_analysis.theory.prediction import Moments, Prediction
+    from msg_analysis.theory.sampling import SampledPrediction, sampled_prediction
     from msg_analysis.theory.spectrum import Spectrum
     from msg_analysis.theory.transient import Transient
 
@@ -40,6 +41,7 @@ _MODULES = {
     "sweeps.in_python": ("Sweep", "sweep"),
     "theory.leaders": ("Selection",),
     "theory.prediction": ("Moments", "Prediction"),
+    "theory.sampling": ("SampledPrediction", "sampled_prediction"),
     "theory.spectrum": ("Spectrum",),
     "theory.transient": ("Transient",),
 }
@@ -55,12 +57,14 @@ __all__ = [
     "NotAvailableError",
     "Prediction",
     "Run",
+    "SampledPrediction",
     "Selection",
     "Spectrum",
     "Sweep",
     "Transient",
     "compare",
     "read_bag",
+    "sampled_prediction",
     "sweep",
     "write_report",
 ]

@@ -59,7 +59,9 @@ def main() -> None:
 
 @click.command(
     epilog=examples(
-        "msg-analysis predict line_ring", "msg-analysis predict line_ring --set noise.process=2 --json | jq .emulated"
+        "msg-analysis predict line_ring",
+        "msg-analysis predict line_ring --set noise.process=2 --json | jq .emulated",
+        "msg-analysis predict line_ring --precision 0.5%",
     )
 )
 @experiment_argument
@@ -74,12 +76,36 @@ def main() -> None:
     show_default="5, where that is fast",
     help="Of a schedule: what the K longest outages cost.",
 )
+@click.option("--precision", metavar="SHARE", help="Sample; half-width of the 95 % interval, relative: 1% or 0.01.")
+@click.option("--within", metavar="TIME", help="Sample for at most this time: 90s, 10min.")
+@click.option("--agents", metavar="LIST", help="Sample the errors of these agents, too: 1,17.")
+@click.option("--seed", type=click.IntRange(min=0), help="Sample with this seed.")
 @json_option
-def predict(experiment: Path, *, changes: tuple[str, ...], start: float, outages: int | None, as_json: bool) -> None:
-    """Predict the steady errors of EXPERIMENT, exactly."""
-    from msg_analysis.report.theory_text import print_prediction
+def predict(
+    experiment: Path, *, changes: tuple[str, ...], start: float, outages: int | None, as_json: bool, **sampling: Any
+) -> None:
+    """Predict the steady errors of EXPERIMENT: exactly, or by sampling.
 
-    document = load_experiment(experiment, changes).predict(start=start).to_json(outages)
+    They are sampled, with an interval, where the exact way is too large, or with --precision, --within, --agents or
+    --seed (1%, 60s, up to 20 agents, 0 where not given).
+    """
+    from msg_analysis.report.theory_text import print_prediction
+    from msg_analysis.theory.sampling import exact_ends, sampled_prediction
+
+    loaded = load_experiment(experiment, changes)
+    given = {key: value for key, value in sampling.items() if value is not None}
+    if not given and not exact_ends(loaded):
+        document = loaded.predict(start=start).to_json(outages)
+    else:
+        if start:
+            raise InputError(f"--from {start:g}: expected with a schedule; a steady state has no time: leave it out")
+        if "agents" in given:
+            given["agents"] = [int(agent) if agent.isdigit() else agent for agent in given["agents"].split(",")]
+        if "precision" in given:
+            given["precision"] = theory.parse_share(given["precision"])
+        if "within" in given:
+            given["within"] = theory.parse_duration("--within", given["within"])
+        document = sampled_prediction(loaded, **given).to_json()
     print_result(document, print_prediction, as_json=as_json)
 
 

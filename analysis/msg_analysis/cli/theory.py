@@ -104,7 +104,7 @@ def facts(experiment: Path, as_json: bool) -> None:
     print_result(document, print_facts, as_json=as_json)
 
 
-UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}  # of --budget
+UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 
 
 @click.command(
@@ -146,11 +146,13 @@ def plan(
     from msg_analysis.report.theory_text import print_plan
 
     loaded = load_experiment(experiment, changes)
-    document = loaded.plan(_parse_share(precision), seconds=_parse_duration(budget), rate=speed, level=level).to_json()
+    document = loaded.plan(
+        parse_share(precision), seconds=parse_duration("--budget", budget), rate=speed, level=level
+    ).to_json()
     print_result(document, print_plan, as_json=as_json)
 
 
-def _parse_share(text: str) -> float:
+def parse_share(text: str) -> float:
     """A share of 1 from ``1%``, ``1 %`` or ``0.01``; InputError for anything else."""
     number, share = text.strip(), -1.0
     with suppress(ValueError):
@@ -160,7 +162,7 @@ def _parse_share(text: str) -> float:
     return share
 
 
-def _parse_duration(text: str | None) -> float | None:
+def parse_duration(key: str, text: str | None) -> float | None:
     """Seconds from a number and one of ``UNITS``, s if there is none; InputError for anything else."""
     if text is None:
         return None
@@ -169,7 +171,7 @@ def _parse_duration(text: str | None) -> float | None:
     with suppress(ValueError):
         seconds = float(number.removesuffix(unit)) * UNITS[unit or "s"]
     if not 0.0 < seconds < float("inf"):
-        raise InputError(f"--budget {text}: expected a number above 0 with s, min, h or d: for example 10min")
+        raise InputError(f"{key} {text}: expected a number above 0 with s, min, h or d: for example 10min")
     return seconds
 
 

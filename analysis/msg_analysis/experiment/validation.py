@@ -421,7 +421,7 @@ def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
 
 def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
     """What the experiment asks for that this version cannot do, one line each."""
-    lines = _too_large_to_predict(experiment) if purpose != "run" else matrix_problems(experiment)
+    lines = too_large_to_predict(experiment) if purpose != "run" else matrix_problems(experiment)
     states = 2.0 ** len(experiment.links or ())
     if purpose != "run" and states > MOST_STATES:
         wanted = f"has no exact prediction: 2^{len(experiment.links or ())} graphs, expected at most {MOST_STATES}"
@@ -437,10 +437,11 @@ def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
 def unpredictable(experiment: Experiment) -> str | None:
     """Why there is no prediction, as a part of a sentence; None where there is one."""
     reason = experiment.protocol.unpredictable() if experiment.protocol else None
-    return reason or next(iter(_too_large_to_predict(experiment)), None)
+    return reason or next(iter(too_large_to_predict(experiment)), None)
 
 
-def _too_large_to_predict(experiment: Experiment) -> list[str]:
+def too_large_to_predict(experiment: Experiment) -> list[str]:
+    """What makes the exact prediction too large, one line each."""
     lines, noise, graphs, gains = [], experiment.noise, experiment.graph_list, experiment.leader_gains
     links = heard_links(graphs, experiment.time) & np.isfinite(gains)[:, None]
     lossy = int((links & (experiment.loss > 0.0)).sum())

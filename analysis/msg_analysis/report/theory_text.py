@@ -12,7 +12,17 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from msg_analysis.common.text import agent_name, counted, duration_text, listed, number_text, p_text, percent, z_text
+from msg_analysis.common.text import (
+    agent_name,
+    agent_text,
+    counted,
+    duration_text,
+    listed,
+    number_text,
+    p_text,
+    percent,
+    z_text,
+)
 from msg_analysis.report.tables import fact_table, interval_text, number_table, print_errors, print_rows, print_table
 from msg_analysis.theory.prediction import LAW_NAMES
 
@@ -21,6 +31,10 @@ _METHODS = {"exhaustive": "exhaustive search", "greedy": "greedy selection", "sw
 
 def print_prediction(document: dict[str, Any], console: Console) -> None:
     """Print the steady errors of every predicted law, and the share of time of every graph."""
+    steps = document.get("emulated") or document["discrete"]
+    if steps.get("method") == "sampled":
+        _print_sampled(document, steps, console)
+        return
     laws = {
         LAW_NAMES["sequential"] if document[key].get("law") == "sequential" else LAW_NAMES[key]: document[key]
         for key in LAW_NAMES
@@ -30,7 +44,6 @@ def print_prediction(document: dict[str, Any], console: Console) -> None:
         [number_text(law[key]) for law in laws.values()] for key in ("system_error", "system_certainty")
     )
     agents = (list(map(number_text, row)) for row in zip(*(law["node_errors"] for law in laws.values()), strict=True))
-    steps = document.get("emulated") or document["discrete"]
     scheduled = "largest" in steps
     title = (
         "Mean-square error over the given sequence of graphs" if scheduled else "Mean-square error in the steady state"
@@ -67,6 +80,21 @@ def _print_outages(found: dict[str, Any], console: Console) -> None:
         print_rows(console, "Longest outages", ("from", "to", "parts", "adds to the mean error"), rows)
         without = f"without {'this' if len(rows) == 1 else 'these'}: {number_text(found['error_without'])}"
         console.print(f"{counted(found['count'], 'outage')}; mean system error {without}")
+
+
+def _print_sampled(document: dict[str, Any], law: dict[str, Any], console: Console) -> None:
+    """Print sampled errors with their intervals."""
+    rows = [("system", number_text(law["system_error"]), interval_text(law["interval"]))]
+    for agent, (error, interval) in enumerate(zip(law["node_errors"], law["node_intervals"], strict=True), start=1):
+        if error is not None:
+            rows.append((agent_text(agent, document["names"]), number_text(error), interval_text(interval)))
+    title = f"Mean-square error in the steady state, {LAW_NAMES['emulated']}, sampled"
+    print_rows(console, title, ["", "error", "95 % interval"], rows, "agents")
+    shares = [(name, number_text(share)) for name, share in zip(document["modes"], document["stationary"], strict=True)]
+    print_rows(console, "Graphs", ["graph", "share of time"], shares)
+    console.print(
+        f"{law['paths']} samples in {number_text(law['seconds'], 2)} s: --precision and --within say how many"
+    )
 
 
 def tails_words(document: dict[str, Any]) -> list[str]:

@@ -1,0 +1,484 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""Steady errors by sampling, where matrices are too large: unbiased, with an interval.
+
+With g(-1), g(-2), ... a stationary path of the graphs backwards, and random z with E[z z^T] = I (projected: consensus),
+
+    E = sum_(k >= 1) E |B_g(-k)^T W_g(1-k)^T ... W_g(-1)^T z|^2
+
+so one walk of z through transposed sparse steps is one sample. Messages are walked through backwards, too: what an
+agent used of a message goes to the message, and from there, squared with its noise, to the sender. A walk whose latest
+terms are small ends by Russian roulette: one that survives with probability p counts 1 / p, so no tail is cut off.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import scipy.special
+from scipy import sparse
+
+from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.common.resources import tell
+from msg_analysis.common.text import finite
+from msg_analysis.errors import InputError, NotAvailableError
+from msg_analysis.experiment.graphs import Graph
+from msg_analysis.experiment.validation import MOST_STATES, too_large_to_predict
+from msg_analysis.model.step_model import StepLaw, step_law, step_matrices, turns
+
+if TYPE_CHECKING:
+    from msg_analysis.experiment.experiment import Experiment
+
+LEVEL = 0.95
+ALL_AGENTS = 20  # most agents of which each has walks of its own by default
+FEWEST = 16  # samples before an interval is believed
+NUMBERS = 2**17  # on arcs, that walks which are made together have at a time: they fit in a cache
+MOST_TOGETHER = 512
+BLOCK = 16  # steps of a walk before it may end; later a quarter of those that it has made
+SMALL = 0.03  # of the sum so far, terms of a block: then the walk may end
+GROWTH = 1e6  # of |z|^2, beyond what weights that are not negative can do: the steps are unstable
+LONGEST = 2**30  # [steps]
+
+
+class Links(Protocol):
+    """Links that switch by themselves, each between up and down, whatever the others do."""
+
+    mesh: Graph  # all links up
+    link_of: IntArray  # (l,) number of the link of each arc of the mesh
+    rise: FloatArray  # (E,) probabilities per step that a link that is down comes up
+    fall: FloatArray  # (E,) and that one that is up goes down
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SampledPrediction:
+    """The steady errors of the run's steps, sampled.
+
+    Attributes
+    ----------
+    experiment
+        what is predicted
+    system_error, interval
+        E, and its 95 % interval (t, over independent samples)
+    node_errors, node_intervals
+        (m,) E_i and (m, 2) their 95 % intervals; nan for agents that were not sampled
+    paths
+        number of walks, each on a path of the graphs of its own
+    seed
+        from which they were drawn
+    seconds
+        that they took [s]
+    """
+
+    experiment: Experiment
+    system_error: float
+    interval: tuple[float, float]
+    node_errors: FloatArray
+    node_intervals: FloatArray
+    paths: int
+    seed: int
+    seconds: float
+
+    @property
+    def law(self) -> StepLaw:
+        """Whether the agents step all at once, or one after the other."""
+        return step_law(self.experiment)
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of ``msg-analysis predict --json``, with None for what is not sampled."""
+        error, nodes = self.system_error, self.node_errors
+        law = {
+            "law": self.law,
+            "method": "sampled",
+            "system_error": error,
+            "interval": list(self.interval),
+            "node_errors": finite(nodes.tolist()),
+            "node_intervals": finite(self.node_intervals.tolist()),
+            "system_certainty": 1.0 / error if error > 0.0 else None,
+            "node_certainty": [1.0 / node if node > 0.0 else None for node in nodes.tolist()],
+            "covariance": None,
+            "paths": self.paths,
+            "seed": self.seed,
+            "seconds": self.seconds,
+        }
+        document: dict[str, Any] = {
+            "agents": self.experiment.agents,
+            "names": self.experiment.names,
+            "modes": [graph.name for graph in self.experiment.graph_list],
+            "stationary": self.experiment.switching_law.stationary.tolist(),
+        }
+        laws = {"discrete": law} if self.experiment.time == "discrete" else {"continuous": None, "emulated": law}
+        tails = dict.fromkeys(("radius", "lower", "upper", "finite"))
+        rest = {"static": None, "disconnected": [], "fourth_moment": tails, "notes": list(self.experiment.notes)}
+        return document | laws | rest
+
+
+def exact_ends(experiment: Experiment) -> bool:
+    """Whether links, bursts or held values of an experiment are too many for the exact prediction."""
+    links: Links | None = getattr(experiment, "links", None)
+    if experiment.schedule:
+        return False
+    return bool(too_large_to_predict(experiment)) or (links is not None and 2.0 ** len(links.rise) > MOST_STATES)
+
+
+def sampled_prediction(
+    experiment: Experiment,
+    *,
+    precision: float = 0.01,
+    within: float = 60.0,
+    agents: Sequence[int | str] = (),
+    seed: int = 0,
+    links: Links | None = None,
+) -> SampledPrediction:
+    """Sample the steady errors of the run's steps.
+
+    Parameters
+    ----------
+    experiment
+        with a chain, or links that switch by themselves
+    precision
+        half width of the 95 % intervals at which sampling ends, relative to the error; above 0, below 1
+    within
+        time after which it ends all the same [s]
+    agents
+        whose errors are sampled, too, by number from 1 or name; with up to 20 agents, by default all
+    seed
+        of the random numbers; for one seed, the time decides nothing but how many samples there are
+    links
+        that switch by themselves; by default those of the experiment
+
+    Raises
+    ------
+    InputError
+        an argument that is not valid, a given sequence of graphs, unstable steps, or too little time for an interval
+    """
+    began = time.monotonic()
+    for key, value, most in (("precision", precision, 1.0), ("within", within, math.inf)):
+        if not 0.0 < value < most:
+            wanted = "expected a number above 0" + ", below 1" * (most < math.inf)
+            raise InputError(f"{key}: {value:g}: {wanted}: for example 0.01")
+    law, m = _Law.of(experiment, links or getattr(experiment, "links", None)), experiment.agents
+    every = not agents and m <= ALL_AGENTS
+    units = list(range(m)) if every else experiment.indices(agents)
+    width = len(units) + (not every)
+    rounds = max(1, min(MOST_TOGETHER, NUMBERS // max(1, len(law.targets))) // width)
+    seeds, count, sums, squares = np.random.SeedSequence(seed), 0, np.zeros(1 + len(units)), np.zeros(1 + len(units))
+    mean = half = sums
+    while count < FEWEST or (half[: None if agents else 1] > precision * mean[: None if agents else 1]).any():
+        batch = _batch(law, units, every, rounds, np.random.default_rng(seeds.spawn(1)[0]), began + within)
+        if batch is None:
+            break
+        sums, squares, count = sums + batch.sum(axis=0), squares + (batch**2).sum(axis=0), count + len(batch)
+        mean = sums / count
+        variance = np.maximum(squares / count - mean**2, 0.0) / max(1, count - 1)
+        half = scipy.special.stdtrit(max(1, count - 1), 0.5 + LEVEL / 2.0) * np.sqrt(variance)
+        share = precision * mean[0] / half[0] if half[0] else 1.0
+        tell("samples", count, max(count, math.ceil(count / min(1.0, share) ** 2)))
+    if count < 2:
+        wanted = "expected more than two samples take, each of which ends when the agents have forgotten its start"
+        raise InputError(f"within: {within:g} s: {wanted}: raise it")
+    nodes, intervals = np.full(m, np.nan), np.full((m, 2), np.nan)
+    nodes[units], intervals[units] = mean[1:], np.stack([mean - half, mean + half], axis=1)[1:]
+    return SampledPrediction(
+        experiment,
+        system_error=float(mean[0]),
+        interval=(float(mean[0] - half[0]), float(mean[0] + half[0])),
+        node_errors=nodes,
+        node_intervals=intervals,
+        paths=count * width,
+        seed=seed,
+        seconds=time.monotonic() - began,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Law:
+    """The step of a run, sparse. An arc is a pair of agents of which the first hears the second in some graph."""
+
+    agents: int
+    consensus: bool
+    targets: IntArray  # (l,)
+    sources: IntArray  # (l,)
+    weights: FloatArray  # (l, n) W_ij of each arc in each graph
+    rows: FloatArray | None  # (m, n) sums of the rows of W; None: all 1
+    gains: list[sparse.csr_array]  # of every graph, B^T (m, m); one if all are the same
+    backwards: FloatArray  # (n, n) transition matrix of the graphs backwards in time
+    stationary: FloatArray  # (n,)
+    lost: FloatArray | None  # (2, l) probability that a message is lost after one that was not, and after one that was
+    loss: FloatArray  # (l,) and after any
+    burst: float | None
+    holds: bool
+    broadcast: float
+    link: float
+    delay: int
+    order: IntArray | None  # (m,) agents in the order of their steps; None: all at once
+    links: Links | None  # (l,) arcs are then in the order of the links
+
+    @classmethod
+    def of(cls, experiment: Experiment, links: Links | None) -> _Law:
+        m, dt, noise, graphs = experiment.agents, experiment.step_length, experiment.noise, experiment.graph_list
+        if links is None and experiment.schedule:
+            raise NotAvailableError("switching: the sequence of the graphs is given: expected a Markov chain for this")
+        if links is not None and (experiment.time == "discrete" or experiment.protocol):
+            raise NotAvailableError("switching.links: expected the built-in law in continuous time: no sampling here")
+        if experiment.protocol and (lines := experiment.protocol.unavailable("predict")):
+            raise NotAvailableError(lines[0])
+        gains, rows, grounded = experiment.leader_gains, None, np.isinf(experiment.leader_gains)
+        if experiment.protocol or experiment.time == "discrete":
+            matrices = step_matrices(experiment)
+            inside = ~np.eye(m, dtype=np.bool_)
+            targets, sources = np.nonzero((matrices.weights != 0.0).any(axis=0) & inside)
+            weights = matrices.weights[:, targets, sources].T.copy()
+            rows = matrices.weights.sum(axis=2).T
+            felt = [sparse.csr_array(gain.T) for gain in matrices.noise_gain]
+        else:
+            graphs = (links.mesh,) if links else graphs
+            keys, place = np.unique(np.concatenate([g.targets * m + g.sources for g in graphs]), return_inverse=True)
+            targets, sources = np.divmod(keys, m)
+            weights = np.zeros((len(keys), len(graphs)))
+            mode = np.repeat(np.arange(len(graphs)), [len(graph.weights) for graph in graphs])
+            weights[place, mode] = dt * np.concatenate([graph.weights for graph in graphs])
+            weights[grounded[targets]] = 0.0
+            if gains.any():
+                rows = np.where(grounded, 0.0, 1.0 - dt * np.where(grounded, 0.0, gains))[:, None]
+            felt = [_felt(gain, grounded, dt) for gain in _process_of(experiment)]
+        if links:
+            order = np.lexsort((sources, targets))  # as in the mesh
+            order = order[np.argsort(links.link_of, kind="stable")]
+            targets, sources, weights = targets[order], sources[order], weights[order]
+        loss, lost = experiment.loss[targets, sources], None
+        if loss.any():
+            lost = np.stack([loss, loss])
+            if noise.burst is not None:
+                lost = np.stack(
+                    [loss / (noise.burst * (1.0 - loss)), np.where(loss > 0.0, 1.0 - 1.0 / noise.burst, 0.0)]
+                )
+        chain = np.ones((1, 1)) if links else experiment.chain.transition(dt)
+        stationary = np.ones(1) if links else experiment.switching_law.stationary
+        return cls(
+            agents=m,
+            consensus=experiment.problem == "consensus",
+            targets=targets,
+            sources=sources,
+            weights=weights,
+            rows=None if rows is None or np.allclose(rows, 1.0, rtol=0.0, atol=1e-15) else rows,
+            gains=felt[:1] if all(abs(felt[0] - gain).sum() == 0.0 for gain in felt[1:]) else felt,
+            backwards=chain.T * stationary / stationary[:, None],
+            stationary=stationary,
+            lost=lost,
+            loss=loss,
+            burst=noise.burst,
+            holds=noise.holds,
+            broadcast=noise.broadcast,
+            link=noise.link,
+            delay=noise.delay,
+            order=turns(experiment),
+            links=links,
+        )
+
+
+def _process_of(experiment: Experiment) -> list[Any]:
+    """F of every graph, as the file has it: a number, a list or a matrix."""
+    process = experiment.noise.process
+    if not isinstance(process, dict):
+        return [process]
+    return [process[graph.name] for graph in experiment.graph_list]
+
+
+def _felt(gain: Any, grounded: BoolArray, dt: float) -> sparse.csr_array:
+    """B^T of a noise gain F: sqrt(dt) F without the rows of grounded leaders, transposed."""
+    given, free = np.asarray(gain, dtype=float), np.where(grounded, 0.0, math.sqrt(dt))
+    if given.ndim < 2:
+        return sparse.csr_array(sparse.diags_array(given * free))
+    return sparse.csr_array((given * free[:, None]).T)
+
+
+def _batch(
+    law: _Law, units: Sequence[int], every: bool, rounds: int, rng: np.random.Generator, deadline: float
+) -> FloatArray | None:
+    """(rounds, 1 + units) independent samples of the system error and of those of agents; None: not done in time."""
+    m, width = law.agents, len(units) + (not every)
+    z: FloatArray = np.zeros((m, rounds, width))
+    z[units, :, np.arange(width - len(units), width)] = 1.0
+    if not every:
+        z[:, :, 0] = 2.0 * rng.integers(0, 2, (m, rounds)) - 1.0
+    if law.consensus:
+        z -= z.mean(axis=0)
+    walk, first = _Walk(law, z.reshape(m, -1), rng), np.einsum("irw,irw->rw", z, z).ravel()
+    total, counts, number = np.zeros(rounds * width), np.ones(rounds * width), np.arange(rounds * width)
+    with np.errstate(over="ignore", invalid="ignore"):
+        while number.size:
+            terms, size = walk.block(max(BLOCK, walk.steps // 4))
+            if not (size <= GROWTH * m * first[number]).all():
+                raise InputError(
+                    "second moments: a walk backwards through the steps has grown a million times: the steps are "
+                    "unstable, there is no steady state: lower run.dt"
+                )
+            if time.monotonic() > deadline:
+                return None
+            terms *= counts
+            total[number] += terms
+            # Without noise so far, a walk ends where nothing of it is left.
+            heard = total[number] > 0.0
+            chance = np.where(heard, terms / np.where(heard, SMALL * total[number], 1.0), size > 1e-30 * first[number])
+            lives = rng.random(len(number)) < chance
+            counts = (counts / np.clip(chance, 1e-300, 1.0))[lives]
+            number = number[lives]
+            walk.keep(lives)
+    table = total.reshape(rounds, width)
+    return np.concatenate([table.sum(axis=1, keepdims=True), table], axis=1) if every else table
+
+
+class _Walk:
+    """Vectors (m, C), each of which goes backwards through the steps of a path of its own."""
+
+    def __init__(self, law: _Law, z: FloatArray, rng: np.random.Generator) -> None:
+        self.law, self.steps, self._rng, self._z = law, 0, rng, z
+        m, arcs, count = law.agents, len(law.targets), z.shape[1]
+        self._modes: IntArray = np.asarray(rng.choice(len(law.stationary), count, p=law.stationary))
+        self._weights = law.weights if law.weights.shape[1] == 1 else law.weights[:, self._modes]
+        self._leave = 1.0 - np.diag(law.backwards)
+        jumps = np.cumsum(law.backwards * ~np.eye(len(law.backwards), dtype=np.bool_), axis=1)
+        self._jumps = jumps / np.maximum(jumps[:, -1:], np.finfo(float).tiny)
+        self._until = self._held(self._leave[self._modes]) if len(jumps) > 1 else np.full(count, LONGEST)
+        self._up = self._flip = np.empty((0, count), dtype=np.int64)
+        if law.links is not None:
+            self._free_links(law.links, count)
+        self._lossy = np.flatnonzero(law.loss)
+        self._lost = np.zeros((arcs, count), dtype=np.bool_)
+        self._lost[self._lossy] = rng.random((len(self._lossy), count)) < law.loss[self._lossy, None]
+        self._chances = None if law.lost is None else law.lost[:, self._lossy, None].astype(np.float32)
+        own, into = (
+            sparse.csr_array((np.ones(arcs), (ends, np.arange(arcs))), (m, arcs)) for ends in (law.targets, law.sources)
+        )
+        self._squares: FloatArray | None = None
+        if all(gain.nnz == np.count_nonzero(gain.diagonal()) for gain in law.gains):
+            self._squares = np.stack([gain.diagonal() ** 2 for gain in law.gains], axis=1)
+        self._plain = not (law.delay or law.holds or law.broadcast or law.link or law.order is not None)
+        self._flow = into - own
+        if self._plain:
+            return
+        # In real time the agents step one after the other: backwards, the last one first.
+        self._ahead = np.zeros(arcs, dtype=np.int64)
+        groups = [np.arange(m)]
+        if law.order is not None:
+            rank = np.argsort(law.order)
+            self._ahead = (rank[law.sources] < rank[law.targets]).astype(np.int64)
+            groups = [np.array([i]) for i in law.order[::-1].tolist()]
+        self._groups = []
+        for agents in groups:
+            heard, said = (np.flatnonzero(np.isin(ends, agents)) for ends in (law.targets, law.sources))
+            self._groups.append((agents, heard, said, own[agents][:, heard], into[agents][:, said]))
+        # What was used of the messages of d + 2 steps, and what passes on to an earlier message.
+        self._used = np.zeros((law.delay + 2, arcs, count))
+        self._held_back = np.zeros((arcs if law.holds else 0, count))
+
+    def _free_links(self, links: Links, count: int) -> None:
+        """Each link starts in its stationary law, and is then left for a geometric number of steps."""
+        order = np.argsort(links.link_of, kind="stable")
+        self._first = np.searchsorted(links.link_of[order], np.arange(len(links.rise) + 1))
+        self._rates = np.stack([links.rise, links.fall])
+        up = self._rng.random((len(links.rise), count)) * self._rates.sum(axis=0)[:, None] < links.rise[:, None]
+        self._up = up.astype(np.int64)
+        self._flip = self._held(self._rates[self._up, np.arange(len(up))[:, None]])
+        self._weights = self.law.weights * up[links.link_of[order]]
+
+    def _held(self, leave: FloatArray) -> IntArray:
+        """Numbers of steps until something that happens with these probabilities happens, from the last step on."""
+        held = self._rng.geometric(np.maximum(leave, 1e-18))
+        return np.minimum(held, LONGEST).astype(np.int32) + np.int32(self.steps)
+
+    def _switch(self) -> None:
+        """The graphs one step earlier: a stationary chain of two states is the same backwards."""
+        if (ends := np.flatnonzero(self._until == self.steps)).size:
+            jumps = self._jumps[self._modes[ends]]
+            self._modes[ends] = new = (self._rng.random((len(ends), 1)) > jumps).sum(axis=1)
+            self._until[ends] = self._held(self._leave[new])
+            if self._weights.shape[1] > 1:
+                self._weights[:, ends] = self.law.weights[:, new]
+        if (ends := np.flatnonzero(self._flip == self.steps)).size:
+            link, column = np.divmod(ends, self._flip.shape[1])
+            self._up[link, column] ^= 1
+            up = self._up[link, column]
+            self._flip[link, column] = self._held(self._rates[up, link])
+            arc, last = self._first[link], self._first[link + 1]
+            while (more := arc < last).any():
+                self._weights[arc[more], column[more]] = self.law.weights[arc[more], 0] * up[more]
+                arc = arc + 1
+
+    def _back(self) -> FloatArray:
+        """Go back by a step: (C,) the terms of its noise."""
+        law = self.law
+        if self.steps:
+            self._switch()
+        self.steps += 1
+        if self._chances is not None:
+            usual, after = self._chances
+            chance = usual if law.burst is None else np.where(self._lost[self._lossy], after, usual)
+            self._lost[self._lossy] = self._rng.random((len(self._lossy), self._z.shape[1]), np.float32) < chance
+        if not self._plain:
+            return self._messages()
+        terms = self._noise(self._z)
+        flow = self._weights * self._z[law.targets]
+        if self._chances is not None:
+            flow *= ~self._lost
+        if law.rows is not None:
+            self._z *= law.rows if law.rows.shape[1] == 1 else law.rows[:, self._modes]
+        self._z += np.asarray(self._flow @ flow)
+        return terms
+
+    def _messages(self) -> FloatArray:
+        """The same with messages that are noisy, late or held, or agents that step one after the other."""
+        law, depth, terms = self.law, len(self._used), np.zeros(self._z.shape[1])
+        noisy = np.empty_like(self._z)
+        rows = np.ones((law.agents, 1)) if law.rows is None else law.rows
+        rows = rows if rows.shape[1] == 1 else rows[:, self._modes]
+        for agents, heard, said, own, into in self._groups:
+            # The message of the state after this step, which later steps have used.
+            message = self._used[(1 - self.steps) % depth, said]
+            if law.holds:
+                message += self._held_back[said]
+                self._held_back[said] = message * self._lost[said]
+                message *= ~self._lost[said]
+            published = into @ message
+            terms += law.link**2 * (message**2).sum(axis=0) + law.broadcast**2 * (published**2).sum(axis=0)
+            noisy[agents] = z = self._z[agents] + published
+            flow = self._weights[heard] * z[np.searchsorted(agents, law.targets[heard])]
+            if self._chances is not None and not law.holds:
+                flow *= ~self._lost[heard]
+            self._z[agents] = rows[agents] * z - own @ flow
+            self._used[(self._ahead[heard] - self.steps - law.delay) % depth, heard] = flow
+        return terms + self._noise(noisy)
+
+    def _noise(self, z: FloatArray) -> FloatArray:
+        """(C,) |B^T z|^2."""
+        if self._squares is not None:
+            squares = self._squares if self._squares.shape[1] == 1 else self._squares[:, self._modes]
+            return np.asarray(np.einsum("ic,ic->c", z * squares, z))
+        terms = np.zeros(z.shape[1])
+        for mode, gain in enumerate(self.law.gains):
+            there = self._modes == mode if len(self.law.gains) > 1 else np.ones(len(terms), dtype=np.bool_)
+            terms[there] = ((gain @ z[:, there]) ** 2).sum(axis=0)
+        return terms
+
+    def block(self, steps: int) -> tuple[FloatArray, FloatArray]:
+        """(C,) terms of the sum over these steps, and |z|^2 after them."""
+        terms = np.zeros(self._z.shape[1])
+        for _ in range(steps):
+            terms += self._back()
+        return terms, np.einsum("ic,ic->c", self._z, self._z)
+
+    def keep(self, lives: BoolArray) -> None:
+        """Only these vectors go on."""
+        if lives.all():
+            return
+        for name in ("_z", "_modes", "_until", "_up", "_flip", "_lost", "_used", "_held_back"):
+            if hasattr(self, name):
+                setattr(self, name, getattr(self, name)[..., lives])
+        if self._weights.shape[1] > 1:
+            self._weights = self._weights[:, lives]

@@ -1,0 +1,133 @@
+"""Sampled errors: unbiased, with an interval that holds, the same for the same seed."""
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from experiments import CORRELATED, TRACKING, Experiment, directed, five, line_ring, pieces
+from msg_analysis.errors import InputError, NotAvailableError
+from msg_analysis.experiment.graphs import Graph
+from msg_analysis.theory.sampling import SampledPrediction, sampled_prediction
+
+HELD = {"process": 1.0, "loss": 0.4, "on_loss": "hold", "broadcast": 0.7, "link": 0.5}
+BURSTS = {"loss": {"arcs": [[1, 2, 0.4], [2, 3, 0.3]]}, "burst": 5, "broadcast": 0.4, "link": 0.5}
+REALTIME = {"dt": 0.2, "pace": "realtime"}
+LAWS: dict[str, Experiment] = {
+    "undirected": five(),
+    "directed, weighted": directed(),
+    "tracking": directed(**TRACKING),
+    "grounded leader": five(**TRACKING | {"leaders": {"agents": [1], "gain": "inf", "reference": 2.0}}),
+    "correlated noise": pieces(),
+    "noise by graph": five(noise={"process": {"line": 2.0, "ring": [0.5, 1.0, 0.0, 1.0, 0.5]}}),
+    "own value for lost ones": five(noise={"loss": 0.3}, run={"dt": 0.2}),
+    "bursts": line_ring(3, 1.0, noise=BURSTS, run={"dt": 0.2}),
+    "bursts, held": line_ring(3, 1.0, noise=BURSTS | {"on_loss": "hold"}, run={"dt": 0.2}),
+    "held": five(noise=HELD, run={"dt": 0.2}),
+    "delay": five(noise={"delay": 2, "loss": 0.2, "link": 0.5}, run={"dt": 0.1}),
+    "delay, held": five(noise=HELD | {"delay": 2}, run={"dt": 0.1}),
+    "real time": line_ring(3, 1.0, noise={"process": CORRELATED}, run=REALTIME),
+    "real time, noise on the air": five(noise={"loss": 0.3, "broadcast": 0.7, "link": 0.5}, run=REALTIME),
+    "real time, held": five(noise=HELD | {"delay": 1}, run=REALTIME | {"dt": 0.1}),
+    "discrete time": line_ring(5, time="discrete", switching={"transition": [[0.9, 0.1], [0.2, 0.8]]}),
+}
+
+
+def z_of(sampled: SampledPrediction, exact: float) -> float:
+    low, high = sampled.interval
+    return (sampled.system_error - exact) / (high - low) * 2.0 * 1.96
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_mean_is_the_exact_prediction(name):
+    """The exact prediction is the oracle, which shares no code. Seeds are fixed; |z| < 4 fails once in 16,000."""
+    exact = LAWS[name].predict().emulated
+    sampled = sampled_prediction(LAWS[name], precision=0.02, seed=1)
+    assert abs(z_of(sampled, exact.system_error)) < 4.0
+    low, high = sampled.node_intervals.T
+    assert (np.abs(sampled.node_errors - exact.node_errors) <= 2.5 * (high - low) / 2.0 + 1e-12).all()
+
+
+def of_links(count: int) -> SimpleNamespace:
+    """The first of ten links of six agents, each up and down at rate 0.5, in steps of 0.05."""
+    ends = [(i, i + 1) for i in range(5)] + [(0, 2), (1, 3), (0, 5), (1, 4), (2, 5)]
+    numbers = {(i, j): number for number, pair in enumerate(ends[:count]) for i, j in (pair, pair[::-1])}
+    targets, sources = np.array(sorted(numbers)).T
+    change = np.full(count, (1.0 - math.exp(-0.05)) / 2.0)
+    of_arcs = np.array([numbers[pair] for pair in sorted(numbers)])
+    mesh = Graph("mesh", 6, targets, sources, np.ones(2 * count))
+    return SimpleNamespace(mesh=mesh, link_of=of_arcs, rise=change, fall=change)
+
+
+@pytest.mark.parametrize(("count", "exact"), [(9, 3.41958), (10, 2.73584)])
+def test_links_that_switch_by_themselves(count, exact):
+    """Golden numbers of the chain on all 2^count graphs, by a dense solver. The seed is fixed; |z| < 4."""
+    sampled = sampled_prediction(line_ring(6), links=of_links(count), precision=0.02, seed=2)
+    assert abs(z_of(sampled, exact)) < 4.0
+
+
+def simulated(links: Any, paths: int, steps: int, rng: np.random.Generator) -> tuple[float, float]:
+    """Mean of the system error after these steps from zero, and its standard error, forward in time."""
+    m, dt = links.mesh.agents, 0.05
+    states, up = np.zeros((m, paths)), rng.random((len(links.rise), paths)) < 0.5
+    for _ in range(steps):
+        change = np.zeros_like(states)
+        for arc, (i, j) in enumerate(zip(links.mesh.targets, links.mesh.sources, strict=True)):
+            change[i] += up[links.link_of[arc]] * (states[j] - states[i])
+        states += dt * change + math.sqrt(dt) * rng.standard_normal(states.shape)
+        up ^= rng.random(up.shape) < links.rise[0]
+    errors = ((states - states.mean(axis=0)) ** 2).sum(axis=0)
+    return float(errors.mean()), float(errors.std() / math.sqrt(paths))
+
+
+def test_a_simulation_forward_in_time_has_the_same_mean():
+    """An oracle without adjoints: 2000 copies. Fixed seeds; |z| < 4 fails once in 16,000."""
+    mean, error = simulated(of_links(7), 2000, 400, np.random.default_rng(5))
+    sampled = sampled_prediction(line_ring(6), links=of_links(7), precision=0.02, seed=3)
+    own = (sampled.interval[1] - sampled.interval[0]) / 3.92
+    assert abs(sampled.system_error - mean) < 4.0 * math.hypot(own, error)
+
+
+def test_intervals_cover():
+    """40 intervals of 95 %: fewer than 33 hold once in 1,000 (binomial). Fixed seeds."""
+    exact = LAWS["tracking"].predict().emulated.system_error
+    found = [sampled_prediction(LAWS["tracking"], precision=0.05, seed=100 + seed) for seed in range(40)]
+    assert sum(low <= exact <= high for low, high in (one.interval for one in found)) >= 33
+
+
+def test_the_same_for_the_same_seed_whatever_the_time():
+    first, again = (sampled_prediction(five(), precision=0.05, within=within, seed=4) for within in (60.0, 1000.0))
+    assert first.to_json()["emulated"] | {"seconds": 0} == again.to_json()["emulated"] | {"seconds": 0}
+    assert sampled_prediction(five(), precision=0.05, seed=5).system_error != first.system_error
+
+
+def test_single_agents():
+    """Fixed seed; both intervals of 95 % hold three times as wide (|z| < 6)."""
+    exact = five().predict().emulated
+    sampled = sampled_prediction(five(), precision=0.05, agents=[2], seed=1)
+    assert np.isnan(sampled.node_errors).tolist() == [True, False, True, True, True]
+    assert sampled.node_errors[1] == pytest.approx(exact.node_errors[1], rel=0.15)
+    assert sampled.system_error == pytest.approx(exact.system_error, rel=0.15)
+
+
+def test_no_noise_no_error():
+    assert sampled_prediction(five(noise={"process": 0.0})).interval == (0.0, 0.0)
+
+
+def test_growing_walks_are_unstable_steps():
+    graph = {"all": {"star": {"center": 1}}}
+    late = line_ring(agents=4, graphs=graph, switching={}, noise={"delay": 1}, run={"dt": 0.4})
+    with pytest.raises(InputError, match="steps are unstable"):
+        sampled_prediction(late)
+
+
+def test_what_cannot_be_sampled():
+    with pytest.raises(InputError, match=r"within: 1e-09 s: expected more than two samples take"):
+        sampled_prediction(five(), within=1e-9)
+    with pytest.raises(InputError, match="precision: 2: expected a number above 0, below 1"):
+        sampled_prediction(five(), precision=2.0)
+    given = five(switching={"schedule": [[0, "line"], [1, "ring"]]}, run={"start": "zero"})
+    with pytest.raises(NotAvailableError, match="expected a Markov chain"):
+        sampled_prediction(given)
