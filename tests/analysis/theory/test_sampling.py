@@ -117,8 +117,8 @@ def test_no_noise_no_error():
 
 
 def test_growing_walks_are_unstable_steps():
-    graph = {"all": {"star": {"center": 1}}}
-    late = line_ring(agents=4, graphs=graph, switching={}, noise={"delay": 1}, run={"dt": 0.4})
+    fields = {"graphs": {"all": {"complete": True}}, "switching": {}, "noise": {"delay": 1}}
+    late = line_ring(agents=4, **TRACKING | fields, run={"dt": 0.4})
     with pytest.raises(InputError, match="steps are unstable"):
         sampled_prediction(late)
 
