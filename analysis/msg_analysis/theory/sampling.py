@@ -39,11 +39,12 @@ LEVEL = 0.95
 ALL_AGENTS = 20  # most agents of which each has walks of its own by default
 FEWEST = 16  # samples before an interval is believed
 NUMBERS = 2**17  # on arcs, that walks which are made together have at a time: they fit in a cache
-MOST_TOGETHER = 512
+LEAST_TOGETHER, MOST_TOGETHER = 4, 512
+FEW_GRAPHS = 8  # whose matrices are multiplied, and not the arcs of each walk
 BLOCK = 16  # steps of a walk before it may end; later a quarter of those that it has made
 SMALL = 0.03  # of the sum so far, terms of a block: then the walk may end
 GROWTH = 1e6  # of |z|^2, beyond what weights that are not negative can do: the steps are unstable
-LONGEST = 2**30  # [steps]
+LONGEST, NEVER = 2**60, 1e-18  # steps, and probability in a step, that are not told from infinity and 0
 
 
 class Links(Protocol):
@@ -162,11 +163,11 @@ def sampled_prediction(
         if not 0.0 < value < most:
             wanted = "expected a number above 0" + ", below 1" * (most < math.inf)
             raise InputError(f"{key}: {value:g}: {wanted}: for example 0.01")
-    law, m = _Law.of(experiment, links or getattr(experiment, "links", None)), experiment.agents
+    law, m = _Law(experiment, links or getattr(experiment, "links", None)), experiment.agents
     every = not agents and m <= ALL_AGENTS
     units = list(range(m)) if every else experiment.indices(agents)
     width = len(units) + (not every)
-    rounds = max(1, min(MOST_TOGETHER, NUMBERS // max(1, len(law.targets))) // width)
+    rounds = max(1, min(MOST_TOGETHER, max(LEAST_TOGETHER, NUMBERS // max(1, len(law.targets)))) // width)
     seeds, count, sums, squares = np.random.SeedSequence(seed), 0, np.zeros(1 + len(units)), np.zeros(1 + len(units))
     mean = half = sums
     while count < FEWEST or (half[: None if agents else 1] > precision * mean[: None if agents else 1]).any():
@@ -196,106 +197,106 @@ def sampled_prediction(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Law:
     """The step of a run, sparse. An arc is a pair of agents of which the first hears the second in some graph."""
 
-    agents: int
-    consensus: bool
     targets: IntArray  # (l,)
     sources: IntArray  # (l,)
-    weights: FloatArray  # (l, n) W_ij of each arc in each graph
-    rows: FloatArray | None  # (m, n) sums of the rows of W; None: all 1
-    gains: list[sparse.csr_array]  # of every graph, B^T (m, m); one if all are the same
-    backwards: FloatArray  # (n, n) transition matrix of the graphs backwards in time
-    stationary: FloatArray  # (n,)
-    lost: FloatArray | None  # (2, l) probability that a message is lost after one that was not, and after one that was
-    loss: FloatArray  # (l,) and after any
-    burst: float | None
-    holds: bool
-    broadcast: float
-    link: float
-    delay: int
-    order: IntArray | None  # (m,) agents in the order of their steps; None: all at once
-    links: Links | None  # (l,) arcs are then in the order of the links
+    weights: FloatArray  # (l, n) W_ij
+    rows: FloatArray  # (m, 1) or (m, n) sums of the rows of W
 
-    @classmethod
-    def of(cls, experiment: Experiment, links: Links | None) -> _Law:
-        m, dt, noise, graphs = experiment.agents, experiment.step_length, experiment.noise, experiment.graph_list
+    def __init__(self, experiment: Experiment, links: Links | None) -> None:
+        m, dt, noise = experiment.agents, experiment.step_length, experiment.noise
         if links is None and experiment.schedule:
             raise NotAvailableError("switching: the sequence of the graphs is given: expected a Markov chain for this")
         if links is not None and (experiment.time == "discrete" or experiment.protocol):
             raise NotAvailableError("switching.links: expected the built-in law in continuous time: no sampling here")
         if experiment.protocol and (lines := experiment.protocol.unavailable("predict")):
             raise NotAvailableError(lines[0])
-        gains, rows, grounded = experiment.leader_gains, None, np.isinf(experiment.leader_gains)
+        self.agents, self.consensus, self.links = m, experiment.problem == "consensus", links
+        self.holds, self.delay, self.burst = noise.holds, noise.delay, noise.burst
+        self.broadcast, self.link = noise.broadcast, noise.link
         if experiment.protocol or experiment.time == "discrete":
-            matrices = step_matrices(experiment)
-            inside = ~np.eye(m, dtype=np.bool_)
-            targets, sources = np.nonzero((matrices.weights != 0.0).any(axis=0) & inside)
-            weights = matrices.weights[:, targets, sources].T.copy()
-            rows = matrices.weights.sum(axis=2).T
-            felt = [sparse.csr_array(gain.T) for gain in matrices.noise_gain]
+            self._dense(experiment)
         else:
-            graphs = (links.mesh,) if links else graphs
-            keys, place = np.unique(np.concatenate([g.targets * m + g.sources for g in graphs]), return_inverse=True)
-            targets, sources = np.divmod(keys, m)
-            weights = np.zeros((len(keys), len(graphs)))
-            mode = np.repeat(np.arange(len(graphs)), [len(graph.weights) for graph in graphs])
-            weights[place, mode] = dt * np.concatenate([graph.weights for graph in graphs])
-            weights[grounded[targets]] = 0.0
-            if gains.any():
-                rows = np.where(grounded, 0.0, 1.0 - dt * np.where(grounded, 0.0, gains))[:, None]
-            felt = [_felt(gain, grounded, dt) for gain in _process_of(experiment)]
-        if links:
-            order = np.lexsort((sources, targets))  # as in the mesh
-            order = order[np.argsort(links.link_of, kind="stable")]
-            targets, sources, weights = targets[order], sources[order], weights[order]
-        loss, lost = experiment.loss[targets, sources], None
-        if loss.any():
-            lost = np.stack([loss, loss])
-            if noise.burst is not None:
-                lost = np.stack(
-                    [loss / (noise.burst * (1.0 - loss)), np.where(loss > 0.0, 1.0 - 1.0 / noise.burst, 0.0)]
-                )
-        chain = np.ones((1, 1)) if links else experiment.chain.transition(dt)
-        stationary = np.ones(1) if links else experiment.switching_law.stationary
-        return cls(
-            agents=m,
-            consensus=experiment.problem == "consensus",
-            targets=targets,
-            sources=sources,
-            weights=weights,
-            rows=None if rows is None or np.allclose(rows, 1.0, rtol=0.0, atol=1e-15) else rows,
-            gains=felt[:1] if all(abs(felt[0] - gain).sum() == 0.0 for gain in felt[1:]) else felt,
-            backwards=chain.T * stationary / stationary[:, None],
-            stationary=stationary,
-            lost=lost,
-            loss=loss,
-            burst=noise.burst,
-            holds=noise.holds,
-            broadcast=noise.broadcast,
-            link=noise.link,
-            delay=noise.delay,
-            order=turns(experiment),
-            links=links,
+            self._sparse(experiment, (links.mesh,) if links else experiment.graph_list)
+        if links:  # arcs in the order of the links
+            order = np.argsort(links.link_of, kind="stable")
+            self.targets, self.sources, self.weights = self.targets[order], self.sources[order], self.weights[order]
+            self.link_of, self.rates = links.link_of[order], np.stack([links.rise, links.fall])
+            self.first = np.searchsorted(self.link_of, np.arange(len(links.rise) + 1))
+        loss = experiment.loss[self.targets, self.sources]
+        self.lossy = np.flatnonzero(loss)  # arcs on which messages can be lost
+        # (3, lossy, 1) with which probability, after one that was not lost, and after one that was
+        p, burst = loss[self.lossy, None], noise.burst
+        self.losses = np.stack(
+            [p, p, p] if burst is None else [p, p / (burst * (1.0 - p)), 0.0 * p + 1.0 - 1.0 / burst]
         )
+        # The chain of the graphs backwards in time: probability to leave each one, and where to, as sums.
+        chain = np.ones((1, 1)) if links else experiment.chain.transition(dt)
+        self.stationary = np.ones(1) if links else experiment.switching_law.stationary
+        backwards = chain.T * self.stationary / self.stationary[:, None]
+        self.leave = 1.0 - np.diag(backwards)
+        jumps = np.cumsum(backwards * ~np.eye(len(backwards), dtype=np.bool_), axis=1)
+        self.jumps = jumps / np.maximum(jumps[:, -1:], np.finfo(float).tiny)
+        arcs = np.arange(len(self.targets))
+        own, into = (
+            sparse.csr_array((np.ones(len(arcs)), (ends, arcs)), (m, len(arcs)))
+            for ends in (self.targets, self.sources)
+        )
+        self.flow = sparse.csr_array(into - own)  # (m, l) what is used of a message goes from who used it to its sender
+        turn = turns(experiment)
+        self.plain = not (self.delay or self.holds or self.broadcast or self.link or turn is not None)
+        self.products: list[Any] = []  # W^T of every graph (m, m), where nothing else is random
+        if self.plain and not len(self.lossy) and not links and len(chain) <= FEW_GRAPHS:
+            for mode, weights in enumerate(self.weights.T):
+                same = sparse.diags_array(self.rows[:, mode % self.rows.shape[1]])
+                self.products.append(sparse.csr_array(same + self.flow @ sparse.diags_array(weights) @ own.T))
+        if self.plain:
+            return
+        # In real time agents step one after the other: backwards, the last one first.
+        self.ahead, groups = np.zeros(len(arcs), dtype=np.int64), [np.arange(m)]
+        if turn is not None:
+            ranks = np.argsort(turn)
+            self.ahead = (ranks[self.sources] < ranks[self.targets]).astype(np.int64)
+            groups = [np.array([i]) for i in turn[::-1].tolist()]
+        self.groups = []
+        for agents in groups:
+            heard, said = (np.flatnonzero(np.isin(ends, agents)) for ends in (self.targets, self.sources))
+            place = np.searchsorted(agents, self.targets[heard])
+            self.groups.append((agents, heard, said, place, own[agents][:, heard], into[agents][:, said]))
 
+    def _dense(self, experiment: Experiment) -> None:
+        """Of a protocol, or exp(-Z)."""
+        matrices = step_matrices(experiment)
+        arcs = (matrices.weights != 0.0).any(axis=0) & ~np.eye(self.agents, dtype=np.bool_)
+        self.targets, self.sources = np.nonzero(arcs)
+        self.weights = np.ascontiguousarray(matrices.weights[:, self.targets, self.sources].T)
+        self.rows = matrices.weights.sum(axis=2).T
+        self._feel([gain.T for gain in matrices.noise_gain])
 
-def _process_of(experiment: Experiment) -> list[Any]:
-    """F of every graph, as the file has it: a number, a list or a matrix."""
-    process = experiment.noise.process
-    if not isinstance(process, dict):
-        return [process]
-    return [process[graph.name] for graph in experiment.graph_list]
+    def _sparse(self, experiment: Experiment, graphs: Sequence[Graph]) -> None:
+        """Of the built-in law, with these graphs."""
+        m, dt, gains = self.agents, experiment.step_length, experiment.leader_gains
+        keys, place = np.unique(np.concatenate([g.targets * m + g.sources for g in graphs]), return_inverse=True)
+        self.targets, self.sources = np.divmod(keys, m)
+        grounded = np.isinf(gains)
+        self.weights = np.zeros((len(keys), len(graphs)))
+        mode = np.repeat(np.arange(len(graphs)), [len(graph.weights) for graph in graphs])
+        self.weights[place, mode] = dt * np.concatenate([graph.weights for graph in graphs])
+        self.weights[grounded[self.targets]] = 0.0
+        self.rows = np.where(grounded, 0.0, 1.0 - dt * np.where(grounded, 0.0, gains))[:, None]
+        process, free = experiment.noise.process, np.where(grounded, 0.0, math.sqrt(dt))
+        given = [process[graph.name] for graph in experiment.graph_list] if isinstance(process, dict) else [process]
+        forms = [np.asarray(gain, dtype=float) for gain in given]
+        self._feel([(f * free[:, None]).T if f.ndim == 2 else sparse.diags_array(f * free) for f in forms])
 
-
-def _felt(gain: Any, grounded: BoolArray, dt: float) -> sparse.csr_array:
-    """B^T of a noise gain F: sqrt(dt) F without the rows of grounded leaders, transposed."""
-    given, free = np.asarray(gain, dtype=float), np.where(grounded, 0.0, math.sqrt(dt))
-    if given.ndim < 2:
-        return sparse.csr_array(sparse.diags_array(given * free))
-    return sparse.csr_array((given * free[:, None]).T)
+    def _feel(self, gains: Sequence[Any]) -> None:
+        """Take B^T (m, m) of every graph, or of all of them."""
+        self.gains = [sparse.csr_array(gain) for gain in gains]
+        self.squares: FloatArray | None = None  # (m, 1) or (m, n) of B, where it is diagonal
+        if all(gain.nnz == np.count_nonzero(gain.diagonal()) for gain in self.gains):
+            self.squares = np.stack([gain.diagonal() ** 2 for gain in self.gains], axis=1)
 
 
 def _batch(
@@ -339,76 +340,46 @@ class _Walk:
 
     def __init__(self, law: _Law, z: FloatArray, rng: np.random.Generator) -> None:
         self.law, self.steps, self._rng, self._z = law, 0, rng, z
-        m, arcs, count = law.agents, len(law.targets), z.shape[1]
+        count = z.shape[1]
         self._modes: IntArray = np.asarray(rng.choice(len(law.stationary), count, p=law.stationary))
-        self._weights = law.weights if law.weights.shape[1] == 1 else law.weights[:, self._modes]
-        self._leave = 1.0 - np.diag(law.backwards)
-        jumps = np.cumsum(law.backwards * ~np.eye(len(law.backwards), dtype=np.bool_), axis=1)
-        self._jumps = jumps / np.maximum(jumps[:, -1:], np.finfo(float).tiny)
-        self._until = self._held(self._leave[self._modes]) if len(jumps) > 1 else np.full(count, LONGEST)
+        self._until = self._held(law.leave[self._modes])
         self._up = self._flip = np.empty((0, count), dtype=np.int64)
-        if law.links is not None:
-            self._free_links(law.links, count)
-        self._lossy = np.flatnonzero(law.loss)
-        self._lost = np.zeros((arcs, count), dtype=np.bool_)
-        self._lost[self._lossy] = rng.random((len(self._lossy), count)) < law.loss[self._lossy, None]
-        self._chances = None if law.lost is None else law.lost[:, self._lossy, None].astype(np.float32)
-        own, into = (
-            sparse.csr_array((np.ones(arcs), (ends, np.arange(arcs))), (m, arcs)) for ends in (law.targets, law.sources)
-        )
-        self._squares: FloatArray | None = None
-        if all(gain.nnz == np.count_nonzero(gain.diagonal()) for gain in law.gains):
-            self._squares = np.stack([gain.diagonal() ** 2 for gain in law.gains], axis=1)
-        self._plain = not (law.delay or law.holds or law.broadcast or law.link or law.order is not None)
-        self._flow = into - own
-        if self._plain:
-            return
-        # In real time the agents step one after the other: backwards, the last one first.
-        self._ahead = np.zeros(arcs, dtype=np.int64)
-        groups = [np.arange(m)]
-        if law.order is not None:
-            rank = np.argsort(law.order)
-            self._ahead = (rank[law.sources] < rank[law.targets]).astype(np.int64)
-            groups = [np.array([i]) for i in law.order[::-1].tolist()]
-        self._groups = []
-        for agents in groups:
-            heard, said = (np.flatnonzero(np.isin(ends, agents)) for ends in (law.targets, law.sources))
-            self._groups.append((agents, heard, said, own[agents][:, heard], into[agents][:, said]))
+        self._shared = not law.links and (bool(law.products) or law.weights.shape[1] == 1)
+        self._weights = law.weights if self._shared else law.weights[:, self._modes]
+        if law.links:  # each link starts in its stationary law
+            up = rng.random((law.rates.shape[1], count)) * law.rates.sum(axis=0)[:, None] < law.rates[0, :, None]
+            self._up = up.astype(np.int64)
+            self._flip = self._held(law.rates[self._up, np.arange(len(up))[:, None]])
+            self._weights = law.weights * up[law.link_of]
+        self._lost = np.zeros((len(law.targets) if len(law.lossy) else 0, count), dtype=np.bool_)
+        if len(law.lossy):
+            self._lost[law.lossy] = rng.random((len(law.lossy), count)) < law.losses[0]
         # What was used of the messages of d + 2 steps, and what passes on to an earlier message.
-        self._used = np.zeros((law.delay + 2, arcs, count))
-        self._held_back = np.zeros((arcs if law.holds else 0, count))
-
-    def _free_links(self, links: Links, count: int) -> None:
-        """Each link starts in its stationary law, and is then left for a geometric number of steps."""
-        order = np.argsort(links.link_of, kind="stable")
-        self._first = np.searchsorted(links.link_of[order], np.arange(len(links.rise) + 1))
-        self._rates = np.stack([links.rise, links.fall])
-        up = self._rng.random((len(links.rise), count)) * self._rates.sum(axis=0)[:, None] < links.rise[:, None]
-        self._up = up.astype(np.int64)
-        self._flip = self._held(self._rates[self._up, np.arange(len(up))[:, None]])
-        self._weights = self.law.weights * up[links.link_of[order]]
+        self._used = np.zeros((law.delay + 2, 0 if law.plain else len(law.targets), count))
+        self._passed = np.zeros((len(law.targets) if law.holds else 0, count))
 
     def _held(self, leave: FloatArray) -> IntArray:
-        """Numbers of steps until something that happens with these probabilities happens, from the last step on."""
-        held = self._rng.geometric(np.maximum(leave, 1e-18))
-        return np.minimum(held, LONGEST).astype(np.int32) + np.int32(self.steps)
+        """After how many steps something happens that has these probabilities in a step."""
+        held = self._rng.geometric(np.maximum(leave, NEVER))
+        return np.minimum(held, LONGEST).astype(np.int64) + self.steps
 
     def _switch(self) -> None:
         """The graphs one step earlier: a stationary chain of two states is the same backwards."""
+        law = self.law
         if (ends := np.flatnonzero(self._until == self.steps)).size:
-            jumps = self._jumps[self._modes[ends]]
+            jumps = law.jumps[self._modes[ends]]
             self._modes[ends] = new = (self._rng.random((len(ends), 1)) > jumps).sum(axis=1)
-            self._until[ends] = self._held(self._leave[new])
-            if self._weights.shape[1] > 1:
-                self._weights[:, ends] = self.law.weights[:, new]
+            self._until[ends] = self._held(law.leave[new])
+            if not self._shared:
+                self._weights[:, ends] = law.weights[:, new]
         if (ends := np.flatnonzero(self._flip == self.steps)).size:
             link, column = np.divmod(ends, self._flip.shape[1])
             self._up[link, column] ^= 1
             up = self._up[link, column]
-            self._flip[link, column] = self._held(self._rates[up, link])
-            arc, last = self._first[link], self._first[link + 1]
+            self._flip[link, column] = self._held(law.rates[up, link])
+            arc, last = law.first[link], law.first[link + 1]
             while (more := arc < last).any():
-                self._weights[arc[more], column[more]] = self.law.weights[arc[more], 0] * up[more]
+                self._weights[arc[more], column[more]] = law.weights[arc[more], 0] * up[more]
                 arc = arc + 1
 
     def _back(self) -> FloatArray:
@@ -417,52 +388,60 @@ class _Walk:
         if self.steps:
             self._switch()
         self.steps += 1
-        if self._chances is not None:
-            usual, after = self._chances
-            chance = usual if law.burst is None else np.where(self._lost[self._lossy], after, usual)
-            self._lost[self._lossy] = self._rng.random((len(self._lossy), self._z.shape[1]), np.float32) < chance
-        if not self._plain:
+        if len(law.lossy):
+            chance = (
+                law.losses[1] if law.burst is None else np.where(self._lost[law.lossy], law.losses[2], law.losses[1])
+            )
+            self._lost[law.lossy] = self._rng.random((len(law.lossy), self._z.shape[1])) < chance
+        if not law.plain:
             return self._messages()
         terms = self._noise(self._z)
-        flow = self._weights * self._z[law.targets]
-        if self._chances is not None:
-            flow *= ~self._lost
-        if law.rows is not None:
-            self._z *= law.rows if law.rows.shape[1] == 1 else law.rows[:, self._modes]
-        self._z += np.asarray(self._flow @ flow)
+        for mode, product in enumerate(law.products):
+            there = self._modes == mode
+            if there.all():
+                self._z = product @ self._z
+                break
+            if there.any():
+                self._z[:, there] = product @ self._z[:, there]
+        if not law.products:
+            flow = self._weights * self._z[law.targets]
+            if len(law.lossy):
+                flow *= ~self._lost
+            self._z = self._of_graphs(law.rows) * self._z + law.flow @ flow
         return terms
 
     def _messages(self) -> FloatArray:
         """The same with messages that are noisy, late or held, or agents that step one after the other."""
         law, depth, terms = self.law, len(self._used), np.zeros(self._z.shape[1])
-        noisy = np.empty_like(self._z)
-        rows = np.ones((law.agents, 1)) if law.rows is None else law.rows
-        rows = rows if rows.shape[1] == 1 else rows[:, self._modes]
-        for agents, heard, said, own, into in self._groups:
+        noisy, rows = np.empty_like(self._z), self._of_graphs(law.rows)
+        for agents, heard, said, place, own, into in law.groups:
             # The message of the state after this step, which later steps have used.
             message = self._used[(1 - self.steps) % depth, said]
             if law.holds:
-                message += self._held_back[said]
-                self._held_back[said] = message * self._lost[said]
+                message += self._passed[said]
+                self._passed[said] = message * self._lost[said]
                 message *= ~self._lost[said]
             published = into @ message
             terms += law.link**2 * (message**2).sum(axis=0) + law.broadcast**2 * (published**2).sum(axis=0)
             noisy[agents] = z = self._z[agents] + published
-            flow = self._weights[heard] * z[np.searchsorted(agents, law.targets[heard])]
-            if self._chances is not None and not law.holds:
+            flow = self._weights[heard] * z[place]
+            if len(law.lossy) and not law.holds:
                 flow *= ~self._lost[heard]
             self._z[agents] = rows[agents] * z - own @ flow
-            self._used[(self._ahead[heard] - self.steps - law.delay) % depth, heard] = flow
+            self._used[(law.ahead[heard] - self.steps - law.delay) % depth, heard] = flow
         return terms + self._noise(noisy)
+
+    def _of_graphs(self, table: FloatArray) -> FloatArray:
+        """The columns of the present graphs, of a table (m, n); of one (m, 1), the only one."""
+        return table if table.shape[1] == 1 else table[:, self._modes]
 
     def _noise(self, z: FloatArray) -> FloatArray:
         """(C,) |B^T z|^2."""
-        if self._squares is not None:
-            squares = self._squares if self._squares.shape[1] == 1 else self._squares[:, self._modes]
-            return np.asarray(np.einsum("ic,ic->c", z * squares, z))
+        if self.law.squares is not None:
+            return np.asarray(np.einsum("ic,ic->c", z * self._of_graphs(self.law.squares), z))
         terms = np.zeros(z.shape[1])
         for mode, gain in enumerate(self.law.gains):
-            there = self._modes == mode if len(self.law.gains) > 1 else np.ones(len(terms), dtype=np.bool_)
+            there = self._modes == mode if len(self.law.gains) > 1 else slice(None)
             terms[there] = ((gain @ z[:, there]) ** 2).sum(axis=0)
         return terms
 
@@ -477,8 +456,7 @@ class _Walk:
         """Only these vectors go on."""
         if lives.all():
             return
-        for name in ("_z", "_modes", "_until", "_up", "_flip", "_lost", "_used", "_held_back"):
-            if hasattr(self, name):
-                setattr(self, name, getattr(self, name)[..., lives])
-        if self._weights.shape[1] > 1:
+        for name in ("_z", "_modes", "_until", "_up", "_flip", "_lost", "_used", "_passed"):
+            setattr(self, name, getattr(self, name)[..., lives])
+        if not self._shared:
             self._weights = self._weights[:, lives]
