@@ -137,6 +137,7 @@ def test_everything_says_what_it_is(twin: Run) -> None:
         (LINE_RING.leaders(1), ["agents 3", "exhaustive"]),
         (LINE_RING.transient([0, 1]), ["2 times"]),
         (LINE_RING.spectrum([0, 1]), []),
+        (msg_analysis.sampled_prediction(LINE_RING, precision=0.1), ["line_ring", "95 % interval", "samples"]),
         (msg_analysis.sweep(LINE_RING, {"switching.scale": [1.0, 2.0]}), ["switching.scale", "2 points"]),
     ]
     for result, words in results:

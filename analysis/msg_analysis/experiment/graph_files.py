@@ -261,19 +261,21 @@ def read_csv(key: str, file: Path) -> ForeignGraph:
         head[head.index("type")] = ""
         notes = ["`type` is not about directions, so rows are arcs"]
     needed = max(place for place, name in enumerate(head) if name in (*ends, "weight", "type"))
-    pairs, arcs, attributes = [], [], []
+    pairs, arcs, attributes, known = [], [], [], dict[str, str]()
     for line, row in rows:
         place = f"{file}, line {line}: "
         if len(row) <= needed or any(row[len(head) :]):
             shown = place + show(separator.join(row))
             raise GraphError(key, shown, f"expected {len(head)} values as in the header", "correct the line")
         cells = dict(zip(head, row, strict=False))
-        source, target = (node_name(f"{key}: {place}{end}", cells[end], "correct the line") for end in ends)
+        for end in ends:
+            if (node := cells[end]) not in known:
+                known[node] = node_name(f"{key}: {place}{end}", node, "correct the line")
         kind = cells.get("type", "").lower() or "directed"
         if kind not in ("directed", "undirected"):
             shown = f"{place}type {show(cells['type'])}"
             raise GraphError(key, shown, "expected directed or undirected", "correct the line")
-        pairs.append((source, target))
+        pairs.append((known[cells[ends[0]]], known[cells[ends[1]]]))
         arcs.append(kind == "directed")
         others = {n: cell for n, cell in zip(names, row, strict=False) if n.lower() not in (*ends, "type")}
         attributes.append((place, others))

@@ -208,13 +208,15 @@ def link_problems(
     seen: set[tuple[int, int]] = set()
     for i, j, _ in links(spec, agents):
         pair = (i, j) if kind == "arcs" else (min(i, j), max(i, j))
+        if i != j and pair not in seen:
+            seen.add(pair)
+            continue
         ends = show([i, j] if names is None else [names[i - 1], names[j - 1]])
         if i == j:
             who = agent_text(i, names)
             found.append(problem(key, ends, f"{who} is linked with itself", "remove the self-loop"))
-        elif pair in seen:
+        else:
             twice.append(ends)
-        seen.add(pair)
     if len(twice) > MOST_TWICE:
         twice = [f"{twice[0]} and {len(twice) - 1} more"]
     text = "arc" if kind == "arcs" else "edge (edges have no direction)"

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,8 +105,9 @@ class Graph:
     @property
     def symmetric(self) -> bool:
         """Whether the graph is undirected."""
-        adjacency = self.adjacency
-        return bool(np.array_equal(adjacency, adjacency.T))
+        across = np.lexsort((self.targets, self.sources))
+        ends = np.array_equal(self.sources[across], self.targets), np.array_equal(self.targets[across], self.sources)
+        return all(ends) and np.array_equal(self.weights[across], self.weights)
 
     @property
     def arcs(self) -> list[tuple[int, int, float]]:
@@ -119,3 +120,22 @@ class Graph:
         """(i, j, weight), i < j, of every pair that listen to each other with equal weight, agents from 1."""
         arcs = set(self.arcs)
         return [(s, t, w) for s, t, w in self.arcs if s < t and (t, s, w) in arcs]
+
+
+def reach(graphs: Sequence[Graph], sources: list[int] | None) -> tuple[list[int], BoolArray]:
+    """Agents, and (m,) who hears from one of them in the union, sparse; without ``sources`` those whom nobody leads."""
+    from scipy.sparse import coo_array, csgraph  # here, since every agent's process would wait for it
+
+    targets, heard = (np.concatenate([getattr(graph, ends) for graph in graphs]) for ends in ("targets", "sources"))
+    leads = coo_array((np.ones(len(targets)), (heard, targets)), (graphs[0].agents,) * 2).tocsr()
+    if sources is None:
+        _, part = csgraph.connected_components(leads, connection="strong")
+        led = part[targets[part[targets] != part[heard]]]
+        sizes = np.bincount(part)
+        sizes[led] = 0
+        sources = np.flatnonzero(part == sizes.argmax()).tolist()
+    reached = np.zeros(graphs[0].agents, dtype=np.bool_)
+    for agent in sources:
+        if not reached[agent]:
+            reached[csgraph.breadth_first_order(leads, agent, return_predecessors=False)] = True
+    return sources, reached

@@ -190,6 +190,7 @@ class Sections:
         self.switching: MarkovChain | Schedule | None = None
         self.noise_gain: FloatArray | None = None
         self.loss: FloatArray | None = None
+        self._sparse = False  # no matrices, which do not fit in memory
         self._recorded = recorded  # the protocol of a recorded run need not be installed
         self.protocol: ChosenProtocol | None = None
 
@@ -218,20 +219,21 @@ class Sections:
             self.problems += found
         if self.agents is None or not self._fits(run if whole_steps else None):
             return
-        if self.values["noise"]:
+        if self.values["noise"] and not self._sparse:
             names = list(self.values["graphs"])
             self.noise_gain, found = validation.noise_gain_of(self.values["noise"], names, self.agents)
             self.problems += found
         self._build_graphs()
         if not self.graphs or not leaders_good:
             return
-        self.problems += validation.connection_problems(self.graphs, leaders, self.values["names"])
-        if self.values["noise"] and time:
+        names, sparse = self.values["names"], self._sparse
+        self.problems += validation.connection_problems(self.graphs, leaders, names, sparse=sparse)
+        if self.values["noise"] and time and not sparse:
             self._resolve_losses(self.values["noise"], time)
         built_in = "protocol" in self.known and self.values["protocol"] is None
         if time == "continuous" and run and built_in:
             gains = validation.leader_gains(leaders, self.agents)
-            self.problems += validation.stability_problems(self.graphs, gains, run.dt)
+            self.problems += validation.stability_problems(self.graphs, gains, run.dt, sparse=sparse)
         if self.values["switching"] and self.values["switching"].links and time and run and not self.problems:
             self._draw_links(self.values["switching"], time, run)
 
@@ -477,12 +479,24 @@ class Sections:
         steps, replicas = (run.steps, run.replicas) if run else (1, 1)
         noise: NoiseSpec | None = self.values["noise"]
         delay, truth = (noise.delay, noise.broadcast > 0) if noise else (0, False)
-        switching, graphs = self.values["switching"], len(self.values["graphs"])
+        switching, modes = self.values["switching"], len(self.values["graphs"])
         if switching and switching.schedule and not (noise and isinstance(noise.process, dict)):
-            graphs = 1  # matrices of all are made by some commands only
-        found = validation.memory_problems(self.agents, graphs, steps, replicas, delay, truth)
+            modes = 1  # matrices of all are made by some commands only
+        found = validation.memory_problems(self.agents, modes, steps, replicas, delay, truth)
+        states = validation.memory_problems(self.agents, 0, steps, replicas, delay, truth)
+        matrices = validation.memory_problems(self.agents, modes, -1, replicas, delay)
+        if matrices and not states and noise and self._does_without_matrices(noise):
+            self._sparse, found = True, []
+            self.noise_gain = np.broadcast_to(np.nan, (modes, self.agents, self.agents))
+            self.loss = np.broadcast_to(noise.loss.default, (self.agents, self.agents))
         self.problems += found
         return not found
+
+    def _does_without_matrices(self, noise: NoiseSpec) -> bool:
+        """Whether nothing but the number of agents needs matrices, so that errors can be sampled."""
+        sizes = ("by graph",) if isinstance(noise.process, dict) else np.shape(noise.process)
+        plain = sizes in ((), (self.agents,)) and not (noise.loss.edges or noise.loss.arcs or noise.delay)
+        return plain and self.values["time"] == "continuous" and self.values["protocol"] is None
 
     def _build_graphs(self) -> None:
         assert self.agents is not None

@@ -14,7 +14,7 @@ import numpy as np
 from msg_analysis.common.arrays import BoolArray, FloatArray
 from msg_analysis.common.resources import available_memory
 from msg_analysis.common.text import agent_name, agent_text, amount, listed
-from msg_analysis.experiment.graphs import Graph, hops, widest_reaching
+from msg_analysis.experiment.graphs import Graph, hops, reach, widest_reaching
 from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
 from msg_analysis.experiment.problems import problem, show
 from msg_analysis.experiment.spec import LeadersSpec, NoiseGain, NoiseSpec, Purpose, RunSpec, SwitchingSpec
@@ -212,14 +212,19 @@ def _ergodicity_problems(chain: MarkovChain, names: Sequence[str], key: str) -> 
 
 
 def connection_problems(
-    graphs: Sequence[Graph], leaders: LeadersSpec | None, names: Sequence[str] | None = None
+    graphs: Sequence[Graph], leaders: LeadersSpec | None, names: Sequence[str] | None = None, *, sparse: bool = False
 ) -> list[str]:
     """Agents that are not connected in the union of all graphs; ``leaders`` is None in consensus."""
     # Mean-square stability of the disagreement (tracking: of the deviation from the reference) needs a union in which
     # some agent (tracking: the leaders together) reaches every other one.
-    union = union_of(graphs).T
-    sources = widest_reaching(union) if leaders is None else [label - 1 for label in leaders.agents]
-    lost = np.flatnonzero(hops(union, sources) < 0).tolist()
+    sources = None if leaders is None else [label - 1 for label in leaders.agents]
+    if sparse:
+        sources, reached = reach(graphs, sources)
+    else:
+        union = union_of(graphs).T
+        sources = widest_reaching(union) if sources is None else sources
+        reached = hops(union, sources) >= 0
+    lost = np.flatnonzero(~reached).tolist()
     if not lost:
         return []
     start = "a leader" if leaders is not None else f"agent{_list(sources, names)}"
@@ -337,13 +342,15 @@ def stability_limit(graph: Graph, gains: FloatArray) -> float:
     return float(np.min(2.0 * (values.real / size) / size, initial=np.inf))
 
 
-def stability_problems(graphs: Iterable[Graph], gains: FloatArray, dt: float) -> list[str]:
+def stability_problems(graphs: Iterable[Graph], gains: FloatArray, dt: float, *, sparse: bool = False) -> list[str]:
     """Graphs for which an Euler step of dt is unstable; ``gains`` (m,) kappa, inf for grounded leaders."""
     found = []
     for graph in graphs:
-        if dt * (graph.degrees + gains)[np.isfinite(gains)].max(initial=0.0) < 1.0:
+        pull = (graph.degrees + gains)[np.isfinite(gains)].max(initial=0.0)
+        if dt * pull < 1.0:
             continue  # no agent overshoots (Gershgorin)
-        limit = stability_limit(graph, gains)
+        # Without matrices no eigenvalues are known, and steps with which an agent overshoots are refused.
+        limit = 1.0 / pull if sparse else stability_limit(graph, gains)
         if dt >= limit:
             wanted = f"expected less than {limit:.6g}, the stability limit of graph {graph.name}"
             found.append(problem("run.dt", dt, wanted, "lower run.dt"))
@@ -411,6 +418,16 @@ def matrix_problems(experiment: Experiment) -> list[str]:
     return memory_problems(experiment.agents, *size) if experiment.schedule else []
 
 
+def needs_sampling(experiment: Experiment) -> list[str]:
+    """Matrices that do not fit in memory: only the sampled prediction does without."""
+    if np.isfinite(experiment.noise_gain[0, 0, 0]):
+        return []
+    agents, modes = experiment.agents, len(experiment.graph_list)
+    text = f"{modes} graphs of {agents} agents need {amount(memory_needed(agents, modes, 0, 0)[1])}"
+    wanted = "expected matrices that fit in memory; only `predict` does without, by sampling"
+    return [problem("graphs", text, wanted, "lower the number of agents or graphs")]
+
+
 def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
     """(m,) kappa; 0 for followers, inf for grounded leaders."""
     gains = np.zeros(agents)
@@ -421,7 +438,7 @@ def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
 
 def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
     """What the experiment asks for that this version cannot do, one line each."""
-    lines = too_large_to_predict(experiment) if purpose != "run" else matrix_problems(experiment)
+    lines = too_large_to_predict(experiment) if purpose != "run" else needs_sampling(experiment) or matrix_problems(experiment)
     states = 2.0 ** len(experiment.links or ())
     if purpose != "run" and states > MOST_STATES:
         wanted = f"has no exact prediction: 2^{len(experiment.links or ())} graphs, expected at most {MOST_STATES}"
@@ -442,7 +459,9 @@ def unpredictable(experiment: Experiment) -> str | None:
 
 def too_large_to_predict(experiment: Experiment) -> list[str]:
     """What makes the exact prediction too large, one line each."""
-    lines, noise, graphs, gains = [], experiment.noise, experiment.graph_list, experiment.leader_gains
+    if lines := needs_sampling(experiment):
+        return lines
+    noise, graphs, gains = experiment.noise, experiment.graph_list, experiment.leader_gains
     links = heard_links(graphs, experiment.time) & np.isfinite(gains)[:, None]
     lossy = int((links & (experiment.loss > 0.0)).sum())
     if noise.burst is not None and len(graphs) * 2.0**lossy > MOST_STATES:

@@ -224,6 +224,8 @@ def _mean_squares(document: dict[str, Any]) -> tuple[str, str]:
 
 def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     """The document of ``info EXPERIMENT``, also of one that cannot be run; None: infinite or not known."""
+    if validation.needs_sampling(experiment):
+        experiment.require_available()
     document = experiment.to_document()
     switching, schedule = experiment.switching_law, experiment.schedule
     states, matrices = validation.memory_needed(

@@ -26,11 +26,11 @@ from scipy import sparse
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.common.resources import tell
-from msg_analysis.common.text import finite
+from msg_analysis.common.text import agent_text, finite, markdown_table, number_text
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.validation import MOST_STATES, too_large_to_predict
-from msg_analysis.model.step_model import StepLaw, step_law, step_matrices, turns
+from msg_analysis.model.step_model import step_law, step_matrices, turns
 
 if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
@@ -56,7 +56,7 @@ class Links(Protocol):
     fall: FloatArray  # (E,) and that one that is up goes down
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class SampledPrediction:
     """The steady errors of the run's steps, sampled.
 
@@ -85,16 +85,23 @@ class SampledPrediction:
     seed: int
     seconds: float
 
-    @property
-    def law(self) -> StepLaw:
-        """Whether the agents step all at once, or one after the other."""
-        return step_law(self.experiment)
+    def __repr__(self) -> str:
+        low, high = self.interval
+        text = f"system error {self.system_error:.6g}, 95 % interval {low:.6g} to {high:.6g}, {self.paths} samples"
+        return f"<SampledPrediction of {self.experiment.name!r}: {text}>"
+
+    def _repr_markdown_(self) -> str:
+        rows = [("**system**", number_text(self.system_error), *map(number_text, self.interval))]
+        for i in np.flatnonzero(~np.isnan(self.node_errors)).tolist():
+            numbers = self.node_errors[i], *self.node_intervals[i]
+            rows.append((agent_text(i + 1, self.experiment.names), *map(number_text, numbers)))
+        return "Sampled errors, steady state\n\n" + markdown_table(("", "mean-square error", "from", "to (95 %)"), rows)
 
     def to_json(self) -> dict[str, Any]:
         """The document of ``msg-analysis predict --json``, with None for what is not sampled."""
         error, nodes = self.system_error, self.node_errors
         law = {
-            "law": self.law,
+            "law": step_law(self.experiment),
             "method": "sampled",
             "system_error": error,
             "interval": list(self.interval),

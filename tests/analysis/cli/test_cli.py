@@ -71,6 +71,27 @@ def test_bad_files_are_errors_of_the_user(command: str, tmp_path: Path) -> None:
     assert "did you mean 'seed'?" in result.stderr
 
 
+def test_predict_samples() -> None:
+    """Where it is asked to, and where the exact prediction is too large: ten channels with bursts."""
+    named = call("predict", LINE_RING, "--precision", "5 %", "--agents", "1,3", "--seed", "2", "--json")
+    law = json.loads(named.stdout)["emulated"]
+    low, high = law["interval"]
+    assert (law["method"], law["seed"], low < law["system_error"] < high) == ("sampled", 2, True)
+    assert [error is None for error in law["node_errors"]] == [False, True, False, True, True]
+    large = ("--set", "noise.loss=0.2", "--set", "noise.burst=5")
+    text = call("predict", LINE_RING, *large, "--within", "2s").stdout
+    assert "sampled" in text
+    assert text.count(" .. ") == 6
+    for words, error in (
+        (("--precision", "2"), "--precision 2: expected a share above 0, below 1"),
+        (("--within", "soon"), "--within soon: expected a number above 0 with s, min, h or d"),
+        (("--agents", "1,9"), "agents: 9: expected numbers from 1 to 5"),
+        (("--from", "3", "--seed", "1"), "--from 3: expected with a schedule"),
+    ):
+        refused = call("predict", LINE_RING, *words)
+        assert (refused.exit_code, refused.stderr.startswith(f"error: {error}")) == (2, True)
+
+
 def test_real_time_is_predicted_in_turn() -> None:
     assert "sequential steps" in call("predict", LINE_RING, "--set", "run.pace=realtime").stdout
     for pace, law in (("realtime", "sequential"), ("lockstep", "synchronous")):

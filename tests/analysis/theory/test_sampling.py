@@ -9,7 +9,11 @@ import pytest
 
 from experiments import CORRELATED, TRACKING, Experiment, directed, five, line_ring, pieces
 from msg_analysis.errors import InputError, NotAvailableError
+from msg_analysis.experiment import validation
 from msg_analysis.experiment.graphs import Graph
+from msg_analysis.experiment.problems import ExperimentError
+from msg_analysis.report.documents import describe_experiment
+from msg_analysis.theory import sampling
 from msg_analysis.theory.sampling import SampledPrediction, sampled_prediction
 
 HELD = {"process": 1.0, "loss": 0.4, "on_loss": "hold", "broadcast": 0.7, "link": 0.5}
@@ -101,6 +105,31 @@ def test_the_same_for_the_same_seed_whatever_the_time():
     first, again = (sampled_prediction(five(), precision=0.05, within=within, seed=4) for within in (60.0, 1000.0))
     assert first.to_json()["emulated"] | {"seconds": 0} == again.to_json()["emulated"] | {"seconds": 0}
     assert sampled_prediction(five(), precision=0.05, seed=5).system_error != first.system_error
+
+
+def test_walks_made_one_at_a_time(monkeypatch: pytest.MonkeyPatch):
+    """As in large networks; fixed seed, |z| < 4 fails once in 16,000. Losses: arcs, not the matrices of the graphs."""
+    monkeypatch.setattr(sampling, "MOST_TOGETHER", 1)
+    for law in (five(), five(noise={"loss": 0.2})):
+        sampled = sampled_prediction(law, precision=0.1, agents=[1], seed=1)
+        assert abs(z_of(sampled, law.predict().emulated.system_error)) < 4.0
+
+
+def test_without_matrices(monkeypatch: pytest.MonkeyPatch):
+    """Where these do not fit in memory, experiments load, and errors are sampled: the same ones."""
+    known = sampled_prediction(five(noise={"process": [1, 2, 1, 1, 1], "loss": 0.2}), precision=0.1)
+    monkeypatch.setattr(validation, "available_memory", lambda: 3000)
+    large = five(noise={"process": [1, 2, 1, 1, 1], "loss": 0.2}, run={"duration": 1})
+    assert large.graph_list[0].symmetric
+    assert sampled_prediction(large, precision=0.1).interval == known.interval
+    for refused in (large.predict, large.simulate, lambda: large.leaders(1), lambda: describe_experiment(large)):
+        with pytest.raises(NotAvailableError, match=r"graphs: 2 graphs of 5 agents need 3\.2 kB"):
+            refused()
+    apart = {"a": {"arcs": [[1, 2], [2, 3], [4, 3], [5, 4]]}, "b": {"arcs": [[2, 1]]}}
+    with pytest.raises(ExperimentError, match=r"agents 4, 5 cannot be reached from agents 1, 2"):
+        five(graphs=apart, switching={"rates": {"a": {"b": 1}, "b": {"a": 1}}}, run={"duration": 1})
+    with pytest.raises(ExperimentError, match=r"run.dt: 0.5: expected less than 0.5"):
+        five(run={"duration": 1, "dt": 0.5})
 
 
 def test_single_agents():
