@@ -142,6 +142,7 @@ bench: setup ## Measure speed side by side with the bare middleware, other solve
 	$(BIN)/python benchmarks/dense.py
 	$(BIN)/python benchmarks/precision.py
 	$(BIN)/python benchmarks/moments.py
+	$(BIN)/python benchmarks/sampling.py
 	$(BIN)/python benchmarks/leaders.py
 	$(BIN)/python benchmarks/reading.py
 	$(BIN)/python benchmarks/sweep.py
