@@ -41,8 +41,9 @@ FEWEST = 16  # samples before an interval is believed
 NUMBERS = 2**17  # on arcs, that walks which are made together have at a time: they fit in a cache
 LEAST_TOGETHER, MOST_TOGETHER = 4, 512
 FEW_GRAPHS = 8  # whose matrices are multiplied, and not the arcs of each walk
-BLOCK = 16  # steps of a walk before it may end; later a quarter of those that it has made
+BLOCK = 16  # steps of a walk before it may end, and twice the delay; later a quarter of those that it has made
 SMALL = 0.03  # of the sum so far, terms of a block: then the walk may end
+NOTHING = 1e-30  # of |z|^2, is rounding
 GROWTH = 1e6  # of |z|^2, beyond what weights that are not negative can do: the steps are unstable
 LONGEST, NEVER = 2**60, 1e-18  # steps, and probability in a step, that are not told from infinity and 0
 
@@ -242,10 +243,10 @@ class _Law:
         # The chain of the graphs backwards in time: probability to leave each one, and where to, as sums.
         chain = np.ones((1, 1)) if links else experiment.chain.transition(dt)
         self.stationary = np.ones(1) if links else experiment.switching_law.stationary
-        backwards = chain.T * self.stationary / self.stationary[:, None]
-        self.leave = 1.0 - np.diag(backwards)
-        jumps = np.cumsum(backwards * ~np.eye(len(backwards), dtype=np.bool_), axis=1)
-        self.jumps = jumps / np.maximum(jumps[:, -1:], np.finfo(float).tiny)
+        jumps = chain.T * self.stationary / self.stationary[:, None]
+        np.fill_diagonal(jumps, 0.0)
+        self.leave = jumps.sum(axis=1)
+        self.jumps = np.cumsum(jumps, axis=1) / np.maximum(self.leave, NEVER)[:, None]
         arcs = np.arange(len(self.targets))
         own, into = (
             sparse.csr_array((np.ones(len(arcs)), (ends, arcs)), (m, len(arcs)))
@@ -302,8 +303,11 @@ class _Law:
         """Take B^T (m, m) of every graph, or of all of them."""
         self.gains = [sparse.csr_array(gain) for gain in gains]
         self.squares: FloatArray | None = None  # (m, 1) or (m, n) of B, where it is diagonal
-        if all(gain.nnz == np.count_nonzero(gain.diagonal()) for gain in self.gains):
+        if all(gain.count_nonzero() == np.count_nonzero(gain.diagonal()) for gain in self.gains):
             self.squares = np.stack([gain.diagonal() ** 2 for gain in self.gains], axis=1)
+        on_air = (self.broadcast**2 + self.link**2) * (self.weights**2).sum() / self.weights.shape[1]
+        process = np.mean([(gain.data**2).sum() for gain in self.gains])
+        self.noise = float(process + on_air) / self.agents  # of an agent in a step, in the mean
 
 
 def _batch(
@@ -321,21 +325,21 @@ def _batch(
     total, counts, number = np.zeros(rounds * width), np.ones(rounds * width), np.arange(rounds * width)
     with np.errstate(over="ignore", invalid="ignore"):
         while number.size:
-            terms, size = walk.block(max(BLOCK, walk.steps // 4))
+            steps = max(BLOCK + 2 * law.delay, walk.steps // 4)
+            terms, size = walk.block(steps, deadline)
+            if time.monotonic() > deadline:
+                return None
             if not (size <= GROWTH * m * first[number]).all():
                 raise InputError(
                     "second moments: a walk backwards through the steps has grown a million times: the steps are "
                     "unstable, there is no steady state: lower run.dt"
                 )
-            if time.monotonic() > deadline:
-                return None
-            terms *= counts
-            total[number] += terms
-            # Without noise so far, a walk ends where nothing of it is left.
-            heard = total[number] > 0.0
-            chance = np.where(heard, terms / np.where(heard, SMALL * total[number], 1.0), size > 1e-30 * first[number])
-            lives = rng.random(len(number)) < chance
-            counts = (counts / np.clip(chance, 1e-300, 1.0))[lives]
+            total[number] += counts * terms
+            # Where this graph has no noise, or not where z is, terms that are zero are not the last ones.
+            ahead = counts * np.maximum(terms, law.noise * size * steps)
+            chance = np.divide(ahead, SMALL * total[number], out=np.ones(len(number)), where=total[number] > 0.0)
+            lives = (rng.random(len(number)) < chance) & (size > NOTHING * first[number])
+            counts = (counts / np.clip(chance, np.finfo(float).tiny, 1.0))[lives]
             number = number[lives]
             walk.keep(lives)
     table = total.reshape(rounds, width)
@@ -452,12 +456,14 @@ class _Walk:
             terms[there] = ((gain @ z[:, there]) ** 2).sum(axis=0)
         return terms
 
-    def block(self, steps: int) -> tuple[FloatArray, FloatArray]:
-        """(C,) terms of the sum over these steps, and |z|^2 after them."""
+    def block(self, steps: int, deadline: float) -> tuple[FloatArray, FloatArray]:
+        """(C,) terms of the sum over these steps, and |z|^2 after them, of what messages carry, too."""
         terms = np.zeros(self._z.shape[1])
         for _ in range(steps):
             terms += self._back()
-        return terms, np.einsum("ic,ic->c", self._z, self._z)
+            if time.monotonic() > deadline:
+                break
+        return terms, (self._z**2).sum(axis=0) + (self._used**2).sum(axis=(0, 1)) + (self._passed**2).sum(axis=0)
 
     def keep(self, lives: BoolArray) -> None:
         """Only these vectors go on."""
