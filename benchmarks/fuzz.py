@@ -33,7 +33,7 @@ from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import validation
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.experiment.validation import unavailable
+from msg_analysis.experiment.limits import unavailable
 from msg_analysis.inference.pool import compare
 from msg_analysis.report.documents import describe_bag, describe_experiment
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.text import listed, markdown_table, number_text
 from msg_analysis.errors import NotAvailableError
-from msg_analysis.experiment import protocols, validation
+from msg_analysis.experiment import limits, protocols, validation
 from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.links import IndependentLinks, LinkSchedule, expanded
@@ -174,7 +174,7 @@ class Experiment(Variants):
         bound, found = protocols.bind(self.protocol, network, self.run, self.names, recorded)
         experiment = replace(self, protocol=bound)
         size = 1 if self.schedule else len(self.graph_list), self.steps, experiment.width
-        found += validation.memory_problems(self.agents, *size, 0, experiment.truth)
+        found += limits.memory_problems(self.agents, *size, 0, experiment.truth)
         if found:
             raise ExperimentError(self.source, found)
         return experiment
@@ -400,7 +400,7 @@ class Experiment(Variants):
         NotAvailableError
             lists it
         """
-        lines = validation.unavailable(self, purpose)
+        lines = limits.unavailable(self, purpose)
         if lines and self.protocol and lines == self.protocol.unavailable(purpose):
             raise NotAvailableError(f"{self.source}: {lines[0]}")
         if lines:

@@ -7,19 +7,19 @@ from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.common.files import SAFE_LOADER, load_yaml, read_text
+from msg_analysis.common.files import StrictLoader, load_yaml, read_text
 from msg_analysis.common.text import listed
 from msg_analysis.errors import InputError
-from msg_analysis.experiment import graph_files, graph_sources, protocols, traces, validation
+from msg_analysis.experiment import graph_files, graph_sources, limits, protocols, traces, validation
 from msg_analysis.experiment.graph_files import ForeignGraph, GraphError
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.links import links_of
@@ -27,44 +27,9 @@ from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
 from msg_analysis.experiment.problems import WEIGHT, problem, show, translate
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
 from msg_analysis.experiment.spec import BESIDE, ExperimentSpec, GraphSpec, NoiseSpec, RunSpec, SwitchingSpec
+from msg_analysis.experiment.values import LossSpec, RateSpec
 
-
-class _StrictLoader(SAFE_LOADER):  # type: ignore[misc]  # one of two classes: see there
-    """The safe loader with the scalars of YAML 1.2 (1e-3 is a number, not a text), without duplicate keys."""
-
-    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 (of PyYAML)
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.tag != "tag:yaml.org,2002:merge":
-                if key.value in seen:
-                    text = f"key '{key.value}' appears twice: remove one"
-                    raise yaml.constructor.ConstructorError(None, None, text, key.start_mark)
-                seen.add(key.value)
-        return dict(super().construct_mapping(node, deep))
-
-
-for _tag, _pattern, _first in (
-    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
-    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
-    ("int", r"[-+]?[0-9]+", list("-+0123456789")),
-    (
-        "float",
-        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-        list("-+.0123456789"),
-    ),
-    ("merge", r"<<", ["<"]),
-):
-    _StrictLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), _first)
-
-
-def _construct_int(loader: _StrictLoader, node: yaml.ScalarNode) -> int:
-    """Decimal, also with leading zeros (octal in YAML 1.1)."""
-    return int(loader.construct_scalar(node))
-
-
-_StrictLoader.add_constructor("tag:yaml.org,2002:int", _construct_int)
+Values = TypeVar("Values", LossSpec, RateSpec)
 
 _BAG_FILES = ("metadata.yaml", "*.mcap", "*.mcap.zstd", "*.db3", "*.db3.zstd")
 _BAG_STARTS = (b"\x89MCAP0\r\n", b"SQLite format 3\x00")
@@ -139,7 +104,7 @@ def read_yaml(path: Path) -> Any:
 def parse_yaml(text: str, source: str) -> Any:
     """The content of a text in YAML (or JSON); errors as of ``read_yaml``, ``source`` in the place of the file."""
     try:
-        return load_yaml(text, _StrictLoader)
+        return load_yaml(text, StrictLoader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
@@ -241,17 +206,9 @@ class Sections:
         """The graphs of a run whose links switch by themselves, from the seed, in place of the one with all links."""
         assert switching.links is not None
         assert self.noise_gain is not None
-        values = {}
-        for kind in ("up", "down"):
-            given = getattr(switching.links, kind)
-            found = {
-                ends: [
-                    (*(self._number(f"switching.links.{kind}.{ends}", agent) for agent in (i, j)), value)
-                    for i, j, value in getattr(given, ends)
-                ]
-                for ends in ("edges", "arcs")
-            }
-            values[kind] = given.model_copy(update=found)
+        values = {
+            kind: self._numbered(f"switching.links.{kind}", getattr(switching.links, kind)) for kind in ("up", "down")
+        }
         if self.problems:
             return
         spec = switching.links.model_copy(update=values)
@@ -455,17 +412,21 @@ class Sections:
                 values[number - 1] = value
         self.values["run"] = run.model_copy(update={"start": values})
 
+    def _numbered(self, key: str, given: Values) -> Values:
+        """Numbers instead of names of agents in values by link."""
+        links: dict[str, Any] = {}
+        for kind in ("edges", "arcs"):
+            for i, j, value in getattr(given, kind):
+                place = f"{key}.{kind}"
+                links.setdefault(kind, []).append((self._number(place, i), self._number(place, j), value))
+        return given.model_copy(update=links)
+
     def _resolve_losses(self, noise: NoiseSpec, time: Time) -> None:
         """Numbers instead of names in ``noise.loss``, and the probability of every link."""
         before = len(self.problems)
-        links = {
-            kind: [(*(self._number(f"noise.loss.{kind}", agent) for agent in (i, j)), p) for i, j, p in given]
-            for kind in ("edges", "arcs")
-            if (given := getattr(noise.loss, kind))
-        }
+        loss = self._numbered("noise.loss", noise.loss)
         if len(self.problems) > before:
             return
-        loss = noise.loss.model_copy(update=links)
         self.values["noise"] = noise.model_copy(update={"loss": loss})
         self.loss, found = validation.loss_matrix(loss, self.graphs, time, self.values["names"])
         if noise.whole_link and not found:
@@ -482,9 +443,9 @@ class Sections:
         switching, modes = self.values["switching"], len(self.values["graphs"])
         if switching and switching.schedule and not (noise and isinstance(noise.process, dict)):
             modes = 1  # matrices of all are made by some commands only
-        found = validation.memory_problems(self.agents, modes, steps, replicas, delay, truth)
-        states = validation.memory_problems(self.agents, 0, steps, replicas, delay, truth)
-        matrices = validation.memory_problems(self.agents, modes, -1, replicas, delay)
+        found = limits.memory_problems(self.agents, modes, steps, replicas, delay, truth)
+        states = limits.memory_problems(self.agents, 0, steps, replicas, delay, truth)
+        matrices = limits.memory_problems(self.agents, modes, -1, replicas, delay)
         if matrices and not states and noise and self._does_without_matrices(noise):
             self._sparse, found = True, []
             self.noise_gain = np.broadcast_to(np.nan, (modes, self.agents, self.agents))

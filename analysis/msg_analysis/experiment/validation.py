@@ -12,21 +12,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from msg_analysis.common.arrays import BoolArray, FloatArray
-from msg_analysis.common.resources import available_memory
-from msg_analysis.common.text import agent_name, agent_text, amount, listed
+from msg_analysis.common.text import agent_name, agent_text, listed
 from msg_analysis.experiment.graphs import Graph, hops, reach, widest_reaching
 from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
 from msg_analysis.experiment.problems import problem, show
-from msg_analysis.experiment.spec import LeadersSpec, NoiseGain, NoiseSpec, Purpose, RunSpec, SwitchingSpec
+from msg_analysis.experiment.spec import LeadersSpec, NoiseGain, NoiseSpec, RunSpec, SwitchingSpec
 from msg_analysis.experiment.values import LossSpec
 
 if TYPE_CHECKING:
-    from msg_analysis.experiment.experiment import Experiment
+    pass
 
-MOST_STATES = 512
-"""Of graph and links together, in a prediction with losses in bursts."""
-MOST_VALUES = 1500
-"""That agents keep from step to step, in a prediction: the last ones heard, and those that a delay makes older."""
 SUM_TOLERANCE = 1e-9
 STEP_TOLERANCE = 1e-9
 MOST_STEPS = 1e15
@@ -383,102 +378,12 @@ def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
     return found
 
 
-_MATRICES_PER_GRAPH = 8  # adjacency, W, its coupling, F, B, N, the variance of loss, and the product that makes N
-
-
-def memory_needed(
-    agents: int, modes: int, steps: int, replicas: int, delay: int = 0, truth: bool = False
-) -> tuple[int, int]:
-    """Bytes for the states of a run, and for the matrices of all graphs; ``replicas``: numbers in an agent's state."""
-    # A delay [steps] makes the matrices larger. With truth, states are kept twice: as they are and as published.
-    states = (steps + 1) * agents * replicas * 8 * (2 if truth else 1)
-    return states, _MATRICES_PER_GRAPH * modes * (agents * (delay + 1)) ** 2 * 8
-
-
-def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: int, truth: bool = False) -> list[str]:
-    """Problems if states and matrices do not fit in memory; arguments as in ``memory_needed``."""
-    available = available_memory()
-    states, matrices = memory_needed(agents, modes, steps, replicas, delay, truth)
-    if states + matrices <= available:
-        return []
-    room = f"expected at most {amount(available)}, the memory available"
-    if matrices > states:
-        if delay:
-            text = f"{delay} steps with {modes} graphs of {agents} agents need {amount(matrices)}"
-            return [problem("noise.delay", text, room, "lower the delay, or the number of agents or graphs")]
-        text = f"{modes} graphs of {agents} agents need {amount(matrices)}"
-        return [problem("graphs", text, room, "lower the number of agents or graphs")]
-    text = f"{steps} steps of {agents} agents with {replicas} replicas need {amount(states)}"
-    return [problem("run", text, room, "lower run.duration or run.replicas, or raise run.dt")]
-
-
-def matrix_problems(experiment: Experiment) -> list[str]:
-    """The same of an experiment with a schedule, which may have more graphs than matrices fit in memory."""
-    size = len(experiment.graph_list), experiment.steps, experiment.width, experiment.noise.delay, experiment.truth
-    return memory_problems(experiment.agents, *size) if experiment.schedule else []
-
-
-def needs_sampling(experiment: Experiment) -> list[str]:
-    """Matrices that do not fit in memory: only the sampled prediction does without."""
-    if np.isfinite(experiment.noise_gain[0, 0, 0]):
-        return []
-    agents, modes = experiment.agents, len(experiment.graph_list)
-    text = f"{modes} graphs of {agents} agents need {amount(memory_needed(agents, modes, 0, 0)[1])}"
-    wanted = "expected matrices that fit in memory; only `predict` does without, by sampling"
-    return [problem("graphs", text, wanted, "lower the number of agents or graphs")]
-
-
 def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
     """(m,) kappa; 0 for followers, inf for grounded leaders."""
     gains = np.zeros(agents)
     if leaders:
         gains[np.array(leaders.agents) - 1] = leaders.gain
     return gains
-
-
-def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
-    """What the experiment asks for that this version cannot do, one line each."""
-    lines = too_large_to_predict(experiment) if purpose != "run" else needs_sampling(experiment) or matrix_problems(experiment)
-    states = 2.0 ** len(experiment.links or ())
-    if purpose != "run" and states > MOST_STATES:
-        wanted = f"has no exact prediction: 2^{len(experiment.links or ())} graphs, expected at most {MOST_STATES}"
-        lines.append(problem("switching.links", "links that switch by themselves", wanted, "use fewer links"))
-    if purpose == "steady" and experiment.schedule and not experiment.links:
-        wanted = "has no steady state, expected a Markov chain for this"
-        lines.append(
-            problem("switching.schedule", "a given sequence of graphs", wanted, "use predict, run and compare")
-        )
-    return lines + (experiment.protocol.unavailable(purpose) if experiment.protocol else [])
-
-
-def unpredictable(experiment: Experiment) -> str | None:
-    """Why there is no prediction, as a part of a sentence; None where there is one."""
-    reason = experiment.protocol.unpredictable() if experiment.protocol else None
-    return reason or next(iter(too_large_to_predict(experiment)), None)
-
-
-def too_large_to_predict(experiment: Experiment) -> list[str]:
-    """What makes the exact prediction too large, one line each."""
-    if lines := needs_sampling(experiment):
-        return lines
-    noise, graphs, gains = experiment.noise, experiment.graph_list, experiment.leader_gains
-    links = heard_links(graphs, experiment.time) & np.isfinite(gains)[:, None]
-    lossy = int((links & (experiment.loss > 0.0)).sum())
-    if noise.burst is not None and len(graphs) * 2.0**lossy > MOST_STATES:
-        wanted = f"has no prediction: 2^{lossy} states of {lossy} links that lose messages, expected at most "
-        wanted += f"{MOST_STATES} with those of the graph"
-        lines.append(problem("noise.burst", noise.burst, wanted, "remove it, or give fewer links a loss"))
-    others = [key for key in ("broadcast", "link", "delay", "burst") if getattr(noise, key)]
-    others += ["on_loss: hold"] * noise.holds + ["run.pace: realtime"] * (experiment.run.pace == "realtime")
-    if noise.whole_link and others:
-        wanted = f"has no prediction with {', '.join(others)}"
-        lines.append(problem("noise.whole_link", True, wanted, "remove one of them"))
-    kept = len(gains) * (noise.delay + 2) + lossy * (noise.delay + 1) * noise.holds
-    by_message = noise.holds or (experiment.run.pace == "realtime" and noise.steps_only)
-    if by_message and kept > MOST_VALUES:
-        wanted = f"has no prediction: {kept} values are kept from step to step, expected at most {MOST_VALUES}"
-        lines.append(problem("noise.on_loss", noise.on_loss, wanted, "use fewer agents or links, or own values"))
-    return lines
 
 
 def union_of(graphs: Sequence[Graph]) -> BoolArray:

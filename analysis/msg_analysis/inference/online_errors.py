@@ -15,7 +15,7 @@ import numpy as np
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import number_text
-from msg_analysis.experiment.validation import unpredictable
+from msg_analysis.experiment.limits import unpredictable
 from msg_analysis.inference.estimates import Estimate, beside
 from msg_analysis.inference.observation import bounded, deviations
 from msg_analysis.inference.online_evidence import AnyTime, ReceivedEvidence, RunningEvidence, needs_log, supports

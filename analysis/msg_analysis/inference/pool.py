@@ -15,7 +15,7 @@ import numpy as np
 
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.validation import unpredictable
+from msg_analysis.experiment.limits import unpredictable
 from msg_analysis.inference.comparison import MAX_MISSED, Comparison, Pool, PooledRun, first_difference
 from msg_analysis.inference.estimates import Estimate
 from msg_analysis.inference.observation import Observation

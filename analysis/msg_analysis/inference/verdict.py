@@ -12,8 +12,8 @@ import numpy as np
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray, IntArray
 from msg_analysis.common.resources import blas_threads
+from msg_analysis.experiment.limits import unpredictable
 from msg_analysis.experiment.markov_chain import Schedule
-from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.comparison import MAX_MISSED, Comparison, few_digits, trusted
 from msg_analysis.inference.counts import LossTally, Transitions, loss_test

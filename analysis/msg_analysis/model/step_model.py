@@ -24,8 +24,8 @@ from msg_analysis.arithmetic.reproducible import Stream, exponential, generator
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray, once
 from msg_analysis.common.resources import one_blas_thread
 from msg_analysis.errors import NotAvailableError
+from msg_analysis.experiment.limits import matrix_problems
 from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, require_chain
-from msg_analysis.experiment.validation import matrix_problems
 
 if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment

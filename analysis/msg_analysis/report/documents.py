@@ -24,7 +24,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import agent_name
 from msg_analysis.errors import InputError
-from msg_analysis.experiment import validation
+from msg_analysis.experiment import limits, validation
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.links import expanded, given_graphs
 from msg_analysis.inference.autocovariance import (
@@ -224,21 +224,21 @@ def _mean_squares(document: dict[str, Any]) -> tuple[str, str]:
 
 def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     """The document of ``info EXPERIMENT``, also of one that cannot be run; None: infinite or not known."""
-    if validation.needs_sampling(experiment):
+    if limits.needs_sampling(experiment):
         experiment.require_available()
     document = experiment.to_document()
     switching, schedule = experiment.switching_law, experiment.schedule
-    states, matrices = validation.memory_needed(
+    states, matrices = limits.memory_needed(
         experiment.agents, switching.modes, experiment.steps, experiment.width, experiment.noise.delay, experiment.truth
     )
     links, graphs = experiment.links, experiment.written_graphs
     shares, holding_times = switching.stationary.tolist(), experiment.holding_times
     if links:
         shares, holding_times = [None], [None]
-    limits: list[float | None] = [None] * len(graphs)
+    highest_dt: list[float | None] = [None] * len(graphs)
     if experiment.time != "discrete" and not experiment.noise.delay and not experiment.protocol:
         found = (validation.stability_limit(graph, experiment.leader_gains) for graph in graphs)
-        limits = [limit if math.isfinite(limit) else None for limit in found]
+        highest_dt = [limit if math.isfinite(limit) else None for limit in found]
     predicted = None
     with suppress(InputError):  # experiments without a prediction are described, too
         experiment.require_available("predict")
@@ -268,12 +268,12 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
                 "mean_holding_time": holding_time,
                 "stability_limit": limit,
             }
-            for graph, share, holding_time, limit in zip(graphs, shares, holding_times, limits, strict=True)
+            for graph, share, holding_time, limit in zip(graphs, shares, holding_times, highest_dt, strict=True)
         ],
-        "stability_limit": min((limit for limit in limits if limit is not None), default=None),
+        "stability_limit": min((limit for limit in highest_dt if limit is not None), default=None),
         "predicted_system_error": predicted,
         "memory": {"states": states, "matrices": matrices},
-        "unavailable": validation.unavailable(experiment),
+        "unavailable": limits.unavailable(experiment),
         "notes": list(experiment.notes),
     }
 

@@ -21,7 +21,7 @@ import scipy.linalg
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.validation import MOST_STATES, MOST_VALUES
+from msg_analysis.experiment.limits import MOST_STATES, MOST_VALUES
 from msg_analysis.model.step_model import StepModel
 
 

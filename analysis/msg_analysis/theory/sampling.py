@@ -29,7 +29,7 @@ from msg_analysis.common.resources import tell
 from msg_analysis.common.text import agent_text, finite, markdown_table, number_text
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment.graphs import Graph
-from msg_analysis.experiment.validation import MOST_STATES, too_large_to_predict
+from msg_analysis.experiment.limits import MOST_STATES, too_large_to_predict
 from msg_analysis.model.step_model import step_law, step_matrices, turns
 
 if TYPE_CHECKING:
@@ -118,8 +118,8 @@ class SampledPrediction:
         document: dict[str, Any] = {
             "agents": self.experiment.agents,
             "names": self.experiment.names,
-            "modes": [graph.name for graph in self.experiment.graph_list],
-            "stationary": self.experiment.switching_law.stationary.tolist(),
+            "modes": [graph.name for graph in self.experiment.written_graphs],
+            "stationary": [1.0] if self.experiment.links else self.experiment.switching_law.stationary.tolist(),
         }
         laws = {"discrete": law} if self.experiment.time == "discrete" else {"continuous": None, "emulated": law}
         tails = dict.fromkeys(("radius", "lower", "upper", "finite"))
@@ -130,7 +130,7 @@ class SampledPrediction:
 def exact_ends(experiment: Experiment) -> bool:
     """Whether links, bursts or held values of an experiment are too many for the exact prediction."""
     links: Links | None = getattr(experiment, "links", None)
-    if experiment.schedule:
+    if experiment.schedule and links is None:
         return False
     return bool(too_large_to_predict(experiment)) or (links is not None and 2.0 ** len(links.rise) > MOST_STATES)
 
@@ -235,6 +235,10 @@ class _Law:
             self.first = np.searchsorted(self.link_of, np.arange(len(links.rise) + 1))
         loss = experiment.loss[self.targets, self.sources]
         self.lossy = np.flatnonzero(loss)  # arcs on which messages can be lost
+        ends = np.stack([self.targets, self.sources])[:, self.lossy]
+        pairs = np.sort(ends, axis=0) if noise.whole_link else ends
+        _, first, which = np.unique(pairs, axis=1, return_index=True, return_inverse=True)
+        self.drawn = first[which.reshape(-1)]  # (lossy,) the one with whose messages those of each arc are lost
         # (3, lossy, 1) with which probability, after one that was not lost, and after one that was
         p, burst = loss[self.lossy, None], noise.burst
         self.losses = np.stack(
@@ -295,7 +299,7 @@ class _Law:
         self.weights[grounded[self.targets]] = 0.0
         self.rows = np.where(grounded, 0.0, 1.0 - dt * np.where(grounded, 0.0, gains))[:, None]
         process, free = experiment.noise.process, np.where(grounded, 0.0, math.sqrt(dt))
-        given = [process[graph.name] for graph in experiment.graph_list] if isinstance(process, dict) else [process]
+        given = [process[graph.name] for graph in experiment.written_graphs] if isinstance(process, dict) else [process]
         forms = [np.asarray(gain, dtype=float) for gain in given]
         self._feel([(f * free[:, None]).T if f.ndim == 2 else sparse.diags_array(f * free) for f in forms])
 
@@ -364,7 +368,7 @@ class _Walk:
             self._weights = law.weights * up[law.link_of]
         self._lost = np.zeros((len(law.targets) if len(law.lossy) else 0, count), dtype=np.bool_)
         if len(law.lossy):
-            self._lost[law.lossy] = rng.random((len(law.lossy), count)) < law.losses[0]
+            self._lost[law.lossy] = (rng.random((len(law.lossy), count)) < law.losses[0])[law.drawn]
         # What was used of the messages of d + 2 steps, and what passes on to an earlier message.
         self._used = np.zeros((law.delay + 2, 0 if law.plain else len(law.targets), count))
         self._passed = np.zeros((len(law.targets) if law.holds else 0, count))
@@ -403,7 +407,7 @@ class _Walk:
             chance = (
                 law.losses[1] if law.burst is None else np.where(self._lost[law.lossy], law.losses[2], law.losses[1])
             )
-            self._lost[law.lossy] = self._rng.random((len(law.lossy), self._z.shape[1])) < chance
+            self._lost[law.lossy] = (self._rng.random((len(law.lossy), self._z.shape[1])) < chance)[law.drawn]
         if not law.plain:
             return self._messages()
         terms = self._noise(self._z)

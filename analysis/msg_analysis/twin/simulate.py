@@ -22,9 +22,9 @@ from msg_analysis.arithmetic.update_law import ManySteps, Round, from_payload, t
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray, large_zeros, release
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.experiment.limits import unpredictable
 from msg_analysis.experiment.problems import problem
 from msg_analysis.experiment.protocols import AgentProtocol
-from msg_analysis.experiment.validation import unpredictable
 from msg_analysis.model.agent_law import ProcessNoise, ProtocolLaw
 from msg_analysis.model.graph_path import holding_periods, mode_path, past_modes
 from msg_analysis.model.reception import Air, AirReception, MessagesUsed, add_broadcast_noise

@@ -9,7 +9,7 @@ import pytest
 
 from experiments import compare, line_ring
 from msg_analysis.experiment.experiment import Experiment, ExperimentError
-from msg_analysis.experiment.validation import unpredictable
+from msg_analysis.experiment.limits import unpredictable
 from msg_analysis.twin.simulate import simulate
 
 GOLDEN = {

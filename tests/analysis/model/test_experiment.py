@@ -14,9 +14,9 @@ from random_networks import random_document
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.experiment.limits import unavailable, unpredictable
 from msg_analysis.experiment.problems import ExperimentError
 from msg_analysis.experiment.spec import ExperimentSpec, json_schema
-from msg_analysis.experiment.validation import unavailable, unpredictable
 
 ROOT = Path(__file__).parents[3]
 EXPERIMENTS = ROOT / "analysis/msg_analysis/experiment/bundled"

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from msg_analysis.experiment import validation
+from msg_analysis.experiment import limits
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.problems import ExperimentError
 
@@ -279,12 +279,12 @@ def test_text_names_the_source_and_lists_the_problems() -> None:
 
 
 def test_memory_is_compared_with_what_is_available(monkeypatch: pytest.MonkeyPatch) -> None:
-    needed = sum(validation.memory_needed(agents=5, modes=2, steps=8000, replicas=1))
-    monkeypatch.setattr(validation, "available_memory", lambda: needed)
+    needed = sum(limits.memory_needed(agents=5, modes=2, steps=8000, replicas=1))
+    monkeypatch.setattr(limits, "available_memory", lambda: needed)
     Experiment.parse(GOOD)
-    monkeypatch.setattr(validation, "available_memory", lambda: needed - 1)
+    monkeypatch.setattr(limits, "available_memory", lambda: needed - 1)
     assert "need 320 kB: expected at most 323 kB, the memory available" in problems_of({})[0]
 
 
 def test_available_memory_is_a_plausible_number_of_bytes() -> None:
-    assert 2**20 < validation.available_memory() < 2**60
+    assert 2**20 < limits.available_memory() < 2**60

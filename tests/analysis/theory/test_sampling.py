@@ -9,7 +9,7 @@ import pytest
 
 from experiments import CORRELATED, TRACKING, Experiment, directed, five, line_ring, pieces
 from msg_analysis.errors import InputError, NotAvailableError
-from msg_analysis.experiment import validation
+from msg_analysis.experiment import limits
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.problems import ExperimentError
 from msg_analysis.report.documents import describe_experiment
@@ -121,7 +121,7 @@ def test_walks_made_one_at_a_time(monkeypatch: pytest.MonkeyPatch):
 def test_without_matrices(monkeypatch: pytest.MonkeyPatch):
     """Where these do not fit in memory, experiments load, and errors are sampled: the same ones."""
     known = sampled_prediction(five(noise={"process": [1, 2, 1, 1, 1], "loss": 0.2}), precision=0.1)
-    monkeypatch.setattr(validation, "available_memory", lambda: 3000)
+    monkeypatch.setattr(limits, "available_memory", lambda: 3000)
     large = five(noise={"process": [1, 2, 1, 1, 1], "loss": 0.2}, run={"duration": 1})
     assert large.graph_list[0].symmetric
     assert sampled_prediction(large, precision=0.1).interval == known.interval

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from msg_analysis.cli.main import main
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.errors import NotAvailableError
-from msg_analysis.experiment import validation
+from msg_analysis.experiment import limits
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.step_model import phases
 from msg_analysis.theory.prediction import predict
@@ -164,8 +164,8 @@ def test_of_what_there_are_no_outages(tmp_path: Any) -> None:
 def test_more_graphs_than_matrices_fit_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """They are predicted and described; what needs the matrices says so."""
     law = given(agents=25, run={"duration": 6.0})
-    states, matrices = validation.memory_needed(25, 5, law.steps, 1)
-    monkeypatch.setattr(validation, "available_memory", lambda: states + matrices - 1)
+    states, matrices = limits.memory_needed(25, 5, law.steps, 1)
+    monkeypatch.setattr(limits, "available_memory", lambda: states + matrices - 1)
     law = given(agents=25)
     assert predict(law).to_json()["emulated"]["system_error"] > 0.0
     words = r"graphs: 5 graphs of 25 agents need 200 kB: expected at most .*: lower the number of agents or graphs"
