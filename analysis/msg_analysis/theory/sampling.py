@@ -18,7 +18,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.special
@@ -46,15 +46,6 @@ SMALL = 0.03  # of the sum so far, terms of a block: then the walk may end
 NOTHING = 1e-30  # of |z|^2, is rounding
 GROWTH = 1e6  # of |z|^2, beyond what weights that are not negative can do: the steps are unstable
 LONGEST, NEVER = 2**60, 1e-18  # steps, and probability in a step, that are not told from infinity and 0
-
-
-class Links(Protocol):
-    """Links that switch by themselves, each between up and down, whatever the others do."""
-
-    mesh: Graph  # all links up
-    link_of: IntArray  # (l,) number of the link of each arc of the mesh
-    rise: FloatArray  # (E,) probabilities per step that a link that is down comes up
-    fall: FloatArray  # (E,) and that one that is up goes down
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -129,10 +120,10 @@ class SampledPrediction:
 
 def exact_ends(experiment: Experiment) -> bool:
     """Whether links, bursts or held values of an experiment are too many for the exact prediction."""
-    links: Links | None = getattr(experiment, "links", None)
+    links = experiment.links
     if experiment.schedule and links is None:
         return False
-    return bool(too_large_to_predict(experiment)) or (links is not None and 2.0 ** len(links.rise) > MOST_STATES)
+    return bool(too_large_to_predict(experiment)) or 2.0 ** len(links or ()) > MOST_STATES
 
 
 def sampled_prediction(
@@ -142,7 +133,6 @@ def sampled_prediction(
     within: float = 60.0,
     agents: Sequence[int | str] = (),
     seed: int = 0,
-    links: Links | None = None,
 ) -> SampledPrediction:
     """Sample the steady errors of the run's steps.
 
@@ -158,8 +148,6 @@ def sampled_prediction(
         whose errors are sampled, too, by number from 1 or name; with up to 20 agents, by default all
     seed
         of the random numbers; for one seed, the time decides nothing but how many samples there are
-    links
-        that switch by themselves; by default those of the experiment
 
     Raises
     ------
@@ -171,7 +159,7 @@ def sampled_prediction(
         if not 0.0 < value < most:
             wanted = "expected a number above 0" + ", below 1" * (most < math.inf)
             raise InputError(f"{key}: {value:g}: {wanted}: for example 0.01")
-    law, m = _Law(experiment, links or getattr(experiment, "links", None)), experiment.agents
+    law, m = _Law(experiment), experiment.agents
     every = not agents and m <= ALL_AGENTS
     units = list(range(m)) if every else experiment.indices(agents)
     width = len(units) + (not every)
@@ -213,7 +201,8 @@ class _Law:
     weights: FloatArray  # (l, n) W_ij
     rows: FloatArray  # (m, 1) or (m, n) sums of the rows of W
 
-    def __init__(self, experiment: Experiment, links: Links | None) -> None:
+    def __init__(self, experiment: Experiment) -> None:
+        links = experiment.links
         m, dt, noise = experiment.agents, experiment.step_length, experiment.noise
         if links is None and experiment.schedule:
             raise NotAvailableError("switching: the sequence of the graphs is given: expected a Markov chain for this")

@@ -1,8 +1,6 @@
 """Sampled errors: unbiased, with an interval that holds, the same for the same seed."""
 
 import math
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +8,6 @@ import pytest
 from experiments import CORRELATED, TRACKING, Experiment, directed, five, line_ring, pieces
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment import limits
-from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.problems import ExperimentError
 from msg_analysis.report.documents import describe_experiment
 from msg_analysis.theory import sampling
@@ -30,6 +27,7 @@ LAWS: dict[str, Experiment] = {
     "noise of messages alone": five(noise={"process": 0.0, "broadcast": 1.0}, run={"dt": 0.2}),
     "long delay": five(noise={"delay": 12}, run={"dt": 0.05}),
     "own value for lost ones": five(noise={"loss": 0.3}, run={"dt": 0.2}),
+    "whole links": five(noise={"loss": 0.5, "whole_link": True}, run={"dt": 0.2}),
     "bursts": line_ring(3, 1.0, noise=BURSTS, run={"dt": 0.2}),
     "bursts, held": line_ring(3, 1.0, noise=BURSTS | {"on_loss": "hold"}, run={"dt": 0.2}),
     "held": five(noise=HELD, run={"dt": 0.2}),
@@ -57,34 +55,31 @@ def test_the_mean_is_the_exact_prediction(name):
     assert (np.abs(sampled.node_errors - exact.node_errors) <= 2.5 * (high - low) / 2.0 + 1e-12).all()
 
 
-def of_links(count: int) -> SimpleNamespace:
+def of_links(count: int) -> Experiment:
     """The first of ten links of six agents, each up and down at rate 0.5, in steps of 0.05."""
-    ends = [(i, i + 1) for i in range(5)] + [(0, 2), (1, 3), (0, 5), (1, 4), (2, 5)]
-    numbers = {(i, j): number for number, pair in enumerate(ends[:count]) for i, j in (pair, pair[::-1])}
-    targets, sources = np.array(sorted(numbers)).T
-    change = np.full(count, (1.0 - math.exp(-0.05)) / 2.0)
-    of_arcs = np.array([numbers[pair] for pair in sorted(numbers)])
-    mesh = Graph("mesh", 6, targets, sources, np.ones(2 * count))
-    return SimpleNamespace(mesh=mesh, link_of=of_arcs, rise=change, fall=change)
+    ends = [[i, i + 1] for i in range(1, 6)] + [[1, 3], [2, 4], [1, 6], [2, 5], [3, 6]]
+    switching = {"links": {"up": 0.5, "down": 0.5}}
+    return line_ring(6, graphs={"mesh": {"edges": ends[:count]}}, switching=switching)
 
 
 @pytest.mark.parametrize(("count", "exact"), [(9, 3.41958), (10, 2.73584)])
 def test_links_that_switch_by_themselves(count, exact):
     """Golden numbers of the chain on all 2^count graphs, by a dense solver. The seed is fixed; |z| < 4."""
-    sampled = sampled_prediction(line_ring(6), links=of_links(count), precision=0.02, seed=2)
+    sampled = sampled_prediction(of_links(count), precision=0.02, seed=2)
     assert abs(z_of(sampled, exact)) < 4.0
 
 
-def simulated(links: Any, paths: int, steps: int, rng: np.random.Generator) -> tuple[float, float]:
+def simulated(law: Experiment, paths: int, steps: int, rng: np.random.Generator) -> tuple[float, float]:
     """Mean of the system error after these steps from zero, and its standard error, forward in time."""
-    m, dt = links.mesh.agents, 0.05
-    states, up = np.zeros((m, paths)), rng.random((len(links.rise), paths)) < 0.5
+    pairs, change = law.written_graphs[0].edges, (1.0 - math.exp(-0.05)) / 2.0
+    states, up = np.zeros((6, paths)), rng.random((len(pairs), paths)) < 0.5
     for _ in range(steps):
-        change = np.zeros_like(states)
-        for arc, (i, j) in enumerate(zip(links.mesh.targets, links.mesh.sources, strict=True)):
-            change[i] += up[links.link_of[arc]] * (states[j] - states[i])
-        states += dt * change + math.sqrt(dt) * rng.standard_normal(states.shape)
-        up ^= rng.random(up.shape) < links.rise[0]
+        pull = np.zeros_like(states)
+        for there, (i, j, _) in zip(up, pairs, strict=True):
+            pull[i - 1] += there * (states[j - 1] - states[i - 1])
+            pull[j - 1] += there * (states[i - 1] - states[j - 1])
+        states += 0.05 * pull + math.sqrt(0.05) * rng.standard_normal(states.shape)
+        up ^= rng.random(up.shape) < change
     errors = ((states - states.mean(axis=0)) ** 2).sum(axis=0)
     return float(errors.mean()), float(errors.std() / math.sqrt(paths))
 
@@ -92,7 +87,7 @@ def simulated(links: Any, paths: int, steps: int, rng: np.random.Generator) -> t
 def test_a_simulation_forward_in_time_has_the_same_mean():
     """An oracle without adjoints: 1500 copies. Fixed seeds; |z| < 4 fails once in 16,000."""
     mean, error = simulated(of_links(7), 1500, 300, np.random.default_rng(5))
-    sampled = sampled_prediction(line_ring(6), links=of_links(7), precision=0.03, seed=3)
+    sampled = sampled_prediction(of_links(7), precision=0.03, seed=3)
     own = (sampled.interval[1] - sampled.interval[0]) / 3.92
     assert abs(sampled.system_error - mean) < 4.0 * math.hypot(own, error)
 
