@@ -70,21 +70,24 @@ def needs_sampling(experiment: Experiment) -> list[str]:
 
 def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
     """What the experiment asks for that this version cannot do, one line each."""
-    lines = (
-        too_large_to_predict(experiment)
-        if purpose != "run"
-        else needs_sampling(experiment) or matrix_problems(experiment)
-    )
-    states = 2.0 ** len(experiment.links or ())
-    if purpose != "run" and states > MOST_STATES:
-        wanted = f"has no exact prediction: 2^{len(experiment.links or ())} graphs, expected at most {MOST_STATES}"
-        lines.append(problem("switching.links", "links that switch by themselves", wanted, "use fewer links"))
+    lines = why_sampled(experiment)
+    if purpose == "run":
+        lines = needs_sampling(experiment) or matrix_problems(experiment)
     if purpose == "steady" and experiment.schedule and not experiment.links:
         wanted = "has no steady state, expected a Markov chain for this"
         lines.append(
             problem("switching.schedule", "a given sequence of graphs", wanted, "use predict, run and compare")
         )
     return lines + (experiment.protocol.unavailable(purpose) if experiment.protocol else [])
+
+
+def why_sampled(experiment: Experiment) -> list[str]:
+    """What makes the steady errors too large for an exact prediction, one line each; none where there is one."""
+    lines, links = too_large_to_predict(experiment), len(experiment.links or ())
+    if 2**links > MOST_STATES:
+        wanted = f"has no exact prediction: 2^{links} graphs, expected at most {MOST_STATES}"
+        lines.append(problem("switching.links", "links that switch by themselves", wanted, "use fewer links"))
+    return lines
 
 
 def unpredictable(experiment: Experiment) -> str | None:
@@ -94,24 +97,24 @@ def unpredictable(experiment: Experiment) -> str | None:
 
 
 def too_large_to_predict(experiment: Experiment) -> list[str]:
-    """What makes the exact prediction too large, one line each."""
+    """What makes the exact errors of a run too large, given its graphs where no chain of these is known; as above."""
     if lines := needs_sampling(experiment):
         return lines
     noise, graphs, gains = experiment.noise, experiment.graph_list, experiment.leader_gains
     links = heard_links(graphs, experiment.time) & np.isfinite(gains)[:, None]
     lossy = int((links & (experiment.loss > 0.0)).sum())
-    if noise.burst is not None and len(graphs) * 2.0**lossy > MOST_STATES:
-        wanted = f"has no prediction: 2^{lossy} states of {lossy} links that lose messages, expected at most "
+    if noise.burst is not None and (1 if experiment.schedule else len(graphs)) * 2**lossy > MOST_STATES:
+        wanted = f"has no exact prediction: 2^{lossy} states of {lossy} links that lose messages, expected at most "
         wanted += f"{MOST_STATES} with those of the graph"
         lines.append(problem("noise.burst", noise.burst, wanted, "remove it, or give fewer links a loss"))
     others = [key for key in ("broadcast", "link", "delay", "burst") if getattr(noise, key)]
     others += ["on_loss: hold"] * noise.holds + ["run.pace: realtime"] * (experiment.run.pace == "realtime")
     if noise.whole_link and others:
-        wanted = f"has no prediction with {', '.join(others)}"
+        wanted = f"has no exact prediction with {', '.join(others)}"
         lines.append(problem("noise.whole_link", True, wanted, "remove one of them"))
     kept = len(gains) * (noise.delay + 2) + lossy * (noise.delay + 1) * noise.holds
     by_message = noise.holds or (experiment.run.pace == "realtime" and noise.steps_only)
     if by_message and kept > MOST_VALUES:
-        wanted = f"has no prediction: {kept} values are kept from step to step, expected at most {MOST_VALUES}"
+        wanted = f"has no exact prediction: {kept} values are kept from step to step, expected at most {MOST_VALUES}"
         lines.append(problem("noise.on_loss", noise.on_loss, wanted, "use fewer agents or links, or own values"))
     return lines

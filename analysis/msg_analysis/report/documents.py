@@ -40,6 +40,7 @@ from msg_analysis.theory.first_steps import simplification
 from msg_analysis.theory.graph_indices import algebraic_connectivity, error_bounds, graph_indices, two_topology
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.prediction import predict
+from msg_analysis.theory.sampling import prediction_method, sampled_prediction
 from msg_analysis.theory.settling import asymptotic_rates, settling_time
 from msg_analysis.theory.spectrum import Spectrum, spectrum
 from msg_analysis.theory.transient import TransientLaw, point_start, solve_transient, start_of
@@ -239,10 +240,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     if experiment.time != "discrete" and not experiment.noise.delay and not experiment.protocol:
         found = (validation.stability_limit(graph, experiment.leader_gains) for graph in graphs)
         highest_dt = [limit if math.isfinite(limit) else None for limit in found]
-    predicted = None
-    with suppress(InputError):  # experiments without a prediction are described, too
-        experiment.require_available("predict")
-        predicted = predict(experiment).emulated.system_error
+    prediction = _method(experiment)
     return {
         "name": experiment.name,
         "problem": experiment.problem,
@@ -271,11 +269,32 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
             for graph, share, holding_time, limit in zip(graphs, shares, holding_times, highest_dt, strict=True)
         ],
         "stability_limit": min((limit for limit in highest_dt if limit is not None), default=None),
-        "predicted_system_error": predicted,
+        "predicted_system_error": prediction.pop("system_error"),
+        "prediction": prediction,
         "memory": {"states": states, "matrices": matrices},
         "unavailable": limits.unavailable(experiment),
         "notes": list(experiment.notes),
     }
+
+
+SHORT, ONE_PERCENT = 2.0, 0.01  # s for which errors are sampled to say how long it takes to know them so well
+
+
+def _method(experiment: Experiment) -> dict[str, Any]:
+    """How the steady errors are known: "exact", "sampled", or "measured" in runs only; why; and the system error."""
+    method, why = prediction_method(experiment)
+    found: dict[str, Any] = {"method": method, "why": why, "seconds": None, "system_error": None}
+    if method == "sampled":
+        with suppress(InputError):  # not known so fast
+            sampled = sampled_prediction(experiment, precision=ONE_PERCENT, within=SHORT)
+            width = (sampled.interval[1] - sampled.interval[0]) / 2.0 / (ONE_PERCENT * sampled.system_error)
+            found |= {"system_error": sampled.system_error, "seconds": sampled.seconds * width**2}
+    elif method == "exact":
+        try:
+            found["system_error"] = predict(experiment).emulated.system_error
+        except InputError as error:
+            found |= {"method": "measured", "why": str(error)}
+    return found
 
 
 def describe_bag(path: Path) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from msg_analysis.common.text import (
     agent_text,
     amount,
     counted,
+    duration_text,
     half_width_text,
     listed,
     number_text,
@@ -182,6 +183,7 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
         facts.add_row("schedule", f"{counted(schedule['stretches'], 'graph')}, ends {end}{then}")
     facts.add_row("pace", f"{run['pace']}, processes {run['processes']}")
     facts.add_row("predicted system error", number_text(document["predicted_system_error"]))
+    facts.add_row("prediction", _prediction(document["prediction"]))
     memory = document["memory"]
     facts.add_row("memory", f"states {amount(memory['states'])}, graphs {amount(memory['matrices'])}")
     facts.add_row("can be run", "yes" if not document["unavailable"] else "no")
@@ -265,6 +267,12 @@ def _noise(noise: dict[str, Any], names: Sequence[str] | None) -> str:
         special = [f"{agent_name(i, names)}{sign}{agent_name(j, names)}: {p:g}" for i, sign, j, p in links]
         shown["loss"] = f"{noise['loss']['default']:g} ({listed(special)})"
     return ", ".join(f"{key} {value}" for key, value in shown.items())
+
+
+def _prediction(found: dict[str, Any]) -> str:
+    """How the steady errors are known, and why not exactly."""
+    time = "" if found["seconds"] is None else f", to 1 % in about {duration_text(found['seconds'])}"
+    return str(found["method"]) + time + (f": {found['why']}" if found["why"] else "")
 
 
 def _links(graph: dict[str, Any], names: Sequence[str] | None) -> str:

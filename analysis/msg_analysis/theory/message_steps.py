@@ -378,7 +378,7 @@ def loss_modes(step: StepModel) -> list[tuple[int, FloatArray]]:
 def _channel_states(step: StepModel) -> FloatArray:
     """(2^c, c): 1.0 where a channel loses, for every combination of states, in the order of Kronecker products."""
     channels = len(burst_channels(step))
-    if step.modes * 2.0**channels > MOST_STATES:
+    if step.modes * 2**channels > MOST_STATES:
         raise InputError(
             f"noise.burst: {step.modes} graphs and {channels} links that lose messages make {step.modes} * "
             f"2^{channels} states of the network; at most {MOST_STATES} are predicted: give a loss to fewer links "

@@ -18,7 +18,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import scipy.special
@@ -29,7 +29,7 @@ from msg_analysis.common.resources import tell
 from msg_analysis.common.text import agent_text, finite, markdown_table, number_text
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment.graphs import Graph
-from msg_analysis.experiment.limits import MOST_STATES, too_large_to_predict
+from msg_analysis.experiment.limits import why_sampled
 from msg_analysis.model.step_model import step_law, step_matrices, turns
 
 if TYPE_CHECKING:
@@ -120,10 +120,14 @@ class SampledPrediction:
 
 def exact_ends(experiment: Experiment) -> bool:
     """Whether links, bursts or held values of an experiment are too many for the exact prediction."""
-    links = experiment.links
-    if experiment.schedule and links is None:
-        return False
-    return bool(too_large_to_predict(experiment)) or 2.0 ** len(links or ()) > MOST_STATES
+    return bool(why_sampled(experiment)) and not (experiment.schedule and experiment.links is None)
+
+
+def prediction_method(experiment: Experiment) -> tuple[Literal["exact", "sampled", "measured"], str | None]:
+    """How the steady errors of an experiment are known, or those of runs only; and why not exactly."""
+    if experiment.protocol and (reason := experiment.protocol.unpredictable()):
+        return "measured", reason
+    return ("sampled", why_sampled(experiment)[0]) if exact_ends(experiment) else ("exact", None)
 
 
 def sampled_prediction(
