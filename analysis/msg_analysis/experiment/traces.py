@@ -23,6 +23,8 @@ from msg_analysis.experiment.problems import show
 from msg_analysis.experiment.spec import SwitchingSpec
 from msg_analysis.experiment.values import LARGEST_NUMBER
 
+MOST_AGENTS = 20_000  # one matrix of them takes 3 GB
+MOST_LINKS = 3_000_000  # in all graphs together, which take 1 GB
 ROUNDING = 1e-9  # of times: what differs by less, relative to its size, is the same time
 
 COLUMNS: Mapping[str, Sequence[str]] = {
@@ -110,7 +112,7 @@ def read_trace(
         moments = _moments(
             _joined(key, _intervals(key, rows, nodes, hold), directed=directed, refreshed=hold is not None)
         )
-    return _trace(nodes, moments, first, directed=directed and radius is None)
+    return _trace(key, nodes, moments, first, directed=directed and radius is None)
 
 
 def resolved(
@@ -140,21 +142,25 @@ def resolved(
         "schedule": [(start, names[graph]) for start, graph in zip(trace.starts, trace.which, strict=True)],
         "end": None if math.isinf(trace.end) else trace.end,
     }
-    notes = [f"{key}: time 0 of the run is {trace.first:.12g} in the file"] if trace.first else []
+    looks = f", which looks like {unit} since 1970" if (unit := _unit_of(trace.first)) else ""
+    notes = [f"{key}: time 0 of the run is {trace.first:.12g} in the file{looks}"] if trace.first else []
     return switching.model_copy(update=changes), found, notes
+
+
+def _unit_of(first: float) -> str | None:
+    """The unit that the first time of a file seems to have, if it counts from 1970; None: seconds, or unknown."""
+    sizes = {"milliseconds": 1e12, "microseconds": 1e15, "nanoseconds": 1e18}
+    return next((unit for unit, size in sizes.items() if 1.0 <= first / size < 4.0), None)
 
 
 def _rows(key: str, file: Path) -> tuple[str, float, Iterator[_Row]]:
     """The kind of trace, its first time, and its rows in the order of time."""
     try:
         text = file_content(key, file).decode("utf-8-sig")
-        names: list[str] = []
-        for separator in (",", ";", "\t"):
-            table = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
-            names = [name.strip().lower() for name in next(table, [])]
-            found = next((kind for kind, columns in COLUMNS.items() if set(columns) <= set(names)), None)
-            if found:
-                break
+        separator = max((",", ";", "\t"), key=next(io.StringIO(text), "").count)
+        table = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
+        names = [name.strip().lower() for name in next(table, [])]
+        found = next((kind for kind, columns in COLUMNS.items() if set(columns) <= set(names)), None)
     except (UnicodeDecodeError, csv.Error) as error:
         raise GraphError(key, str(file), f"expected a CSV file in UTF-8 ({error})", "export it again") from error
     if not found:
@@ -209,6 +215,8 @@ def _number(key: str, place: str, column: str, text: str) -> Decimal:
 
 def _agent(key: str, text: str, nodes: dict[str, int]) -> int:
     found = nodes.get(text)  # a million rows have few different ones
+    if len(nodes) > MOST_AGENTS:
+        raise GraphError(key, f"more than {MOST_AGENTS} agents", "expected fewer", "correct the columns, or split it")
     return nodes.setdefault(node_name(key, text, _CORRECT), len(nodes)) if found is None else found
 
 
@@ -236,6 +244,9 @@ def _intervals(
     """When each row says that a link was there."""
     for place, (begin, *others), cells in rows:
         end = begin + hold if hold is not None else others[0]
+        if hold is not None and _same(begin, end):
+            wanted = f"expected times in the unit of switching.hold, {hold:g}"
+            raise GraphError(key, f"{place}: {begin:g} after the first", wanted, "divide them, if they are nanoseconds")
         if end <= begin or _same(begin, end):
             raise GraphError(key, place, "expected the end of an interval after its start", _CORRECT)
         a, b = (_agent(key, cell, nodes) for cell in cells[:2])
@@ -316,13 +327,22 @@ def _near(
 
 
 def _trace(
-    nodes: Mapping[str, int], moments: Iterable[tuple[float, frozenset[Link]]], first: float, *, directed: bool
+    key: str,
+    nodes: Mapping[str, int],
+    moments: Iterable[tuple[float, frozenset[Link]]],
+    first: float,
+    *,
+    directed: bool,
 ) -> Trace:
     numbers: dict[frozenset[Link], int] = {}
     starts: list[float] = []
     which: list[int] = []
-    end = 0.0
+    end, count = 0.0, 0
     for (time, links), (end, _) in pairwise(moments):
+        count += len(links) if links not in numbers else 0
+        if count > MOST_LINKS:
+            wanted = f"expected at most {MOST_LINKS} in all graphs together"
+            raise GraphError(key, f"{count} links in {len(numbers) + 1} graphs", wanted, "lower `radius`, or split it")
         number = numbers.setdefault(links, len(numbers))
         if not _same(time, end) and which[-1:] != [number]:
             starts.append(time)

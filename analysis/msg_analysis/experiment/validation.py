@@ -26,6 +26,8 @@ SUM_TOLERANCE = 1e-9
 STEP_TOLERANCE = 1e-9
 MOST_STEPS = 1e15
 """Beyond this, a double cannot tell one step from the next."""
+MOST_GIVEN_STEPS = 1e8
+"""Of a run as long as its schedule: more are rather times in another unit."""
 LONGEST_DURATION = 2**31 - 1
 """A message's stamp has 32 bits for the seconds of simulated time."""
 
@@ -92,7 +94,11 @@ def scheduled_run(run: RunSpec, switching: SwitchingSpec) -> tuple[RunSpec, list
             wanted = "expected 'zero' or values, since a stationary start needs a Markov chain of graphs"
             found.append(problem("run.start", "stationary", wanted, "say where the agents are"))
     if switching.end is not None and not switching.repeat:
-        if "duration" not in run.model_fields_set:
+        if "duration" not in run.model_fields_set and switching.end / run.dt > MOST_GIVEN_STEPS:
+            wanted = f"expected at most {MOST_GIVEN_STEPS:.0e} steps, and until {switching.end:.6g} there are more"
+            remedy = "raise it, or divide the times, if they are milli- or nanoseconds"
+            found.append(problem("run.dt", run.dt, wanted, remedy))
+        elif "duration" not in run.model_fields_set:
             changes["duration"] = max(1, math.floor(switching.end / run.dt * (1.0 + STEP_TOLERANCE))) * run.dt
         elif run.duration > switching.end * (1.0 + STEP_TOLERANCE):
             wanted = f"expected at most {switching.end:.12g}, where the schedule ends"

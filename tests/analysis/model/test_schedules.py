@@ -10,6 +10,7 @@ import networkx as nx
 import numpy as np
 import pytest
 
+from msg_analysis.experiment import traces
 from msg_analysis.experiment.experiment import Experiment, ExperimentError
 from msg_analysis.model.graph_path import mode_path
 
@@ -103,6 +104,7 @@ def test_schedules(tmp_path: Path, written: str) -> None:
 
 
 CONTACTS = "time,source,target"
+EPOCH = 1_764_000_000 * 10**9  # in nanoseconds
 
 
 @pytest.mark.parametrize(
@@ -135,6 +137,9 @@ CONTACTS = "time,source,target"
         ("time,graph", [(0, "x")], {"weight": 2, "graphs": {"x": {"path": NAMES}}}, "switching.weight: 2.0: expected"),
         (CONTACTS, [(0, *p) for p in RING], {"hold": 1, "run": {"duration": 9}}, "9.0: expected at most 1"),
         (CONTACTS, [(0, *p) for p in RING], {"hold": 1, "run": {"start": "stationary"}}, "needs a Markov chain"),
+        (CONTACTS, [(EPOCH + k, *RING[0]) for k in (0, 10**9)], {"hold": 1}, "1e+09 after the first: expected times"),
+        ("start,end,source,target", [(0, 10**11, *p) for p in RING], {}, "run.dt: 0.1: expected at most 1e+08 steps"),
+        (",".join(f"c{k}" for k in range(10**5)), [(0, "a", "b")], {"hold": 1}, 'line 1: "c0,c1,c2,'),
     ],
 )  # fmt: skip
 def test_mistakes(tmp_path: Path, header: str, rows: list[Any], keys: dict[str, Any], wanted: str) -> None:
@@ -142,3 +147,21 @@ def test_mistakes(tmp_path: Path, header: str, rows: list[Any], keys: dict[str, 
         recorded(tmp_path, header, rows, **keys)
     assert wanted in str(caught.value)
     assert len(caught.value.problems) == 1
+
+
+def test_more_links_or_agents_than_there_is_room_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Links of different graphs, together; equal ones count once."""
+    monkeypatch.setattr(traces, "MOST_LINKS", 10)
+    rows = [(time, *pair) for time in range(4) for pair in (RING if time % 2 else RING[:-1])]
+    recorded(tmp_path, CONTACTS, rows, hold=1)
+    with pytest.raises(ExperimentError, match="12 links in 3 graphs: expected at most 10 in all graphs together"):
+        recorded(tmp_path, CONTACTS, [*rows, (4, *RING[0]), (4, *RING[1]), (4, *RING[2])], hold=1)
+    monkeypatch.setattr(traces, "MOST_AGENTS", 4)
+    with pytest.raises(ExperimentError, match="more than 4 agents: expected fewer"):
+        recorded(tmp_path, CONTACTS, rows, hold=1)
+
+
+def test_a_unit_that_may_not_be_meant(tmp_path: Path) -> None:
+    rows = [(EPOCH // 10**6, *pair) for pair in RING]
+    (note,) = recorded(tmp_path, CONTACTS, rows, hold=1).notes
+    assert note.endswith("time 0 of the run is 1.764e+12 in the file, which looks like milliseconds since 1970")
