@@ -145,6 +145,7 @@ bench: setup ## Measure speed side by side with the bare middleware, other solve
 	$(BIN)/python benchmarks/sampling.py
 	$(BIN)/python benchmarks/leaders.py
 	$(BIN)/python benchmarks/reading.py
+	$(BIN)/python benchmarks/traces.py
 	$(BIN)/python benchmarks/sweep.py
 
 calibrate: setup ## Measure error rates and power of the verdict into docs/calibration.md: an hour on two CPUs

@@ -207,16 +207,15 @@ def link_problems(
     found, twice = [], []
     seen: set[tuple[int, int]] = set()
     for i, j, _ in links(spec, agents):
-        pair = (i, j) if kind == "arcs" else (min(i, j), max(i, j))
-        if i != j and pair not in seen:
-            seen.add(pair)
-            continue
-        ends = show([i, j] if names is None else [names[i - 1], names[j - 1]])
-        if i == j:
-            who = agent_text(i, names)
-            found.append(problem(key, ends, f"{who} is linked with itself", "remove the self-loop"))
-        else:
-            twice.append(ends)
+        pair = (i, j) if kind == "arcs" or i < j else (j, i)
+        if i == j or pair in seen:
+            ends = show([i, j] if names is None else [names[i - 1], names[j - 1]])
+            if i == j:
+                who = agent_text(i, names)
+                found.append(problem(key, ends, f"{who} is linked with itself", "remove the self-loop"))
+            else:
+                twice.append(ends)
+        seen.add(pair)
     if len(twice) > MOST_TWICE:
         twice = [f"{twice[0]} and {len(twice) - 1} more"]
     text = "arc" if kind == "arcs" else "edge (edges have no direction)"

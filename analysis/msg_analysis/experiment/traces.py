@@ -285,14 +285,14 @@ def _joined(
 def _moments(intervals: Iterable[_Interval]) -> Iterator[tuple[float, frozenset[Link]]]:
     """From each time on, the links that are there; the last one is the end."""
     begins, ends, links = zip(*intervals, strict=True)
-    times = np.concatenate([ends, begins])
+    times = [*ends, *begins]
     there: set[Link] = set()
     order = np.argsort(times, kind="stable").tolist()  # at one time, links go before others come
     count = len(ends)
     for number, place in enumerate(order):
         (there.discard if place < count else there.add)(links[place % count])
         if number + 1 == len(order) or not _same(times[place], times[order[number + 1]]):
-            yield float(times[place]), frozenset(there)
+            yield times[place], frozenset(there)
 
 
 def _near(

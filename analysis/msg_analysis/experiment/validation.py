@@ -334,8 +334,8 @@ def stability_limit(graph: Graph, gains: FloatArray) -> float:
 
     Rows and columns of agents with infinite gain are deleted; ``gains`` (m,) kappa. inf for a graph without links.
     """
-    follows = np.isfinite(gains)
-    z = (graph.laplacian + np.diag(np.where(follows, gains, 0.0)))[np.ix_(follows, follows)]
+    moved = np.isfinite(gains) & (graph.degrees + gains > 0.0)  # the others have rows of zeros
+    z = (graph.laplacian + np.diag(np.where(moved, gains, 0.0)))[np.ix_(moved, moved)]
     values = np.linalg.eigvalsh(z) if np.array_equal(z, z.T) else np.linalg.eigvals(z)
     size = np.abs(values)
     moving = size > 1e-9 * size.max(initial=np.finfo(float).tiny)

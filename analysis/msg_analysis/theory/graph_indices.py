@@ -46,7 +46,8 @@ class GraphIndices:
 def algebraic_connectivity(graph: Graph) -> float:
     """Second smallest real part of the Laplacian's eigenvalues, at least 0: the rate of agreement (Fiedler 1973)."""
     leads = graph.adjacency.T > 0
-    if (hops(leads, widest_reaching(leads)[:1]) < 0).any():  # exactly, where rounding would leave a little
+    # Exactly, where rounding would leave a little.
+    if graph.parts > 1 or (hops(leads, widest_reaching(leads)[:1]) < 0).any():
         return 0.0
     laplacian = graph.laplacian
     values = np.linalg.eigvalsh(laplacian) if graph.symmetric else np.linalg.eigvals(laplacian)

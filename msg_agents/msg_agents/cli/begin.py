@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any, cast
 import click
 
 from msg_analysis.cli.console import examples as example_lines
-from msg_analysis.cli.console import print_json, print_text, result_console
+from msg_analysis.cli.console import print_json, print_note, print_text, result_console
 from msg_analysis.cli.options import PATH, choice_option, json_option, positive_option
-from msg_analysis.common.console import print_note
 from msg_analysis.errors import ExitCode, InputError
 from msg_analysis.experiment.examples import (
     FOLDER,
