@@ -273,14 +273,16 @@ class Prediction:
         if self.path is None:
             raise NotAvailableError("outages: expected a given sequence of graphs, not a Markov chain: leave it out")
 
+        experiment = self.matrices.experiment
+
         def error(steps: BoolArray) -> float | None:
             if steps.all():
                 return self.emulated.system_error
-            path = self.matrices.path(steps)
-            return float(np.trace(path.covariance)) if path.counted else None
+            path = self.matrices.path(steps) if steps.any() else None
+            return float(np.trace(path.covariance)) if path and path.counted else None
 
-        with blas_threads(self.experiment.agents):
-            return outages(self.experiment, given_path(self.experiment)[1], most, error)
+        with blas_threads(experiment.agents):
+            return outages(experiment, given_path(experiment)[1], most, error)
 
     def for_run(self, experiment: Experiment) -> Prediction:
         """The same for another run, with what was computed before.

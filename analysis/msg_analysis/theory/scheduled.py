@@ -249,36 +249,36 @@ class Matrices:
         *,
         first: int = 0,
     ) -> None:
-        self._experiment, self._first = experiment, first
+        self.experiment, self._first = experiment, first
         self._given = step, system, steady
 
     @cached_property
     def step(self) -> StepModel:
         """See ``Prediction``."""
-        return self._given[0] or build_step_model(self._experiment)
+        return self._given[0] or build_step_model(self.experiment)
 
     @cached_property
     def system(self) -> JumpSystem:
         """See ``Prediction``."""
-        run = build_run_model(self._experiment, self.step)
-        return self._given[1] or emulated(run, self._experiment.problem)
+        known = self._given[1]
+        return known or emulated(build_run_model(self.experiment, self.step), self.experiment.problem)
 
     @cached_property
     def steady(self) -> FloatArray:
         """See ``Prediction``."""
         if self._given[2] is not None:
             return self._given[2]
-        start, modes = given_path(self._experiment)
-        with blas_threads(self._experiment.agents):
+        start, modes = given_path(self.experiment)
+        with blas_threads(self.experiment.agents):
             return path_moments(self.system, start[:, None], modes, self._first)[1]
 
     def path(self, steps: BoolArray | None = None) -> PathMoments:
         """Of a schedule: moments given its graphs; ``steps`` (N,): those that are made, by default all."""
-        start, modes = given_path(self._experiment)
+        start, modes = given_path(self.experiment)
         made = np.ones(len(modes), np.bool_) if steps is None else steps
         first = int(made[: self._first].sum())
-        if without_stacks(self._experiment):
-            return sparse_moments(self._experiment, start, modes[made], first)
+        if without_stacks(self.experiment):
+            return sparse_moments(self.experiment, start, modes[made], first)
         path, steady = path_moments(self.system, start[:, None], modes[made], first)
         if steps is None:
             self._given = self.step, self.system, steady

@@ -141,7 +141,7 @@ def test_what_outages_cost(more: dict[str, Any]) -> None:
     assert [each["adds"] for each in found["longest"]] == pytest.approx(adds, rel=1e-7)
 
 
-def test_of_what_there_are_no_outages(tmp_path: Any) -> None:
+def test_of_what_there_are_no_outages() -> None:
     """A chain; a schedule that never ends to connect all; and one that never does, of which no step is left."""
     chain = {"name": "net", "graphs": {"line": {"path": [1, 2, 3]}, "arc": {"arcs": [[1, 2]]}}}
     rates = {"rates": {"line": {"arc": 1.0}, "arc": {"line": 1.0}}}
@@ -153,12 +153,13 @@ def test_of_what_there_are_no_outages(tmp_path: Any) -> None:
         "error_without": predict(whole).emulated.system_error,
         "longest": [],
     }
-    never = Experiment.parse(chain | {"switching": {"schedule": [[0, "arc"]], "end": 100}})
-    assert predict(never).to_json(1)["outages"] == {
-        "count": 1,
-        "error_without": None,
-        "longest": [{"start": 0.0, "end": 100.0, "parts": 2, "adds": None}],
-    }
+    for noise in ({}, {"delay": 1}):
+        never = Experiment.parse(chain | {"switching": {"schedule": [[0, "arc"]]}, "noise": noise})
+        assert predict(never).to_json(1)["outages"] == {
+            "count": 1,
+            "error_without": None,
+            "longest": [{"start": 0.0, "end": 100.0, "parts": 2, "adds": None}],
+        }
 
 
 def test_more_graphs_than_matrices_fit_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,3 +188,6 @@ def test_options_of_outages(tmp_path: Any) -> None:
     assert any(line.startswith("5 7 2 ") for line in lines)
     assert any(line.startswith("2 outages; mean system error without this: ") for line in lines)
     assert "outages" not in CliRunner().invoke(main, ["predict", str(file), "--outages", "0"]).stdout
+    wrong = CliRunner().invoke(main, ["predict", "line_ring", "--outages", "1"])
+    assert (wrong.exit_code, wrong.stdout) == (2, "")
+    assert wrong.stderr.startswith("error: outages: expected a given sequence of graphs")
