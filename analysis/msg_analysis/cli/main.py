@@ -79,15 +79,15 @@ def main() -> None:
 @click.option("--precision", metavar="SHARE", help="Sample; half-width of the 95 % interval, relative: 1% or 0.01.")
 @click.option("--within", metavar="TIME", help="Sample for at most this time: 90s, 10min.")
 @click.option("--agents", metavar="LIST", help="Sample the errors of these agents, too: 1,17.")
-@click.option("--seed", type=click.IntRange(min=0), help="Sample with this seed.")
+@seed_option
 @json_option
 def predict(
     experiment: Path, *, changes: tuple[str, ...], start: float, outages: int | None, as_json: bool, **sampling: Any
 ) -> None:
-    """Predict the steady errors of EXPERIMENT: exactly, or by sampling.
+    """Predict the steady errors, exactly or by sampling.
 
-    They are sampled, with an interval, where the exact way is too large, or with --precision, --within, --agents or
-    --seed (1%, 60s, up to 20 agents, 0 where not given).
+    They are sampled, with an interval, where the exact way is too large, or with --precision (1%), --within (60s),
+    --agents (all of up to 20) or --seed.
     """
     from msg_analysis.report.theory_text import print_prediction
     from msg_analysis.theory.sampling import exact_ends, sampled_prediction
@@ -99,6 +99,8 @@ def predict(
     else:
         if start:
             raise InputError(f"--from {start:g}: expected with a schedule; a steady state has no time: leave it out")
+        if "seed" in given:
+            loaded = loaded.with_run(seed=given.pop("seed"))
         if "agents" in given:
             given["agents"] = [int(agent) if agent.isdigit() else agent for agent in given["agents"].split(",")]
         if "precision" in given:

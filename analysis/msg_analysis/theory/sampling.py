@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 LEVEL = 0.95
 ALL_AGENTS = 20  # most agents of which each has walks of its own by default
-FEWEST = 16  # samples before an interval is believed
+FEWEST = 32  # samples before an interval is believed
 NUMBERS = 2**17  # on arcs, that walks which are made together have at a time: they fit in a cache
 LEAST_TOGETHER, MOST_TOGETHER = 4, 512
 FEW_GRAPHS = 8  # whose matrices are multiplied, and not the arcs of each walk
@@ -136,7 +136,7 @@ def sampled_prediction(
     precision: float = 0.01,
     within: float = 60.0,
     agents: Sequence[int | str] = (),
-    seed: int = 0,
+    seed: int | None = None,
 ) -> SampledPrediction:
     """Sample the steady errors of the run's steps.
 
@@ -151,7 +151,8 @@ def sampled_prediction(
     agents
         whose errors are sampled, too, by number from 1 or name; with up to 20 agents, by default all
     seed
-        of the random numbers; for one seed, the time decides nothing but how many samples there are
+        of the random numbers, >= 0; for one seed, the time decides nothing but how many samples there are. None:
+        ``run.seed``
 
     Raises
     ------
@@ -163,6 +164,7 @@ def sampled_prediction(
         if not 0.0 < value < most:
             wanted = "expected a number above 0" + ", below 1" * (most < math.inf)
             raise InputError(f"{key}: {value:g}: {wanted}: for example 0.01")
+    seed = experiment.run.seed if seed is None else seed
     law, m = _Law(experiment), experiment.agents
     every = not agents and m <= ALL_AGENTS
     units = list(range(m)) if every else experiment.indices(agents)
