@@ -183,7 +183,7 @@ def sampled_prediction(
         share = precision * mean[0] / half[0] if half[0] else 1.0
         tell("samples", count, max(count, math.ceil(count / min(1.0, share) ** 2)))
     if count < 2:
-        wanted = "expected more than two samples take, each of which ends when the agents have forgotten its start"
+        wanted = "expected time for two samples at least, each of which ends when the agents have forgotten its start"
         raise InputError(f"within: {within:g} s: {wanted}: raise it")
     nodes, intervals = np.full(m, np.nan), np.full((m, 2), np.nan)
     nodes[units], intervals[units] = mean[1:], np.stack([mean - half, mean + half], axis=1)[1:]

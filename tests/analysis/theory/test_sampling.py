@@ -36,6 +36,7 @@ LAWS: dict[str, Experiment] = {
     "real time": line_ring(3, 1.0, noise={"process": CORRELATED}, run=REALTIME),
     "real time, noise on the air": five(noise={"loss": 0.3, "broadcast": 0.7, "link": 0.5}, run=REALTIME),
     "real time, held": five(noise=HELD | {"delay": 1}, run=REALTIME | {"dt": 0.1}),
+    "linear protocol": five(protocol={"name": "metropolis"}),
     "discrete time": line_ring(5, time="discrete", switching={"transition": [[0.9, 0.1], [0.2, 0.8]]}),
 }
 
@@ -67,6 +68,18 @@ def test_links_that_switch_by_themselves(count, exact):
     """Golden numbers of the chain on all 2^count graphs, by a dense solver. The seed is fixed; |z| < 4."""
     sampled = sampled_prediction(of_links(count), precision=0.02, seed=2)
     assert abs(z_of(sampled, exact)) < 4.0
+
+
+@pytest.mark.parametrize(
+    "changes", [{"noise": {"loss": 0.3}, "run": {"dt": 0.2}}, {"noise": HELD | {"delay": 1}, "run": REALTIME}]
+)
+def test_one_link_that_switches_makes_two_graphs(changes):
+    """Line and ring of five agents: the exact prediction is the oracle. The seed is fixed; |z| < 4."""
+    one = [[1, 5, 0.5]]
+    links = {"up": {"default": 1.0, "edges": one}, "down": {"edges": one}}
+    free = five(**changes, graphs={"ring": {"cycle": [1, 2, 3, 4, 5]}}, switching={"links": links})
+    sampled = sampled_prediction(free, precision=0.02, seed=2)
+    assert abs(z_of(sampled, five(**changes).predict().emulated.system_error)) < 4.0
 
 
 def simulated(law: Experiment, paths: int, steps: int, rng: np.random.Generator) -> tuple[float, float]:
@@ -151,7 +164,7 @@ def test_growing_walks_are_unstable_steps():
 
 
 def test_what_cannot_be_sampled():
-    with pytest.raises(InputError, match=r"within: 1e-09 s: expected more than two samples take"):
+    with pytest.raises(InputError, match=r"within: 1e-09 s: expected time for two samples at least"):
         sampled_prediction(five(), within=1e-9)
     with pytest.raises(InputError, match="precision: 2: expected a number above 0, below 1"):
         sampled_prediction(five(), precision=2.0)
