@@ -14,13 +14,11 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.experiment.graphs import Graph
 from msg_analysis.theory.sampling import SampledPrediction, sampled_prediction
 
 RATE, DT = 0.5, 0.05
@@ -48,16 +46,12 @@ def small(changes: dict[str, Any]) -> Experiment:
     return Experiment.parse(fields | {"run": {"dt": DT, "duration": 10} | changes.get("run", {})})
 
 
-def links(agents: int, ends: list[tuple[int, int]]) -> tuple[Experiment, Any]:
-    """An experiment of so many agents, and these links, agents from 1, which switch by themselves."""
-    numbers = {(i - 1, j - 1): number for number, pair in enumerate(ends) for i, j in (pair, pair[::-1])}
-    targets, sources = np.array(sorted(numbers)).T
-    mesh = Graph("mesh", agents, targets, sources, np.ones(len(targets)))
-    change = np.full(len(ends), (1.0 - np.exp(-2.0 * RATE * DT)) / 2.0)
-    of_arcs = np.array([numbers[pair] for pair in sorted(numbers)])
-    path = {"graphs": {"mesh": {"path": list(range(1, agents + 1))}}, "switching": {}}
-    experiment = Experiment.parse({"name": "links", **path, "run": {"dt": DT, "duration": 10}})
-    return experiment, SimpleNamespace(mesh=mesh, link_of=of_arcs, rise=change, fall=change)
+def links(agents: int, ends: list[tuple[int, int]]) -> Experiment:
+    """So many agents, and these links, agents from 1, which switch by themselves."""
+    graphs = {"mesh": {"edges": [list(pair) for pair in ends]}}
+    switching = {"links": {"up": RATE, "down": RATE}}
+    run = {"dt": DT, "duration": 10}
+    return Experiment.parse({"name": "links", "agents": agents, "graphs": graphs, "switching": switching, "run": run})
 
 
 def sixty_links() -> None:
@@ -67,8 +61,7 @@ def sixty_links() -> None:
         i, j = sorted((rng.choice(30, 2, replace=False) + 1).tolist())
         if (i, j) not in ends:
             ends.append((i, j))
-    experiment, free = links(30, ends)
-    report(sampled_prediction(experiment, links=free, precision=0.01))
+    report(sampled_prediction(links(30, ends), precision=0.01))
 
 
 def write_large(directory: Path, agents: int = 100_000) -> Path:
@@ -127,7 +120,7 @@ def coverage(repetitions: int, precision: float) -> None:
     """Print the second table."""
     print(f"\n| law, to {100 * precision:g} % | samples, mean | intervals that hold the exact error |")
     print("|---|---:|---:|")
-    experiment, free = links(6, GOLDEN_LINKS)
+    experiment = links(6, GOLDEN_LINKS)
     cases: dict[str, tuple[float, Callable[[int], SampledPrediction]]] = {}
     for name, changes in LAWS.items():
         law = small(changes)
@@ -137,7 +130,7 @@ def coverage(repetitions: int, precision: float) -> None:
         )
     cases["nine links"] = (
         GOLDEN_ERROR,
-        lambda seed: sampled_prediction(experiment, links=free, precision=precision, seed=seed),
+        lambda seed: sampled_prediction(experiment, precision=precision, seed=seed),
     )
     for name, (exact, sample) in cases.items():
         found = [sample(seed) for seed in range(repetitions)]
