@@ -20,6 +20,7 @@ LINES: dict[tuple[str, str], tuple[str, ...]] = {
     ("msg-analysis", "compare"): ("bag",),
     ("msg-analysis", "sweep"): ("sweep.yaml", "--out", "out"),  # networks: tests/integration/test_sweep.py
     ("msg-agents", "doctor"): (),
+    ("msg-agents", "new"): ("new.yaml",),  # "missing" stays missing: else the command "run" would run it
 }
 # In one process, since each would import the same again. It is started as an executable is: its folder is on the path.
 ALL = f"""

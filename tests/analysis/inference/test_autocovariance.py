@@ -56,7 +56,7 @@ def test_lag_0_is_the_system_error_given_the_path() -> None:
 )
 def test_many_states_of_one_path(noise: dict[str, Any]) -> None:
     """3000 replicas of one path: mean and covariance of the sums are the stated ones, 4.5 standard errors allowed."""
-    run = observed(steps(run={"duration": 10, "replicas": 3000, "start": [1, 0, -2, 0, 3]}, noise=noise))
+    run = observed(steps(run={"duration": 4, "replicas": 3000, "start": [1, 0, -2, 0, 3]}, noise=noise))
     result = found(run, LAGS)
     assert np.abs((result.measured - result.expected) / result.standard_errors).max() < 4.5
     first = noise.get("delay", -1) + 1 if "link" in noise else 0  # noisy and late: step d + 1
@@ -76,13 +76,13 @@ def test_many_states_of_one_path(noise: dict[str, Any]) -> None:
     [
         {"process": 1.0},
         {"process": 1.0, "loss": 0.2, "broadcast": 0.3},
-        {"process": 0.3, "delay": 6, "link": 2.0, "broadcast": 0.3},
+        {"process": 0.3, "delay": 4, "link": 2.0, "broadcast": 0.3},
     ],
 )
 def test_p_values_of_correct_runs_are_uniform(noise: dict[str, Any]) -> None:
     """60 runs; Kolmogorov and Smirnov at 0.1 %: so often it fails with another seed."""
-    # A replica costs next to nothing, a step much: 300 steps of 8 replicas are as many numbers as 1,200 of 2.
-    experiment = steps(noise=noise, run={"duration": 15, "replicas": 8})
+    # A replica costs next to nothing, a step much: 150 steps of 16 replicas are as many numbers as 1,200 of 2.
+    experiment = steps(noise=noise, run={"duration": 7.5, "replicas": 16})
     prediction = predict(experiment)
     values = [found(observed(experiment.with_run(seed=seed), prediction), LONG_LAGS).p for seed in range(60)]
     assert scipy.stats.kstest(values, "uniform").pvalue > 0.001

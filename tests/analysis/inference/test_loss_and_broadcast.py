@@ -17,7 +17,7 @@ from msg_analysis.inference.regression import Regression
 from msg_analysis.inference.residuals import BroadcastSums, ResidualSums, residuals
 
 AIR = {"broadcast": 0.3, "link": 0.2, "loss": 0.2}
-SEEDS = range(40)
+SEEDS = range(30)
 
 
 CASES = {
@@ -32,7 +32,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.usefixtures("predicted_once")
 def test_calibration(case):
-    """40 true runs of 400 steps."""
+    """30 true runs of 400 steps."""
     results = [compare(simulate(CASES[case].with_run(seed=seed))) for seed in SEEDS]
     collected = {test.name for test in results[0].tests}
     names = {"system error, corrected", "covariance", "residuals: covariance", "residuals: gains"}

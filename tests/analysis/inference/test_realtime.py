@@ -120,8 +120,8 @@ IN_DETAIL = [
 
 @pytest.mark.parametrize("case", ["consensus", "noise by graph"])
 def test_calibration(case):
-    """30 late runs of 400 steps."""
-    laws = [CASES[case].with_run(seed=seed) for seed in range(30)]
+    """25 late runs of 250 steps."""
+    laws = [CASES[case].with_run(seed=seed, duration=25) for seed in range(25)]
     results = [compare(late_timers.run(law, timing_seed=seed, **LATENESS)) for seed, law in enumerate(laws)]
     names = ["system error", *(f"error of agent {i}" for i in (1, 2, 3)), "covariance"]
     names += [f"residuals: {what}" for what in ("covariance", "whiteness", "gains", "common gain")]

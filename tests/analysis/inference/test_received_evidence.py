@@ -26,7 +26,7 @@ LAWS: dict[str, dict[str, Any]] = {
     "burst": {"noise": {"loss": {"arcs": [[1, 2, 0.2], [2, 1, 0.2]]}, "burst": 4}},
     "burst, hold": {"noise": {"loss": {"arcs": [[1, 2, 0.2]]}, "burst": 4, "on_loss": "hold"}},
     "delay": {"noise": {"delay": 3}},
-    "delay, link": {"noise": {"delay": 40, "link": 1.0, "loss": 0.1}},
+    "delay, link": {"noise": {"delay": 12, "link": 1.0, "loss": 0.1}},
     "delay, hold": {"noise": {"delay": 2, "loss": 0.2, "on_loss": "hold"}},
     "correlated": {"noise": {"process": [[1.0, 0.5, 0, 0, 0], *np.eye(5).tolist()[1:]], "loss": 0.3}},
     "leaders": {
@@ -108,7 +108,7 @@ def test_steps_that_were_not_seen(name: str) -> None:
 
 def test_values_older_than_what_is_kept() -> None:
     """Which agents are left out depends on losses only, so that the evidence stays fair, and losses all count."""
-    run = simulate(law(duration=200.0, noise={"loss": 0.7, "on_loss": "hold"}))
+    run = simulate(law(duration=60.0, noise={"loss": 0.7, "on_loss": "hold"}))
     live, wanted = LiveEstimate(run.record, kept=8), whole_sums(run, predict(run.record.experiment))
     watch(live, messages_of(run))
     sums = live.evidence.sums
