@@ -18,12 +18,13 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import yaml
 from left_processes import describe, last_line
-from many_commands import ForkedCommand, ensure_running
+from many_commands import MARK, ForkedCommand, ForkedNodeServer, ensure_running
 from networks import assert_equal_to_twin, document, experiment
 from started_processes import started_processes
 from terminal import Terminal
@@ -32,6 +33,7 @@ from waiting import wait_for
 pytest.importorskip("rclpy")
 
 from msg_agents.discovery.rtps import free_domain
+from msg_agents.run import fork_server
 from msg_agents.run.folder import PREFIX
 from msg_agents.run.result import RunResult, read_steps
 from msg_agents.run.runner import run_network
@@ -43,7 +45,6 @@ from msg_analysis.model.run import Run
 from msg_analysis.twin.simulate import simulate
 
 Command = ForkedCommand | subprocess.Popen[str]
-MARK = "MSG_AGENTS_TEST"
 PROGRAM = Path(sys.executable).with_name("msg-agents")
 PLAIN_RECORDER = Path(__file__).parents[1] / "support" / "plain_recorder.py"
 ensure_running()  # it imports while tests are collected, and serves all of them
@@ -275,6 +276,7 @@ def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
     mark = uuid.uuid4().hex
     monkeypatch.setenv(MARK, mark)
+    monkeypatch.setattr(fork_server, "programs", SimpleNamespace(start=ForkedNodeServer))
     for name in list(os.environ):
         if name.startswith(("ROS_DOMAIN", "ROS_AUTOMATIC", "ROS_STATIC", "FASTDDS_", "FASTRTPS_")):
             monkeypatch.delenv(name)

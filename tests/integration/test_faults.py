@@ -195,7 +195,7 @@ LONGEST_STOP = 120.0 if "STRESS" in os.environ else 2.0  # s
 @pytest.mark.timeout(600)
 def test_stopped_processes(network: Any, repetition: int, rng: random.Random) -> None:
     """Any of the run, up to all, for any time: the others wait for them, and nothing is lost."""
-    file = network.file(run={"duration": 800, "processes": rng.choice([2, 5])})
+    file = network.file(run={"duration": 200, "processes": rng.choice([2, 5])})
     run = network.record(file, "--json")
     network.wait_for_steps()
     time.sleep(rng.uniform(0.0, 0.5))

@@ -154,7 +154,7 @@ def test_hosts_of_unlike_processors(lan: Lan) -> None:
 def test_a_host_is_cut_off_for_five_seconds(lan: Lan, repetition: int, rng: random.Random) -> None:
     """Its cable is pulled, or its interface goes down: everybody waits, then all goes on, and nothing is lost."""
     # The demo network across three hosts equals the twin to the last bit, and agrees with the prediction.
-    prepare(lan, 200)
+    prepare(lan, 150)
     host, cable = rng.choice(NAMES), rng.random() < 0.5
     hosts = lan.start_all("--write-report", "never")
     lan.network.wait_until_moving("base")
@@ -209,7 +209,7 @@ def rejoined(lan: Lan, patch: pytest.MonkeyPatch, duration: float, run: dict[str
 
 @pytest.mark.timeout(300)
 def test_a_host_that_comes_back_after_its_lease_rejoins(lan: Lan, monkeypatch: pytest.MonkeyPatch) -> None:
-    rejoined(lan, monkeypatch, 200, {})
+    rejoined(lan, monkeypatch, 150, {})
 
 
 @pytest.mark.timeout(300)

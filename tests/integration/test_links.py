@@ -110,7 +110,7 @@ def test_killed_agents_hold_again_what_they_held(network: Any) -> None:
     """Bursts of 200 messages: an agent that comes back needs values from long before it was killed."""
     # Of four processes, one of a single agent and the one of two agents are killed.
     held = MESSAGES["all"] | {"delay": 2, "loss": 0.5, "burst": 200}
-    run = {"duration": 250, "replicas": 16, "processes": 4}
+    run = {"duration": 150, "replicas": 16, "processes": 4}
     file = network.file(noise={"process": 1.0, **held}, run=run)
 
     def victims() -> list[Any]:

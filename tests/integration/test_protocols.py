@@ -75,7 +75,7 @@ def test_noise_and_loss_and_killed_agents(network: Any) -> None:
     """All of the state comes back, and others hear the same of it as before."""
     document = yaml.safe_load((EXPERIMENTS / "integral_action.yaml").read_text())
     document["noise"] |= {"broadcast": 0.2, "link": 0.1, "loss": 0.2}
-    document["run"] |= {"duration": 120, "replicas": 32, "processes": 3}
+    document["run"] |= {"duration": 80, "replicas": 32, "processes": 3}
     file = network.file(**document)
     process = network.record(file, "--restarts", "3", "--json")
     trajectory = network.killed_and_back(process, network.any_agent, 2)

@@ -18,9 +18,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
-from multiprocessing import forkserver
+from multiprocessing import forkserver, reduction
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import IO, Any
+
+import pytest
 
 from msg_agents.cli.node_server import MODULES
 
@@ -35,12 +38,22 @@ FORKING.set_forkserver_preload(
         *("msg_agents.watch.panel", "msg_analysis.inference.pool", "msg_analysis.report.documents"),
         *("msg_analysis.report.page", "msg_analysis.report.tables", "msg_analysis.report.theory_text"),
         *("networkx", "rich._emoji_codes", "rich.progress"),
+        "forked_node_server",
     ]
 )
-ensure_running = forkserver.ensure_running
-"""Start what forks them: its own environment is that of now."""
+MARK = "MSG_AGENTS_TEST"
+"""Variable by which tests find their processes."""
+NO_MARK = 32 * "0"  # as long as one
 MEMORY = 1 << 30  # bytes
 LONGEST = 60  # s of a job
+
+
+def ensure_running() -> None:
+    """Start what forks them: its own environment is that of now, with a mark that ``forked_node_server`` can change."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(MARK, NO_MARK)
+        patch.setenv("PYTHONPATH", str(Path(__file__).parent))
+        forkserver.ensure_running()
 
 
 class ForkedCommand:
@@ -111,6 +124,30 @@ class ForkedCommand:
 
     def kill(self) -> None:
         self.send_signal(signal.SIGKILL)
+
+
+class ForkedNodeServer:
+    """A node server of a network that this process itself runs, with what is used of ``subprocess.Popen``."""
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        *,
+        stdout: IO[bytes],
+        pass_fds: Sequence[int],
+        **_: Any,
+    ) -> None:
+        descriptors = [reduction.DupFd(number) for number in (stdout.fileno(), *pass_fds)]
+        process = FORKING.Process(target=_serve_nodes, args=(command, dict(environment), *descriptors))
+        process.start()
+        self.pid, self.kill, self.wait = process.pid, process.kill, process.join
+
+
+def _serve_nodes(command: Sequence[str], environment: dict[str, str], output: Any, control: Any) -> None:
+    from forked_node_server import become
+
+    become(command, environment, output.detach(), control.detach())
 
 
 def _become(

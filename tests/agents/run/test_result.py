@@ -84,9 +84,14 @@ def test_a_full_disk_is_no_failure(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("limit", "lost"), [(100, ["report.html", "result.json"]), (50_000, ["report.html"]), (None, ["result.json"])]
+    ("limit", "lost", "as_json"),
+    [
+        (100, ["report.html", "result.json"], True),
+        (100, ["report.html", "result.json"], False),
+        (50_000, ["report.html"], True),
+        (None, ["result.json"], False),
+    ],
 )
-@pytest.mark.parametrize("as_json", [True, False])
 def test_the_verdict_is_said_without_room_for_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], limit: int | None, lost: list[str], as_json: bool
 ) -> None:

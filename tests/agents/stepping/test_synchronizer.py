@@ -199,7 +199,7 @@ def losses(agents: int, steps: int, loss: float, chance: random.Random) -> froze
     return frozenset(value for value in values if chance.random() < loss)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(cases(), st.integers(0, 2**32), st.sampled_from([1.0, 0.1, 0.001]))
 def test_any_network_in_any_order_is_the_serial_loop(case: Case, seed: int, slowness: float) -> None:
     rng = random.Random(seed)
@@ -216,7 +216,7 @@ def test_any_network_in_any_order_is_the_serial_loop(case: Case, seed: int, slow
     network.check_end(serial(case))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(cases(), st.integers(0, 2**32))
 def test_agents_may_be_killed_at_any_time(case: Case, seed: int) -> None:
     """Each of them a few times, also while others wait for its answer."""
@@ -246,7 +246,7 @@ def run_with_kills(case: Case, rng: random.Random) -> None:
     network.check_end(serial(case))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(cases(), st.data(), st.integers(0, 2**32))
 def test_the_run_may_end_early_at_any_time(case: Case, data: st.DataObject, seed: int) -> None:
     """Agents learn of the last step at different times: all make every step up to it, and none waits for ever."""

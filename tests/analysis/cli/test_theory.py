@@ -250,16 +250,16 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch: pytest.
 
 def test_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for number, example in list(examples.EXAMPLES.items()):
-        monkeypatch.setitem(examples.EXAMPLES, number, lambda example=example: example(5))
+        monkeypatch.setitem(examples.EXAMPLES, number, functools.cache(functools.partial(example, 5)))
     result = call("figures", "--out", tmp_path / "all", "--format", "svg")
     assert (result.exit_code, result.stderr) == (0, "")
     names = [f"example_{number}.{kind}" for number in (1, 2, 3) for kind in ("svg", "csv")]
     assert result.stdout.splitlines() == [str(tmp_path / "all" / name) for name in names]
     assert sorted(path.name for path in (tmp_path / "all").iterdir()) == sorted(names)
-    result = call("figures", "1", "--out", tmp_path / "one", "--format", "pdf", "--format", "pdf", "--format", "svg")
+    result = call("figures", "2", "--out", tmp_path / "one", "--format", "pdf", "--format", "pdf", "--format", "svg")
     assert sorted(path.suffix for path in (tmp_path / "one").iterdir()) == [".csv", ".pdf", ".svg"]
     (tmp_path / "file").touch()
-    result = call("figures", "1", "--out", tmp_path / "file")
+    result = call("figures", "2", "--out", tmp_path / "file", "--format", "svg")
     assert (result.exit_code, result.stdout) == (2, "")
     assert "choose another place with --out" in result.stderr
     assert call("figures", "4").exit_code == 2

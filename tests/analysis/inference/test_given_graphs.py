@@ -39,9 +39,9 @@ def scheduled(**changes: Any) -> Experiment:
 
 @pytest.mark.parametrize("messages", MESSAGES)
 def test_correct_runs(messages: str) -> None:
-    """At level 0.01, more than 2 of 12 with probability 0.0002, as more than 4 errors outside intervals of 95 %."""
+    """At level 0.01, more than 2 of 10 with probability 0.0001, as more than 4 errors outside intervals of 95 %."""
     law = scheduled(**MESSAGES[messages])
-    found = [compare(simulate(law.with_run(seed=seed))) for seed in range(12)]
+    found = [compare(simulate(law.with_run(seed=seed))) for seed in range(10)]
     assert sum(one.verdict != "agrees" for one in found) <= 2
     assert all(one.switching is None for one in found)
     errors = [one.system_error for one in found]

@@ -269,7 +269,7 @@ def test_the_verdict_in_real_time_is_calibrated():
     Intervals of the system error cover in 95 % of them: fewer than 15 of 20 with probability 3e-4. At level 0.1, more
     than 8 disagree with probability 6e-5 at most.
     """
-    what = network({"loss": 0.3, "link": 0.3, "broadcast": 0.2}, pace="realtime", dt=0.1, duration=30, start="zero")
+    what = network({"loss": 0.3, "link": 0.3, "broadcast": 0.2}, pace="realtime", dt=0.1, duration=20, start="zero")
     covered = alarms = 0
     for seed in range(20):
         found = compare(message_run(what, seed), level=0.1)

@@ -54,7 +54,7 @@ def test_lengths_are_those_of_the_formulas() -> None:
 
 def test_the_interval_of_a_run_is_the_planned_one() -> None:
     """The standard error that a run itself states, and its interval for all times."""
-    experiment = line_ring(duration=4000, replicas=4)
+    experiment = line_ring(duration=1000, replicas=4)
     plan, found = experiment.plan(), compare(simulate(experiment))
     measured = found.system_error.standard_error / plan.precision.error
     assert measured == pytest.approx(plan.precision.standard_error(found.steps, 4), rel=0.05)

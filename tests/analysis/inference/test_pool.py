@@ -90,8 +90,8 @@ def test_document(three):
 @pytest.mark.parametrize("what", [law(), AIR], ids=["quiet", "air"])
 @pytest.mark.usefixtures("predicted_once")
 def test_calibration(what):
-    """p-values of 25 pools of two runs: Kolmogorov-Smirnov at 2e-4 for each of at most 21 tests."""
-    results = [compare_pooled(several(what, (50.0, 70.0), first_seed=10 * i)) for i in range(25)]
+    """p-values of 20 pools of two runs: Kolmogorov-Smirnov at 2e-4 for each of at most 21 tests."""
+    results = [compare_pooled(several(what, (30.0, 40.0), first_seed=10 * i)) for i in range(20)]
     for place, test in enumerate(results[0].tests):
         assert kolmogorov_smirnov(test.name, [result.tests[place].p for result in results]) > 2e-4, test.name
     assert_few_alarms(results)
