@@ -24,7 +24,7 @@ from typing import Any
 import pytest
 import yaml
 from left_processes import describe, last_line
-from many_commands import MARK, ForkedCommand, ForkedNodeServer, ensure_running
+from many_commands import MARK, ForkedCommand, ensure_running, start_program
 from networks import assert_equal_to_twin, document, experiment
 from started_processes import started_processes
 from terminal import Terminal
@@ -276,7 +276,7 @@ def network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
     mark = uuid.uuid4().hex
     monkeypatch.setenv(MARK, mark)
-    monkeypatch.setattr(fork_server, "programs", SimpleNamespace(start=ForkedNodeServer))
+    monkeypatch.setattr(fork_server, "programs", SimpleNamespace(start=start_program))
     for name in list(os.environ):
         if name.startswith(("ROS_DOMAIN", "ROS_AUTOMATIC", "ROS_STATIC", "FASTDDS_", "FASTRTPS_")):
             monkeypatch.delenv(name)

@@ -8,9 +8,7 @@ import pytest
 from networks import assert_equal_to_twin
 from processors import another_processor
 
-from msg_agents.run import fork_server
 from msg_analysis.bags.reading import read_bag
-from msg_analysis.common import programs
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.pool import compare
 from msg_analysis.model.run import Run
@@ -97,11 +95,8 @@ def test_a_network_on_another_processor(network: Any) -> None:
 
 
 @pytest.mark.parametrize("fork", [True, False])
-def test_progress_the_other_executor_and_what_is_imported(
-    network: Any, fork: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_progress_the_other_executor_and_what_is_imported(network: Any, fork: bool) -> None:
     """The executor that a ROS 2 without the events executor falls back to; every process names what it imports."""
-    monkeypatch.setattr(fork_server, "programs", programs)  # a server that has not been forked
     seen: list[int] = []
     environment = {"MSG_AGENTS_EXECUTOR": "single", "PYTHONPROFILEIMPORTTIME": "1"}
     what = network.experiment(run={"processes": 2 if fork else 1})

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NoReturn
 
-from many_commands import MARK, NO_MARK
+from many_commands import MARK, NO_MARK, starts_as_here
 from setproctitle import setproctitle
 
 from msg_agents.cli import node_server
@@ -31,8 +31,8 @@ class ForkedServer(ForkedProcess):
 
 
 def start(command: Sequence[str], environment: Mapping[str, str], **options: Any) -> Any:
-    """``programs.start``, but for the node server."""
-    if list(command[:3]) != fork_server.PROGRAM:
+    """``programs.start``, but node servers are forked."""
+    if not starts_as_here(command, environment):
         return programs.start(command, environment, **options)
     sys.stdout.flush()
     sys.stderr.flush()

@@ -21,11 +21,14 @@ from functools import partial
 from multiprocessing import forkserver, reduction
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import pytest
 
 from msg_agents.cli.node_server import MODULES
+from msg_agents.environment import FOREIGN_VARIABLES
+from msg_agents.run.fork_server import PROGRAM
+from msg_analysis.common import programs
 
 Job = tuple[str, list[str], str]
 PROGRAMS = {"msg-analysis": "msg_analysis.cli.main", "msg-agents": "msg_agents.cli.main"}
@@ -44,6 +47,7 @@ FORKING.set_forkserver_preload(
 MARK = "MSG_AGENTS_TEST"
 """Variable by which tests find their processes."""
 NO_MARK = 32 * "0"  # as long as one
+PYTHON_IS_THE_SAME = {"PYTHONUNBUFFERED", "PYTHONSAFEPATH", "PYTHONDONTWRITEBYTECODE"}  # with these, for what is tested
 MEMORY = 1 << 30  # bytes
 LONGEST = 60  # s of a job
 
@@ -126,22 +130,27 @@ class ForkedCommand:
         self.send_signal(signal.SIGKILL)
 
 
-class ForkedNodeServer:
-    """A node server of a network that this process itself runs, with what is used of ``subprocess.Popen``."""
+def starts_as_here(command: Sequence[str], environment: Mapping[str, str]) -> bool:
+    """Whether it is a node server that imports what this process would, by what is in its environment."""
+    others = {*FOREIGN_VARIABLES, *(name for name in environment if name.startswith("PYTHON"))} - PYTHON_IS_THE_SAME
+    return list(command[:3]) == PROGRAM and not any(environment.get(name) for name in others)
 
-    def __init__(
-        self,
-        command: Sequence[str],
-        environment: Mapping[str, str],
-        *,
-        stdout: IO[bytes],
-        pass_fds: Sequence[int],
-        **_: Any,
-    ) -> None:
-        descriptors = [reduction.DupFd(number) for number in (stdout.fileno(), *pass_fds)]
+
+class _ForkedServer:
+    """With what is used of ``subprocess.Popen``."""
+
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str], output: int, control: int) -> None:
+        descriptors = [reduction.DupFd(number) for number in (output, control)]
         process = FORKING.Process(target=_serve_nodes, args=(command, dict(environment), *descriptors))
         process.start()
         self.pid, self.kill, self.wait = process.pid, process.kill, process.join
+
+
+def start_program(command: Sequence[str], environment: Mapping[str, str], **options: Any) -> Any:
+    """``programs.start``, but node servers of networks that this process itself runs are forked."""
+    if not starts_as_here(command, environment):
+        return programs.start(command, environment, **options)
+    return _ForkedServer(command, environment, options["stdout"].fileno(), *options["pass_fds"])
 
 
 def _serve_nodes(command: Sequence[str], environment: dict[str, str], output: Any, control: Any) -> None:
