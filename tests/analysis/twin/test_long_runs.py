@@ -71,11 +71,11 @@ def test_check_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPat
 def test_comparison_needs_memory_for_a_block(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twice the steps need at most some numbers more for each; its states alone have 192 bytes."""
     monkeypatch.setenv(LARGE_VARIABLE, "1")
-    runs = [simulate(long_run(case, steps, replicas=8, agents=3)) for steps in (100, 200)]
+    runs = [simulate(long_run(case, steps, replicas=8, agents=3)) for steps in (60, 120)]
     for run in runs:  # what is kept for comparisons to come
         compare_run(run, block_numbers=400)
     short, long = (_peak(lambda run=run: compare_run(run, block_numbers=400)) for run in runs)
-    assert long - short < 100 * 96
+    assert long - short < 60 * 96
 
 
 def _peak(work: Callable[[], object]) -> int:

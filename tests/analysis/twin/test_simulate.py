@@ -20,11 +20,11 @@ from msg_analysis.model.step_model import build_step_model
     ],
 )
 def test_mean_square_error_is_the_predicted_one(law: str, air: str) -> None:
-    """30 independent seeds, 60 replicas, forty steps after a stationary start."""
+    """30 independent seeds, 30 replicas, forty steps after a stationary start."""
     # z of the mean over seeds (replicas share lost messages), p > 3e-5 by Student's t with 29 degrees of freedom, for 4
     # agents of 17 cases: a right program fails with probability about 2e-3. An error wrong by a third fails.
     duration = 40 if LAWS[law].get("time") == "discrete" else 2
-    setup = four_agents(law, air, replicas=60, duration=duration, start="stationary")
+    setup = four_agents(law, air, replicas=30, duration=duration, start="stationary")
     means = []
     for seed in range(30):
         states = simulate(setup.with_run(seed=seed)).states[-1]
