@@ -34,7 +34,7 @@ def test_equal(network: Any, repetition: int, rng: random.Random) -> None:
     """Up to three processes are killed or stopped, each at any moment: the run is complete and equal to its twin."""
     file, steps = written(network, KILLED + repetition)
     run = network.record(file, "--restarts", "3", "--json")
-    network.wait_for(network.nodes, 60, "a process")
+    network.wait_for(lambda: network.processes("agent", "switcher"), 60, "a process")
     reached = network.run_file().with_name(STEPS)
     killed: list[str] = []
     for number in range(rng.randint(1, 3)):
