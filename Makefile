@@ -62,7 +62,7 @@ $(VENV)/.packages: $(VENV)/.interfaces $(wildcard analysis/setup.* analysis/msg_
 $(VENV)/.compiled: $(VENV)/.locked
 	@echo "Compiling all packages (half a minute, once)" >&2
 	@$(BIN)/python -m compileall -q -j 0 -x '/tests?/' $(VENV)/lib >/dev/null 2>&1 || true  # some have templates, which are no modules
-	@$(BIN)/python -m pytest --collect-only >/dev/null 2>&1 || true  # as for the modules of tests, which every worker would compile
+	@$(BIN)/python -m pytest --collect-only >/dev/null 2>&1 || true  # modules of tests, which each worker would compile
 	@touch $@
 
 demo: setup ## Run the line/ring network of the paper: processes, bag, verdict, report

@@ -62,7 +62,6 @@ def become(command: Sequence[str], environment: Mapping[str, str], output: int, 
     sys.stderr = open(2, "w", buffering=1, closefd=False)  # noqa: SIM115
     os.environ.clear()
     os.environ.update({**environment, **programs.SAFE_PATH})
-    sys.path[:0] = filter(None, environment.get("PYTHONPATH", "").split(os.pathsep))
     _write_mark(environment.get(MARK, NO_MARK))
     sys.argv = [fork_server.PROGRAM[-1], str(control)]
     setproctitle(" ".join(["python", *command[1:4]]))
@@ -73,7 +72,7 @@ def become(command: Sequence[str], environment: Mapping[str, str], output: int, 
 def _write_mark(mark: str) -> None:
     """Where others see it: in the environment with which what has forked this process was executed."""
     begin, end = map(int, Path("/proc/self/stat").read_text().rpartition(")")[2].split()[47:49])
-    place = ctypes.string_at(begin, end - begin).find(f"{MARK}=".encode())
+    place = ctypes.string_at(begin, end - begin).index(f"{MARK}=".encode())
     ctypes.memmove(begin + place + len(MARK) + 1, mark.encode(), len(NO_MARK))
 
 
