@@ -44,6 +44,7 @@ from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import step_law
 from msg_analysis.theory.fourth_moments import FourthMoment
 from msg_analysis.theory.prediction import SHOWN_AGENTS, Prediction
+from msg_analysis.theory.sampling import SampledPrediction
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -243,6 +244,8 @@ class Comparison:
         of the noise in published values; None without
     unpredicted
         why there is no prediction; None where there is one
+    sampled
+        the steady errors by sampling, where only their exact prediction is too large; the verdict does not use them
     transient
         steps at the start that are left out of the measured errors; None with a prediction, which includes them
     timing, laws
@@ -282,6 +285,7 @@ class Comparison:
     loss: LossTest | None = None
     p_broadcast: float | None = None
     unpredicted: str | None = None
+    sampled: SampledPrediction | None = None
     transient: int | None = None
     timing: Timing | None = None
     laws: Laws | None = None
@@ -390,6 +394,8 @@ class Comparison:
         document = {
             "verdict": self.verdict,
             "unpredicted": self.unpredicted,
+            "sampled": self.sampled
+            and {"system_error": self.sampled.system_error, "interval": list(self.sampled.interval)},
             "transient": self.transient,
             "run": None if self.pool else str(record.run),
             "experiment": record.experiment.name,

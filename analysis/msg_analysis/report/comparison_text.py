@@ -111,6 +111,8 @@ def _facts(document: dict[str, Any]) -> list[str]:
     lines += gaps(count)
     if document.get("unpredicted"):
         lines.append(f"No prediction: {document['unpredicted']}.")
+    if sampled := document.get("sampled"):
+        lines.append(f"Sampled instead: {number_text(sampled['system_error'])} ({interval_text(sampled['interval'])}).")
     if document.get("transient"):
         lines.append(f"The errors leave out the first {document['transient']} steps (transient).")
     return lines

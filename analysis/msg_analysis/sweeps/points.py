@@ -265,7 +265,10 @@ def _result(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
     experiment = Experiment.parse(json.loads(job.document), source="experiment")
     if job.kind == "predict":
         from msg_analysis.theory.prediction import predict
+        from msg_analysis.theory.sampling import prediction_method, sampled_prediction
 
+        if prediction_method(experiment)[0] == "sampled":
+            return of_prediction(sampled_prediction(experiment).to_json())
         return of_prediction(predict(experiment).to_json())
     from msg_analysis.inference.verdict import compare_run
     from msg_analysis.twin.simulate import simulate
