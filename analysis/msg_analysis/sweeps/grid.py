@@ -28,6 +28,7 @@ from msg_analysis.experiment.problems import ExperimentError, problem, show, tra
 from msg_analysis.experiment.values import Count, expected, is_number
 from msg_analysis.model.run_record import Until
 from msg_analysis.sweeps.points import Job, JobKind
+from msg_analysis.theory.sampling import prediction_method
 
 MOST_POINTS = 20_000  # of a sweep: the experiments of all are held in memory
 
@@ -336,6 +337,8 @@ def points_of(path: Path, spec: SweepSpec, base: Mapping[str, Any], directory: P
                 document = put(document, key, value)
             experiment = Experiment.parse(document, source=str(path), directory=directory)
             lines = unavailable(experiment, "predict" if spec.kind == "predict" else "run")
+            if spec.kind == "predict" and prediction_method(experiment)[0] == "sampled":
+                lines = []
         except KeyProblemError as error:
             lines = [str(error)]
         except ExperimentError as error:
