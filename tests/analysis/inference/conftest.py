@@ -23,4 +23,4 @@ def predicted_once(monkeypatch):
             assert known[key].fourth_moment  # computed once, as what the copies keep
         return known[key].for_run(experiment)
 
-    monkeypatch.setattr(verdict, "predict", prediction)
+    monkeypatch.setattr(verdict, "predict_run", prediction)

@@ -85,7 +85,7 @@ SLOW = [[0.95, 0.05], [0.05, 0.95]]
 
 def holding_times(transition: list[list[float]], path: np.ndarray, size: int = 10**6) -> HoldingTimes:
     """Of a path of graphs, counted in blocks of so many steps."""
-    step = SimpleNamespace(transition=np.array(transition), modes=len(transition))
+    step = SimpleNamespace(transition=np.array(transition), modes=len(transition), switching=None)
     law: Any = SimpleNamespace(step=step, noisy=np.ones(3, dtype=bool), apart=True)
     sums = HoldingTimes(law)
     for first in range(0, len(path), size):
@@ -318,7 +318,7 @@ def test_graphs_are_not_swapped_in_real_time() -> None:
 
 def second_order(path: np.ndarray, size: int = 10**6) -> SecondOrder:
     """Of a path of graphs with the law ``FAST``, counted in blocks of so many steps."""
-    step = SimpleNamespace(transition=np.array(FAST), modes=3, agents=1)
+    step = SimpleNamespace(transition=np.array(FAST), modes=3, agents=1, switching=None)
     sums = SecondOrder(SimpleNamespace(step=step, noisy=np.ones(1, dtype=bool), apart=True, graphs="abc"))  # type: ignore[arg-type]
     for first in range(0, len(path), size):
         graphs = path[first : first + size + 1]

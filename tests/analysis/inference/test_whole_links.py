@@ -94,7 +94,7 @@ def test_correct_runs_and_directions_that_are_lost_alone() -> None:
 )
 def test_what_has_no_prediction(changes: dict[str, Any]) -> None:
     law = whole(**changes)
-    assert "noise.whole_link: true: has no prediction with" in (unpredictable(law) or "")
+    assert "noise.whole_link: true: has no exact prediction with" in (unpredictable(law) or "")
     assert compare(simulate(law)).verdict == "unpredicted"
 
 

@@ -154,7 +154,7 @@ def test_everything_runs_and_what_is_too_large_has_no_prediction() -> None:
     large = small(graphs={"all": {"complete": True}}, agents=5, noise=noise)
     large.require_available()
     (line,) = unavailable(large, "predict")
-    assert line.startswith("noise.burst: 5.0: has no prediction: 2^20 states of 20 links")
+    assert line.startswith("noise.burst: 5.0: has no exact prediction: 2^20 states of 20 links")
     assert unpredictable(large) == line
     with pytest.raises(NotAvailableError, match=r"noise\.burst: 5"):
         large.require_available("predict")
