@@ -172,7 +172,7 @@ def seen(tab: Tab, site: Path, pages: dict[Path, Links]) -> Seen:
     page.goto((site / "index.html").as_uri())
     page.locator(".md-search__input").fill("supermodularity")
     first = page.locator(".md-search-result__link").first
-    first.wait_for(timeout=30_000)
+    first.wait_for()
     return Seen(log, str(first.get_attribute("href")), wide, poor)
 
 

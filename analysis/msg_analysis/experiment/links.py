@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any
@@ -115,10 +115,13 @@ class IndependentLinks:
         """A path of graphs, of which it looks up the links."""
         number = np.full((self.mesh.agents, self.mesh.agents), len(self))
         number[self.mesh.targets, self.mesh.sources] = self.link_of
-        there = np.zeros((len(graphs), len(self) + 1), dtype=np.bool_)
-        for row, graph in zip(there, graphs, strict=True):
-            row[number[graph.targets, graph.sources]] = True
-        return LinkSchedule(starts, order, len(graphs), np.inf, repeat=False, law=self, there=there[:, :-1])
+        there, foreign = np.zeros((len(graphs), len(self) + 1), dtype=np.bool_), {}
+        for mode, graph in enumerate(graphs):
+            found = number[graph.targets, graph.sources]
+            there[mode, found] = True
+            for arc in np.flatnonzero(found == len(self))[:1].tolist():
+                foreign[mode] = int(graph.sources[arc]), int(graph.targets[arc])
+        return LinkSchedule(starts, order, len(graphs), np.inf, False, self, there[:, :-1], foreign)
 
     def drawn(self, seed: int, steps: int) -> tuple[list[Graph], LinkSchedule]:
         """The graphs of a run, numbered in the order in which they come, and when each of them is active."""
@@ -150,6 +153,7 @@ class LinkSchedule(Schedule):
 
     law: IndependentLinks
     there: BoolArray  # (n, E) which links are up in each graph
+    foreign: Mapping[int, tuple[int, int]]  # by graph, source and target of an arc that belongs to no link
 
 
 def _path(rise: float, fall: float, share: float, steps: int, random: np.random.Generator) -> BoolArray:

@@ -177,10 +177,7 @@ def exact_findings(
     """By name of the question, from x(0) (m, R) of log and record, ``Run.wrong_stamp``, and the graphs (N,)."""
     found = {}
     if isinstance(step.switching, LinkSchedule):
-        law = step.switching.law
-        known = np.zeros((step.agents, step.agents), dtype=np.bool_)
-        known[law.mesh.targets, law.mesh.sources] = True
-        for mode, target, source in np.argwhere(step.links & ~known & ~np.eye(step.agents, dtype=bool)).tolist():
+        for mode, (source, target) in step.switching.foreign.items():
             if (modes == mode).any():
                 first = int(np.argmax(modes == mode))
                 found[GivenGraphs.name] = Finding(-math.inf, agent=target, sender=source, place=Place(first, first))

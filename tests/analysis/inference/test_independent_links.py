@@ -25,6 +25,7 @@ MESSAGES: dict[str, dict[str, Any]] = {
     "held": {"noise": {"loss": 0.3, "on_loss": "hold"}},
     "late": {"noise": {"delay": 2, "link": 0.3}},
     "tracking": TRACKING,
+    "discrete time": {"time": "discrete", "run": {"dt": 1.0, "duration": 600}},
     "real time": {"run": {"pace": "realtime"}},
     "real time, air": {"noise": {"link": 0.4, "loss": 0.2}, "run": {"pace": "realtime"}},
 }
