@@ -35,6 +35,9 @@ LAWS: dict[str, dict[str, Any]] = {
     "saturated": {"protocol": {"name": "saturated"}},
     "integral_action": {"protocol": {"name": "integral_action"}},
     "schedule": {"switching": {"schedule": [[0, "line"], [0.35, "ring"], [2, "line"]], "end": 4, "repeat": True}},
+    "sojourns": {
+        "switching": {"rates": {"line": {"ring": 1.0}, "ring": {"line": 1.0}}, "sojourn": {"line": {"shape": 3}}}
+    },
     "links": {
         "graphs": {"mesh": {"edges": [[1, 2], [2, 3], [3, 4], [4, 5], [1, 5], [2, 4, 0.5]]}},
         "switching": {"links": {"up": 2.0, "down": {"default": 0.5, "edges": [[3, 4, 1e-6]]}}},
@@ -92,6 +95,7 @@ def test_lockstep(network: Any, law: str, messages: str, processes: Any) -> None
             ("integral_action", "all", "one_per_agent"),
             ("schedule", "own", 2),
             ("links", "own", 2),
+            ("sojourns", "plain", 2),
         ]
     ),
 )

@@ -11,6 +11,7 @@ import numpy as np
 
 from msg_analysis.common.resources import available_memory
 from msg_analysis.common.text import amount
+from msg_analysis.experiment.markov_chain import DrawnSchedule
 from msg_analysis.experiment.problems import problem
 from msg_analysis.experiment.spec import Purpose
 from msg_analysis.experiment.validation import heard_links
@@ -73,7 +74,7 @@ def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
     lines = why_sampled(experiment)
     if purpose == "run":
         lines = needs_sampling(experiment) or matrix_problems(experiment)
-    if purpose == "steady" and experiment.schedule and not experiment.links:
+    if purpose == "steady" and experiment.schedule and not isinstance(experiment.schedule, DrawnSchedule):
         wanted = "has no steady state, expected a Markov chain for this"
         lines.append(
             problem("switching.schedule", "a given sequence of graphs", wanted, "use predict, run and compare")

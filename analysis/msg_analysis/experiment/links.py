@@ -16,7 +16,7 @@ from msg_analysis.arithmetic.reproducible import Stream, generator
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import agent_name
 from msg_analysis.experiment.graphs import Graph
-from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
+from msg_analysis.experiment.markov_chain import DrawnSchedule, MarkovChain, Schedule, SojournSchedule, Time
 from msg_analysis.experiment.problems import problem, show
 from msg_analysis.experiment.spec import LinksSpec
 from msg_analysis.experiment.values import RateSpec
@@ -148,7 +148,7 @@ class IndependentLinks:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LinkSchedule(Schedule):
+class LinkSchedule(DrawnSchedule):
     """The path of a run whose links switch by themselves."""
 
     law: IndependentLinks
@@ -176,18 +176,27 @@ def _path(rise: float, fall: float, share: float, steps: int, random: np.random.
 
 
 def expanded(experiment: Experiment) -> Experiment:
-    """The same with the Markov chain of all 2^E graphs in place of links that switch by themselves."""
-    if experiment.links is None:
+    """The same with a Markov chain in place of what its path is drawn from: of all 2^E graphs, or of phases."""
+    if isinstance(found := experiment.schedule, SojournSchedule):
+        law, gain = found.law, experiment.noise_gain[found.law.graph_of]
+        chain, graphs = law.phases, [experiment.graph_list[graph] for graph in law.graph_of.tolist()]
+        number = np.arange(len(graphs)) - law.first[law.graph_of]
+        graphs = [
+            replace(graph, name=f"{graph.name}, phase {k + 1}") if k else graph
+            for graph, k in zip(graphs, number.tolist(), strict=True)
+        ]
+    elif experiment.links:
+        graphs, chain = experiment.links.product()
+        gain = np.broadcast_to(experiment.noise_gain[0], (len(graphs), *experiment.noise_gain.shape[1:]))
+    else:
         return experiment
-    graphs, chain = experiment.links.product()
-    gain = np.broadcast_to(experiment.noise_gain[0], (len(graphs), *experiment.noise_gain.shape[1:]))
     return replace(experiment, graph_list=tuple(graphs), switching_law=chain, noise_gain=gain)
 
 
 def given_graphs(experiment: Experiment) -> Experiment:
     """The same with the graphs of its run as a given sequence."""
     found = experiment.schedule
-    if not isinstance(found, LinkSchedule):
+    if not isinstance(found, DrawnSchedule):
         return experiment
     return replace(experiment, switching_law=Schedule(found.starts, found.order, found.modes, found.end, found.repeat))
 

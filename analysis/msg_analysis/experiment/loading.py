@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
+from msg_analysis.arithmetic.reproducible import Stream, generator
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.files import StrictLoader, load_yaml, read_text
 from msg_analysis.common.text import listed
@@ -23,7 +24,7 @@ from msg_analysis.experiment import graph_files, graph_sources, limits, protocol
 from msg_analysis.experiment.graph_files import ForeignGraph, GraphError
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.links import links_of
-from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
+from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, SemiMarkovChain, SojournSchedule, Time
 from msg_analysis.experiment.problems import WEIGHT, problem, show, translate
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
 from msg_analysis.experiment.spec import BESIDE, ExperimentSpec, GraphSpec, NoiseSpec, RunSpec, SwitchingSpec
@@ -201,6 +202,18 @@ class Sections:
             self.problems += validation.stability_problems(self.graphs, gains, run.dt, sparse=sparse)
         if self.values["switching"] and self.values["switching"].links and time and run and not self.problems:
             self._draw_links(self.values["switching"], time, run)
+        if isinstance(self.switching, MarkovChain) and self.values["switching"].sojourn and run and not self.problems:
+            self.switching = self._drawn(self.switching, self.values["switching"], run)
+
+    def _drawn(self, chain: MarkovChain, switching: SwitchingSpec, run: RunSpec) -> SojournSchedule:
+        """The path of a run whose holding times are not exponential, from the seed."""
+        names = list(self.values["graphs"])
+        sojourn = switching.sojourn or {}
+        law = SemiMarkovChain(chain, np.array([sojourn[name].shape if name in sojourn else 1 for name in names]))
+        initial = law.phases.stationary
+        if switching.initial != "stationary":
+            initial = np.eye(len(initial))[law.first[names.index(switching.initial)]]
+        return law.drawn(initial, generator(run.seed, Stream.SWITCHING), run.steps, run.dt)
 
     def _draw_links(self, switching: SwitchingSpec, time: Time, run: RunSpec) -> None:
         """The graphs of a run whose links switch by themselves, from the seed, in place of the one with all links."""
@@ -262,7 +275,7 @@ class Sections:
             self.problems.append(str(error))
             switching = graphs = None
         self.values |= {"switching": switching, "graphs": graphs}
-        if self.values["run"] and switching and (switching.schedule or switching.links):
+        if self.values["run"] and switching and (switching.schedule or switching.links or switching.sojourn):
             self.values["run"], found = validation.scheduled_run(self.values["run"], switching)
             self.problems += found
 

@@ -133,6 +133,7 @@ class MarkovChain:
             mode = _draw(jumps[mode], random)
 
 
+MOST_JUMPS = 1000.0  # in a step, in the mean, that are drawn one by one; part of the definition of a run
 ROUNDING = 1e-9  # relative, of times in steps: what is so near to a step begins with it
 
 
@@ -185,6 +186,66 @@ class Schedule:
             for mode, end in zip(self.order.tolist(), ends, strict=True):
                 steps = (end + turn * self.end if turn else end) / dt
                 yield mode, sys.maxsize if math.isinf(steps) else math.ceil(steps - ROUNDING * max(1.0, steps))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrawnSchedule(Schedule):
+    """The path of a run, drawn from its seed, of a law that is not a chain of its graphs."""
+
+
+@dataclass(frozen=True, eq=False)
+class SemiMarkovChain:
+    """A chain whose holding times are Erlang: exactly a Markov chain of phases, passed one after the other."""
+
+    chain: MarkovChain  # with the mean holding times
+    shapes: IntArray  # (n,) number of phases of each graph
+
+    @property
+    def graph_of(self) -> IntArray:
+        """(S,) graph of each phase."""
+        return np.repeat(np.arange(len(self.shapes)), self.shapes)
+
+    @property
+    def first(self) -> IntArray:
+        """(n,) first phase of each graph."""
+        return np.asarray(np.cumsum(self.shapes) - self.shapes)
+
+    @property
+    def phases(self) -> MarkovChain:
+        """The chain of all phases: each graph's are passed as fast as its mean holding time asks for."""
+        size, last = int(self.shapes.sum()), np.cumsum(self.shapes) - 1
+        jumps = self.chain.matrix - np.diag(np.diag(self.chain.matrix))
+        matrix = np.zeros((size, size))
+        for graph, shape in enumerate(self.shapes.tolist()):
+            matrix[last[graph], self.first] = shape * jumps[graph]
+            for phase in range(int(self.first[graph]), int(last[graph])):
+                matrix[phase, phase + 1] = shape * jumps[graph].sum()
+        rest = matrix.sum(axis=1)
+        np.fill_diagonal(matrix, 1.0 - rest if self.chain.time == "discrete" else -rest)
+        return MarkovChain(self.chain.time, matrix)
+
+    def drawn(self, initial: FloatArray, random: np.random.Generator, steps: int, dt: float) -> SojournSchedule:
+        """A path of so many steps; ``initial`` (S,): law of the first phase."""
+        chain, unit, graph_of = self.phases, 1.0 if self.chain.time == "continuous" else dt, self.graph_of.tolist()
+        if chain.jumps_within(dt) > MOST_JUMPS:
+            chain, unit = chain.sampled(dt), dt
+        starts, order, time = [0.0], list[int](), 0.0
+        for phase, held in chain.holding_periods(initial, random):
+            if order[-1:] != [graph_of[phase]]:
+                starts[len(order) :] = [time]
+                order.append(graph_of[phase])
+            time += held * unit
+            if time >= steps * dt:
+                break
+        return SojournSchedule(np.array(starts), np.array(order), len(self.shapes), math.inf, False, self, initial)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SojournSchedule(DrawnSchedule):
+    """The path of a run with Erlang holding times."""
+
+    law: SemiMarkovChain
+    initial: FloatArray  # (S,) law of the first phase
 
 
 def require_chain(switching: MarkovChain | Schedule) -> MarkovChain:

@@ -145,6 +145,12 @@ class GraphSpec(Section):
         return [key for key in given if key not in BESIDE]
 
 
+class ErlangSpec(Section):
+    """Holding times that are sums of exponential ones; in discrete time of geometric ones."""
+
+    shape: Count = Field(description="how many of them; the larger, the more alike are the holding times", examples=[3])
+
+
 class LinksSpec(Section):
     """Links that switch independently of each other: each of them is up or down, a Markov chain of its own."""
 
@@ -164,6 +170,12 @@ class SwitchingSpec(Section):
     scale: Positive = Field(1.0, description="multiplies the rates", examples=[0.5])
     transition: Matrix | None = Field(
         None, description="discrete time: probabilities; rows sum to 1", examples=[[[0.9, 0.1], [0.2, 0.8]]]
+    )
+    sojourn: dict[GraphName, ErlangSpec] | None = Field(
+        None,
+        min_length=1,
+        description="graphs whose holding times are Erlang and not exponential, with the same means",
+        examples=[{"line": {"shape": 3}}],
     )
     initial: str = Field("stationary", description="'stationary' or a graph's name", examples=["stationary"])
     links: LinksSpec | None = Field(

@@ -16,7 +16,7 @@ from msg_analysis.common.text import agent_name, agent_text, listed
 from msg_analysis.experiment.graphs import Graph, hops, reach, widest_reaching
 from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
 from msg_analysis.experiment.problems import problem, show
-from msg_analysis.experiment.spec import LeadersSpec, NoiseGain, NoiseSpec, RunSpec, SwitchingSpec
+from msg_analysis.experiment.spec import ErlangSpec, LeadersSpec, NoiseGain, NoiseSpec, RunSpec, SwitchingSpec
 from msg_analysis.experiment.values import LossSpec
 
 if TYPE_CHECKING:
@@ -53,6 +53,8 @@ def switching_of(
                 lines.append(problem("graphs", listed(names), wanted, "remove the others"))
             return None, lines
         chain, found = _chain_of(switching, names, time)
+        if chain and switching.sojourn:
+            lines += _shape_problems(switching.sojourn, chain, names)
         return (None if lines else chain), lines + found
     found = _alone(switching, "a schedule", "links", "hold", "radius", "undirected", "weight")
     before = -1.0
@@ -78,9 +80,25 @@ def switching_of(
     return Schedule(*path, len(names), end, bool(switching.repeat)), []
 
 
+def _shape_problems(sojourn: Mapping[str, ErlangSpec], chain: MarkovChain, names: Sequence[str]) -> list[str]:
+    """Graphs with Erlang holding times that are not there, or are left faster than a phase in a step."""
+    found = []
+    for name, erlang in sojourn.items():
+        key = f"switching.sojourn.{name}"
+        if name not in names or len(names) == 1:
+            wanted = f"expected one of several graphs: {', '.join(names)}"
+            found.append(problem(key, "unknown graph", wanted, "correct the name"))
+        elif chain.time == "discrete":
+            leaving = 1.0 - float(chain.matrix[names.index(name), names.index(name)])
+            if erlang.shape * leaving > 1.0:
+                wanted = f"expected at most {math.floor(1.0 / leaving)}, since a phase takes a step at least"
+                found.append(problem(f"{key}.shape", erlang.shape, wanted, "lower it"))
+    return found
+
+
 def _alone(switching: SwitchingSpec, beside: str, *more: str) -> list[str]:
     """Keys of a chain, and ``more``, which cannot be given with something else."""
-    keys = ("generator", "rates", "transition", "scale", "initial", *more)
+    keys = ("generator", "rates", "transition", "scale", "sojourn", "initial", *more)
     given = [key for key in keys if getattr(switching, key) != type(switching).model_fields[key].default]
     return [problem(f"switching.{key}", "given", f"expected without {beside}", "remove one of them") for key in given]
 

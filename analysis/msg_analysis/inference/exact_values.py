@@ -18,7 +18,7 @@ import numpy as np
 from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.experiment.links import LinkSchedule
-from msg_analysis.experiment.markov_chain import Schedule
+from msg_analysis.experiment.markov_chain import DrawnSchedule, Schedule
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.question import Block, Diagnostic, Finding, Law, Place, Statistics, Test, agent_words
 from msg_analysis.inference.residuals import received_residuals
@@ -182,7 +182,7 @@ def exact_findings(
                 first = int(np.argmax(modes == mode))
                 found[GivenGraphs.name] = Finding(-math.inf, agent=target, sender=source, place=Place(first, first))
                 break
-    elif isinstance(step.switching, Schedule):
+    elif isinstance(step.switching, Schedule) and not isinstance(step.switching, DrawnSchedule):
         expected = step.switching.sampled(len(modes), step.dt)
         for at in np.flatnonzero(modes != expected)[:1].tolist():
             graph, other = int(modes[at]), int(expected[at])

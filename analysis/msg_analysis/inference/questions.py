@@ -20,6 +20,7 @@ from msg_analysis.inference.link_states import LinkRates
 from msg_analysis.inference.messages import Broadcast, CommonGain, Gains, MessageLosses, StaleValues
 from msg_analysis.inference.noise import LargestResidual, Noise, NoiseByGraph, NoiseOverTime
 from msg_analysis.inference.question import Diagnostic, Question, Search, Statistics, Test
+from msg_analysis.inference.sojourns import Sojourns
 from msg_analysis.inference.statistics import holm
 from msg_analysis.inference.system_error import AgentMeanErrors, Covariance, RunsAlike, SystemMeanError
 
@@ -49,6 +50,7 @@ QUESTIONS: tuple[type[Question], ...] = (
     Stamps,
     GivenGraphs,
     LinkRates,
+    Sojourns,
     RunsAlike,
 )
 

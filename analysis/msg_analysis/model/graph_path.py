@@ -15,13 +15,10 @@ import numpy as np
 
 from msg_analysis.arithmetic.reproducible import Stream, generator
 from msg_analysis.common.arrays import FloatArray, IntArray
-from msg_analysis.experiment.markov_chain import MarkovChain
+from msg_analysis.experiment.markov_chain import MOST_JUMPS, MarkovChain
 
 if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
-
-
-MOST_JUMPS = 1000.0  # in a step, in the mean, that are drawn one by one; part of the definition of a run
 
 
 @dataclass(frozen=True, slots=True)

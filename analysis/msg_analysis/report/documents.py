@@ -27,6 +27,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.experiment import limits, validation
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.links import expanded, given_graphs
+from msg_analysis.experiment.markov_chain import SojournSchedule
 from msg_analysis.inference.autocovariance import (
     LoggedAutocovariance,
     LoggedDensity,
@@ -234,6 +235,17 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     )
     links, graphs = experiment.links, experiment.written_graphs
     shares, holding_times = switching.stationary.tolist(), experiment.holding_times
+    law: dict[str, Any] = {}
+    chain = None if schedule else experiment.chain
+    if links:
+        law = {"links": links.to_json()}
+    elif isinstance(switching, SojournSchedule):
+        law = {"sojourn": document["switching"]["sojourn"]}
+        chain, unit = switching.law.chain, experiment.step_length if experiment.time == "discrete" else 1.0
+        shares = chain.stationary.tolist()
+        holding_times = [None if held is None else unit * held for held in chain.holding_times]
+    elif schedule:
+        law = {"schedule": schedule.to_json()}
     if links:
         shares, holding_times = [None], [None]
     highest_dt: list[float | None] = [None] * len(graphs)
@@ -252,9 +264,9 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
         "noise": document["noise"],
         "run": document["run"] | {"steps": experiment.steps},
         "switching": {
-            "matrix": None if schedule else experiment.chain.matrix.tolist(),
+            "matrix": chain and chain.matrix.tolist(),
             "initial": experiment.switching.initial,
-            **({"links": links.to_json()} if links else {"schedule": schedule.to_json()} if schedule else {}),
+            **law,
         },
         "graphs": [
             {

@@ -16,6 +16,7 @@ from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.text import agent_name, listed, z_text
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graphs import Graph
+from msg_analysis.experiment.markov_chain import SojournSchedule
 from msg_analysis.report.look import LABELLED, places, shorten
 from msg_analysis.report.plot_style import NOBODY, Candidates, graph_variable
 from msg_analysis.theory.graph_indices import algebraic_connectivity
@@ -300,6 +301,12 @@ def _switching(experiment: Experiment) -> str:
         return (
             f"Each of {len(links)} links switches by itself: it comes up and goes down with the {what} {both[0]} and "
             f"{both[1]}, whatever the others do. All predictions are given the {modes} graphs of the run."
+        )
+    if isinstance(experiment.schedule, SojournSchedule):
+        shapes = ", ".join(f"{name} {erlang.shape}" for name, erlang in (experiment.switching.sojourn or {}).items())
+        return (
+            f"The graph switches between {modes} graphs, a semi-Markov chain: holding times are Erlang, of the shapes "
+            f"{shapes}. All predictions are given the path of the run."
         )
     if schedule := experiment.schedule:
         stretches = f"{len(schedule.starts)} stretches of time" + (", again and again" if schedule.repeat else "")

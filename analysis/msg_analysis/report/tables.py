@@ -173,7 +173,7 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     facts.add_row("stability limit of dt", number_text(document["stability_limit"]))
     facts.add_row("replicas", str(run["replicas"]))
     facts.add_row("seed", str(run["seed"]))
-    schedule = document["switching"].get("schedule")
+    schedule, sojourn = (document["switching"].get(key) for key in ("schedule", "sojourn"))
     links = document["switching"].get("links")
     first = document["graphs"][0]["name"] if schedule else document["switching"]["initial"]
     facts.add_row("start", _short(run["start"]) + ("" if links else f", first graph {first}"))
@@ -181,6 +181,9 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
         end = "with the run" if schedule["end"] is None else f"at {number_text(schedule['end'])}"
         then = ", then again" if schedule["repeat"] else ""
         facts.add_row("schedule", f"{counted(schedule['stretches'], 'graph')}, ends {end}{then}")
+    if sojourn:
+        shapes = ", ".join(f"{name} of shape {erlang['shape']}" for name, erlang in sojourn.items())
+        facts.add_row("holding times", Text(f"Erlang: {shapes}"))
     facts.add_row("pace", f"{run['pace']}, processes {run['processes']}")
     facts.add_row("predicted system error", number_text(document["predicted_system_error"]))
     facts.add_row("prediction", _prediction(document["prediction"]))

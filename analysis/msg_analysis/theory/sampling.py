@@ -30,6 +30,8 @@ from msg_analysis.common.text import agent_text, finite, markdown_table, number_
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment.graphs import Graph
 from msg_analysis.experiment.limits import why_sampled
+from msg_analysis.experiment.links import expanded
+from msg_analysis.experiment.markov_chain import DrawnSchedule
 from msg_analysis.model.step_model import step_law, step_matrices, turns
 
 if TYPE_CHECKING:
@@ -120,7 +122,7 @@ class SampledPrediction:
 
 def exact_ends(experiment: Experiment) -> bool:
     """Whether links, bursts or held values of an experiment are too many for the exact prediction."""
-    return bool(why_sampled(experiment)) and not (experiment.schedule and experiment.links is None)
+    return bool(why_sampled(experiment)) and (not experiment.schedule or isinstance(experiment.schedule, DrawnSchedule))
 
 
 def prediction_method(experiment: Experiment) -> tuple[Literal["exact", "sampled", "measured"], str | None]:
@@ -165,7 +167,7 @@ def sampled_prediction(
             wanted = "expected a number above 0" + ", below 1" * (most < math.inf)
             raise InputError(f"{key}: {value:g}: {wanted}: for example 0.01")
     seed = experiment.run.seed if seed is None else seed
-    law, m = _Law(experiment), experiment.agents
+    law, m = _Law(experiment if experiment.links else expanded(experiment)), experiment.agents
     every = not agents and m <= ALL_AGENTS
     units = list(range(m)) if every else experiment.indices(agents)
     width = len(units) + (not every)
