@@ -165,7 +165,9 @@ def test_a_node_of_your_own(network: Any, domain: int) -> None:
     """A plain rclpy node sees graphs and states of a running network, and ends with it."""
     watching = python(watcher(), cwd=network.directory)
     network.wait_for(lambda: participants(domain), 60, "the watcher has a node")  # later it would wait for ever
-    file = network.file(run={"pace": "realtime", "speed": 5, "processes": 2})  # 3 s
+    # 3 s; the last graph is there for a second: the watcher ends with the run, whatever it has not read yet.
+    schedule = [[0, "line"], [5, "ring"], [10, "line"]]
+    file = network.file(switching={"schedule": schedule}, run={"pace": "realtime", "speed": 5, "processes": 2})
     result = network.completed(network.record(file, "--domain", str(domain), "--json"))
     assert result["rejected_messages"] == []
     printed, _ = network.ended(watching)
