@@ -104,9 +104,11 @@ class AgentLaw:
         return self.state
 
     def _draw(self, block: int) -> list[list[bytes]]:
-        """For each mode, the noise plus offset of every step of a block."""
-        noises = zip(self._noise.block(self.agent, block), self._offsets, strict=True)
-        return [[to_payload(drive) for drive in noise + offset] for noise, offset in noises]
+        """For each mode, the noise plus offset of every step of a block; equal ones share a list."""
+        noises = list(zip(self._noise.block(self.agent, block), self._offsets, strict=True))
+        different = {(id(noise), offset): noise + offset for noise, offset in noises}
+        made = {key: [to_payload(drive) for drive in drives] for key, drives in different.items()}
+        return [made[id(noise), offset] for noise, offset in noises]
 
 
 class AgentLawOnAir(AgentLaw):
