@@ -31,7 +31,7 @@ from mcap.reader import make_reader
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.salvage import salvage
 from msg_analysis.errors import InputError
-from msg_analysis.experiment import validation
+from msg_analysis.experiment import limits
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.limits import unavailable
 from msg_analysis.inference.pool import compare
@@ -129,7 +129,7 @@ def work(task: tuple[str, int, int, list[Path], Path]) -> tuple[Counter[str], li
     """A stretch of seeds in a process of its own: outcomes, findings, the longest case [s], most memory [kB]."""
     kind, first, last, sources, findings = task
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
-    validation.available_memory = lambda: MEMORY  # type: ignore[attr-defined]
+    limits.available_memory = lambda: MEMORY  # type: ignore[attr-defined]
     signal.signal(signal.SIGPROF, _too_slow)
     outcomes: Counter[str] = Counter()
     found, longest = [], 0.0

@@ -90,13 +90,15 @@ def predict(
     --agents (all of up to 20) or --seed.
     """
     from msg_analysis.report.theory_text import print_prediction
-    from msg_analysis.theory.sampling import exact_ends, sampled_prediction
+    from msg_analysis.theory.sampling import prediction_method, sampled_prediction
 
     loaded = load_experiment(experiment, changes)
     given = {key: value for key, value in sampling.items() if value is not None}
-    if not given and not exact_ends(loaded):
+    if not given and prediction_method(loaded)[0] != "sampled":
         document = loaded.predict(start=start).to_json(outages)
     else:
+        if outages is not None:
+            raise InputError(f"--outages {outages}: expected with an exact prediction of a schedule: leave it out")
         if start:
             raise InputError(f"--from {start:g}: expected with a schedule; a steady state has no time: leave it out")
         if "seed" in given:

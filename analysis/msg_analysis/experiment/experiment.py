@@ -158,10 +158,10 @@ class Experiment(Variants):
         if sections.problems:
             raise ExperimentError(source, sections.problems)
         experiment = cls(**sections.parts(), source=source, notes=tuple(sections.notes))
-        return experiment._bound(recorded) if experiment.protocol else experiment
+        return experiment.bound(recorded) if experiment.protocol else experiment
 
-    def _bound(self, recorded: ProtocolInfo | None) -> Self:
-        """The same with a protocol that knows its network."""
+    def bound(self, recorded: ProtocolInfo | None) -> Self:
+        """The same with a protocol that knows its network; ExperimentError: it does not fit, or is too large."""
         assert self.protocol is not None
         network = Network(
             graphs=self.graph_list,

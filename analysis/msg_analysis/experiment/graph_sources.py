@@ -227,7 +227,4 @@ def build_graph(name: str, spec: GraphSpec, agents: int) -> Graph:
     found = links(spec, agents)
     if spec.arcs is None:
         found += [(j, i, weight) for i, j, weight in found]
-    found.sort(key=lambda arc: (arc[1], arc[0]))
-    sources, targets, weights = zip(*found, strict=True) if found else ((), (), ())
-    ends = np.array(targets, dtype=np.int64) - 1, np.array(sources, dtype=np.int64) - 1
-    return Graph(name, agents, *ends, np.array(weights, dtype=float))
+    return Graph.of_arcs(name, agents, found)

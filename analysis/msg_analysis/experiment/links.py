@@ -190,7 +190,15 @@ def expanded(experiment: Experiment) -> Experiment:
         gain = np.broadcast_to(experiment.noise_gain[0], (len(graphs), *experiment.noise_gain.shape[1:]))
     else:
         return experiment
-    return replace(experiment, graph_list=tuple(graphs), switching_law=chain, noise_gain=gain)
+    return _of_graphs(experiment, graphs, chain, gain)
+
+
+def _of_graphs(
+    experiment: Experiment, graphs: Sequence[Graph], law: MarkovChain | Schedule, gain: FloatArray
+) -> Experiment:
+    """The same with other graphs (n), what switches between them, and their noise gains (n, m, m)."""
+    found = replace(experiment, graph_list=tuple(graphs), switching_law=law, noise_gain=gain)
+    return found.bound(found.protocol.info) if found.protocol else found
 
 
 def given_graphs(experiment: Experiment) -> Experiment:
@@ -208,7 +216,7 @@ def with_logged(experiment: Experiment, graphs: Sequence[Graph], modes: IntArray
     order = np.maximum(modes[changes], 0)
     path = experiment.links.schedule(graphs, changes * experiment.step_length, order)
     gain = np.broadcast_to(experiment.noise_gain[0], (len(graphs), *experiment.noise_gain.shape[1:]))
-    return replace(experiment, graph_list=tuple(graphs), switching_law=path, noise_gain=gain)
+    return _of_graphs(experiment, graphs, path, gain)
 
 
 def links_of(

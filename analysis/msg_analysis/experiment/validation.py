@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
 from msg_analysis.experiment.problems import problem, show
 from msg_analysis.experiment.spec import ErlangSpec, LeadersSpec, NoiseGain, NoiseSpec, RunSpec, SwitchingSpec
 from msg_analysis.experiment.values import LossSpec
-
-if TYPE_CHECKING:
-    pass
 
 SUM_TOLERANCE = 1e-9
 STEP_TOLERANCE = 1e-9

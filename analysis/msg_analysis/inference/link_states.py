@@ -73,7 +73,7 @@ class LinkRates(SummedDiagnostic):
         link, up = np.unravel_index(int(np.argmax(np.where(impossible, np.inf, np.abs(z)))), z.shape)
         if impossible.any():
             log_p = -math.inf
-        if log_p is None:
+        elif log_p is None:
             return None
         source, target, _ = self._links.ends[link]
         chance, seen, tried = float(self._chance[link, up]), int(changes[link, up]), int(steps[link, up])

@@ -120,16 +120,15 @@ class SampledPrediction:
         return document | laws | rest
 
 
-def exact_ends(experiment: Experiment) -> bool:
-    """Whether links, bursts or held values of an experiment are too many for the exact prediction."""
-    return bool(why_sampled(experiment)) and (not experiment.schedule or isinstance(experiment.schedule, DrawnSchedule))
-
-
 def prediction_method(experiment: Experiment) -> tuple[Literal["exact", "sampled", "measured"], str | None]:
     """How the steady errors of an experiment are known, or those of runs only; and why not exactly."""
     if experiment.protocol and (reason := experiment.protocol.unpredictable()):
         return "measured", reason
-    return ("sampled", why_sampled(experiment)[0]) if exact_ends(experiment) else ("exact", None)
+    if not (lines := why_sampled(experiment)):
+        return "exact", None
+    given = experiment.schedule and not isinstance(experiment.schedule, DrawnSchedule)
+    apart = experiment.links and (experiment.time == "discrete" or experiment.protocol)  # no steps of single links
+    return "measured" if given or apart else "sampled", lines[0]
 
 
 def sampled_prediction(
@@ -296,7 +295,7 @@ class _Law:
         self.weights[grounded[self.targets]] = 0.0
         self.rows = np.where(grounded, 0.0, 1.0 - dt * np.where(grounded, 0.0, gains))[:, None]
         process, free = experiment.noise.process, np.where(grounded, 0.0, math.sqrt(dt))
-        given = [process[graph.name] for graph in experiment.written_graphs] if isinstance(process, dict) else [process]
+        given = list(experiment.noise_gain[: len(graphs)]) if isinstance(process, dict) else [process]
         forms = [np.asarray(gain, dtype=float) for gain in given]
         self._feel([(f * free[:, None]).T if f.ndim == 2 else sparse.diags_array(f * free) for f in forms])
 

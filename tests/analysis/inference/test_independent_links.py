@@ -15,6 +15,7 @@ from msg_analysis.errors import NotAvailableError
 from msg_analysis.experiment.experiment import Experiment, ExperimentError
 from msg_analysis.experiment.links import with_logged
 from msg_analysis.model.run import Run
+from msg_analysis.theory.sampling import prediction_method
 from msg_analysis.twin.simulate import simulate
 
 TEN = [[1, 2], [2, 3], [3, 4], [4, 5], [5, 6], [1, 3], [2, 4], [1, 6], [2, 5], [3, 6]]
@@ -77,7 +78,12 @@ def test_exact_predictions() -> None:
     assert linked().predict().emulated.system_error == pytest.approx(3.41958, abs=5e-6)
     with pytest.raises(NotAvailableError, match=r"switching\.links: .* 2\^10 graphs"):
         linked(10).predict()
-    for time, rates in (("continuous", (0.6, 1.5, 0.2, 0.9)), ("discrete", (0.4, 0.3, 0.2, 0.1))):
+    metropolis: dict[str, Any] = {"protocol": {"name": "metropolis", "laziness": 0.3}}
+    for time, rates, protocol in (
+        ("continuous", (0.6, 1.5, 0.2, 0.9), {}),
+        ("continuous", (0.6, 1.5, 0.2, 0.9), metropolis),
+        ("discrete", (0.4, 0.3, 0.2, 0.1), {}),
+    ):
         rise, fall, up, down = rates
         graphs = {f"{i}{j}": {"edges": [*[[1, 2]] * i, *[[2, 3, 0.5]] * j]} for i in (0, 1) for j in (0, 1)}
         if time == "continuous":
@@ -95,8 +101,8 @@ def test_exact_predictions() -> None:
         dt = {"run": {"dt": 1.0}} if time == "discrete" else {}
         rates_of = [{"edges": [[1, 2, a], [2, 3, b]]} for a, b in ((rise, up), (fall, down))]
         mesh = {"mesh": {"edges": [[1, 2], [2, 3, 0.5]]}}
-        found = linked(2, *rates_of, graphs=mesh, time=time, **dt)
-        by_hand = linked(2, graphs=graphs, switching=chain, time=time, **dt)
+        found = linked(2, *rates_of, graphs=mesh, time=time, **dt, **protocol)
+        by_hand = linked(2, graphs=graphs, switching=chain, time=time, **dt, **protocol)
         np.testing.assert_allclose(
             found.predict().emulated.covariance, by_hand.predict().emulated.covariance, rtol=1e-10
         )
@@ -105,6 +111,13 @@ def test_exact_predictions() -> None:
         )
         variances = [law.plan(0.05).precision.variance for law in (found, by_hand.with_run(start="zero"))]
         assert [variances[0].path, variances[0].replica] == pytest.approx([variances[1].path, variances[1].replica])
+
+
+def test_how_errors_are_known() -> None:
+    """What is sampled is the built-in law in continuous time; else many links are measured in runs."""
+    assert [prediction_method(linked(links))[0] for links in (9, 10)] == ["exact", "sampled"]
+    for changes in ({"time": "discrete", "run": {"dt": 1.0}}, {"protocol": {"name": "metropolis", "laziness": 0.3}}):
+        assert prediction_method(linked(10, **changes))[0] == "measured"
 
 
 @pytest.mark.parametrize("messages", MESSAGES)

@@ -9,7 +9,7 @@ from scipy import stats
 
 from experiments import compare, line_ring
 from msg_analysis.experiment.experiment import Experiment, ExperimentError
-from msg_analysis.theory.sampling import sampled_prediction
+from msg_analysis.theory.sampling import prediction_method, sampled_prediction
 from msg_analysis.twin.simulate import simulate
 
 SHAPES = {"line": {"shape": 4}, "ring": {"shape": 2}}
@@ -42,21 +42,30 @@ def test_holding_times_of_a_run(time: str) -> None:
     assert stats.chisquare(counts, chances * counts.sum()).pvalue > 1e-4
 
 
-def test_exact_prediction_and_a_sampled_one() -> None:
+@pytest.mark.parametrize("changes", [{}, {"noise": 2.0}, {"protocol": {"name": "metropolis", "laziness": 0.3}}])
+def test_exact_prediction_and_a_sampled_one(changes: dict[str, Any]) -> None:
     """Against phases that are written out as graphs of a chain; |z| < 4 of the sampled one. Shape 1 is the chain."""
+
+    def process(*graphs: str) -> dict[str, Any]:
+        """With noise by graph."""
+        noise = {"process": {name: changes.get("noise", 1.0) if name[0] == "l" else 1.0 for name in graphs}}
+        return changes | {"noise": noise}
+
     everybody = [1, 2, 3, 4, 5]
     names = ["l1", "l2", "l3", "l4", "r1", "r2"]
     rates = [2.0, 2.0, 2.0, 2.0, 2.0, 2.0]
     chain = {a: {b: rate} for a, b, rate in zip(names, names[1:] + names[:1], rates, strict=True)}
     graphs = {name: {"path": everybody} if name[0] == "l" else {"cycle": everybody} for name in names}
-    by_hand = line_ring(5, graphs=graphs, switching={"rates": chain}, run={"dt": 0.05, "start": "zero"})
-    law = held()
+    run = {"dt": 0.05, "start": "zero"}
+    by_hand = line_ring(5, graphs=graphs, switching={"rates": chain}, run=run, **process(*names))
+    law = held(**process("line", "ring"))
     np.testing.assert_allclose(law.predict().emulated.covariance, by_hand.predict().emulated.covariance, rtol=1e-10)
     found, wanted = (each.transient([0.5, 4.0]).system_error for each in (law, by_hand))
     np.testing.assert_allclose(found, wanted, rtol=1e-9)
     sampled = sampled_prediction(law, precision=0.02, seed=1)
     half = (sampled.interval[1] - sampled.interval[0]) / 2.0
     assert abs(sampled.system_error - by_hand.predict().emulated.system_error) < 2.0 * half
+    assert prediction_method(law) == ("exact", None)
     one = held({"line": {"shape": 1}})
     plain = held(None, switching={"rates": {"line": {"ring": 0.5}, "ring": {"line": 1.0}}})
     assert one.predict().emulated.system_error == pytest.approx(plain.predict().emulated.system_error, rel=1e-10)
