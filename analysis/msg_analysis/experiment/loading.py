@@ -260,6 +260,7 @@ class Sections:
         switching: SwitchingSpec | None = self.values["switching"]
         graphs: dict[str, GraphSpec] | None = self.values["graphs"]
         if switching is None or graphs is None:
+            self.values["graphs"] = graphs or None  # none are known where a section with a trace has mistakes
             return
         try:
             if switching.trace is not None:

@@ -136,6 +136,7 @@ EPOCH = 1_764_000_000 * 10**9  # in nanoseconds
         (CONTACTS, [(0, *p) for p in RING], {"hold": 1, "initial": "g1"}, "switching.initial: given: expected without"),
         ("time,graph", [(0, "x")], {"weight": 2, "graphs": {"x": {"path": NAMES}}}, "switching.weight: 2.0: expected"),
         (CONTACTS, [(0, *p) for p in RING], {"hold": 1, "run": {"duration": 9}}, "9.0: expected at most 1"),
+        (CONTACTS, [(0, *p) for p in RING], {"hold": 1, "radios": 2}, "switching.radios: unknown key"),
         (CONTACTS, [(0, *p) for p in RING], {"hold": 1, "run": {"start": "stationary"}}, "needs a Markov chain"),
         (CONTACTS, [(EPOCH + k, *RING[0]) for k in (0, 10**9)], {"hold": 1}, "1e+09 after the first: expected times"),
         ("start,end,source,target", [(0, 10**11, *p) for p in RING], {}, "run.dt: 0.1: expected at most 1e+08 steps"),
