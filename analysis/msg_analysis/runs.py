@@ -113,7 +113,9 @@ def _row(path: Path, document: dict[str, Any]) -> Result:
     seeds = [run.get("seed") for run in bags or [document]]
     tests = [_number(test, "p_adjusted", file) for test in _parts(document, "tests", file)]
     given = document.get("names")
-    names = list(map(str, given)) if isinstance(given, list) else None
+    if given is not None and not (isinstance(given, list) and all(isinstance(name, str) for name in given)):
+        raise InputError(f"{file}: names: {_short(given)}: expected a list of texts, or null: {_WANTED}")
+    names = given
     causes = [with_names(str(cause.get("words")), names) for cause in _parts(document, "causes", file)]
     leaders = document["leaders"] if isinstance(document.get("leaders"), list) else ()
     identity = document.get("experiment_identity")
@@ -140,7 +142,10 @@ def _row(path: Path, document: dict[str, Any]) -> Result:
 
 
 def _short(value: Any) -> str:
-    text = repr(value)
+    try:
+        text = repr(value)
+    except RecursionError:
+        text = "lists or objects in each other"
     return text if len(text) <= 100 else f"{text[:100]}..."
 
 

@@ -38,6 +38,7 @@ LAWS: dict[str, dict[str, Any]] = {
     "sojourns": {
         "switching": {"rates": {"line": {"ring": 1.0}, "ring": {"line": 1.0}}, "sojourn": {"line": {"shape": 3}}}
     },
+    "activation": {"graphs": {"ring": {"cycle": [1, 2, 3, 4, 5]}}, "switching": {}, "noise": {"activation": 0.7}},
     "links": {
         "graphs": {"mesh": {"edges": [[1, 2], [2, 3], [3, 4], [4, 5], [1, 5], [2, 4, 0.5]]}},
         "switching": {"links": {"up": 2.0, "down": {"default": 0.5, "edges": [[3, 4, 1e-6]]}}},
@@ -54,7 +55,8 @@ def cells(selected: Cells) -> Cells:
 
 def changes(law: str, messages: str, run: dict[str, Any]) -> dict[str, Any]:
     start = {} if law in ("consensus", "leaders", "grounded", "metropolis") else {"start": [1.0, -1.0, 2.0, 0.0, 3.0]}
-    return {**LAWS[law], "noise": {"process": 1.0, **MESSAGES[messages]}, "run": {**run, **start}}
+    noise = {"process": 1.0, **LAWS[law].get("noise", {}), **MESSAGES[messages]}
+    return {**LAWS[law], "noise": noise, "run": {**run, **start}}
 
 
 def assert_equal(trajectory: Run) -> None:
@@ -75,6 +77,7 @@ def assert_equal(trajectory: Run) -> None:
             ("integral_action", "all", 2),
             ("schedule", "all", 2),
             ("links", "all", 2),
+            ("activation", "all", 2),
         ]
     ),
 )
@@ -95,6 +98,7 @@ def test_lockstep(network: Any, law: str, messages: str, processes: Any) -> None
             ("integral_action", "all", "one_per_agent"),
             ("schedule", "own", 2),
             ("links", "own", 2),
+            ("activation", "own", 2),
             ("sojourns", "plain", 2),
         ]
     ),

@@ -10,7 +10,7 @@ import itertools
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -269,7 +269,7 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Run:
     experiment = record.experiment
     graphs = _logged_graphs(contents, record) if experiment.links else list(experiment.graph_list)
     modes = _modes(contents, record.run.bytes, experiment.steps, planned, len(graphs))
-    if experiment.links and [graph.arcs for graph in graphs] != [graph.arcs for graph in experiment.graph_list]:
+    if experiment.links and _described(graphs) != _described(experiment.graph_list):
         record = dataclasses.replace(record, experiment=with_logged(experiment, graphs, modes), matrices=None)
         experiment = record.experiment
     published, widths = None, _widths(experiment)
@@ -306,13 +306,18 @@ def _trajectory(contents: _Contents, record: RunRecord) -> Run:
 
 def _logged_graphs(contents: _Contents, record: RunRecord) -> list[Graph]:
     """The graphs by their numbers in the log, where links switch by themselves: it may have others than the record."""
+    assert record.experiment.links is not None
     graphs, agents = list(record.experiment.graph_list), record.experiment.agents
     for found in contents.graphs.values():
         known = all(1 <= end <= agents for arc in found.arcs for end in arc[:2])
         if found.run == record.run.bytes and 1 <= found.mode <= record.experiment.steps and known:
-            graphs += [Graph.of("", np.zeros((agents, agents)))] * (found.mode - len(graphs))
-            graphs[found.mode - 1] = Graph.of_arcs(found.name, agents, found.arcs)
+            graphs += [record.experiment.links.logged("", [])] * (found.mode - len(graphs))
+            graphs[found.mode - 1] = record.experiment.links.logged(found.name, found.arcs)
     return graphs
+
+
+def _described(graphs: Sequence[Graph]) -> list[tuple[str, list[tuple[int, int, float]]]]:
+    return [(graph.name, graph.arcs) for graph in graphs]
 
 
 def _end(contents: _Contents, record: RunRecord) -> int | None:

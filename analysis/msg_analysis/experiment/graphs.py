@@ -49,6 +49,9 @@ class Graph:
         number of agents m
     targets, sources, weights
         (l,) every arc: who listens, to whom (agents from 0), and the weight; sorted by target, then source
+    whole, active
+        where agents leave out steps, the graph with the arcs of all of them, and (m,) which of them make this one;
+        None elsewhere
     """
 
     name: str
@@ -56,6 +59,8 @@ class Graph:
     targets: IntArray
     sources: IntArray
     weights: FloatArray
+    whole: Graph | None = None
+    active: BoolArray | None = None
 
     @classmethod
     def of(cls, name: str, adjacency: FloatArray) -> Graph:

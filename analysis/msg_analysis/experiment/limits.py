@@ -87,7 +87,10 @@ def why_sampled(experiment: Experiment) -> list[str]:
     lines, links = too_large_to_predict(experiment), len(experiment.links or ())
     if 2**links > MOST_STATES:
         wanted = f"has no exact prediction: 2^{links} graphs, expected at most {MOST_STATES}"
-        lines.append(problem("switching.links", "links that switch by themselves", wanted, "use fewer links"))
+        key, value, remedy = "switching.links", "links that switch by themselves", "use fewer links"
+        if experiment.noise.leaves_out_steps:
+            key, value, remedy = "noise.activation", str(experiment.noise.activation), "use fewer agents"
+        lines.append(problem(key, value, wanted, remedy))
     return lines
 
 
@@ -114,7 +117,7 @@ def too_large_to_predict(experiment: Experiment) -> list[str]:
         wanted = f"has no exact prediction with {', '.join(others)}"
         lines.append(problem("noise.whole_link", True, wanted, "remove one of them"))
     kept = len(gains) * (noise.delay + 2) + lossy * (noise.delay + 1) * noise.holds
-    by_message = noise.holds or (experiment.run.pace == "realtime" and noise.steps_only)
+    by_message = noise.holds or (experiment.run.pace == "realtime" and noise.on_messages)
     if by_message and kept > MOST_VALUES:
         wanted = f"has no exact prediction: {kept} values are kept from step to step, expected at most {MOST_VALUES}"
         lines.append(problem("noise.on_loss", noise.on_loss, wanted, "use fewer agents or links, or own values"))

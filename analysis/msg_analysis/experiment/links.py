@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Links that switch independently of each other: each is up or down, a Markov chain of its own (Gilbert 1960)."""
+"""Links, or steps of agents, that are there or not independently of each other, and the graphs that they make."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -16,9 +16,16 @@ from msg_analysis.arithmetic.reproducible import Stream, generator
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import agent_name
 from msg_analysis.experiment.graphs import Graph
-from msg_analysis.experiment.markov_chain import DrawnSchedule, MarkovChain, Schedule, SojournSchedule, Time
+from msg_analysis.experiment.markov_chain import (
+    DrawnSchedule,
+    MarkovChain,
+    Schedule,
+    SemiMarkovChain,
+    SojournSchedule,
+    Time,
+)
 from msg_analysis.experiment.problems import problem, show
-from msg_analysis.experiment.spec import LinksSpec
+from msg_analysis.experiment.spec import LinksSpec, NoiseSpec, RunSpec, SwitchingSpec
 from msg_analysis.experiment.values import RateSpec
 
 if TYPE_CHECKING:
@@ -27,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class IndependentLinks:
-    """The law of E links.
+    """The law of E links, each of which is up or down, a Markov chain of its own (Gilbert 1960).
 
     Attributes
     ----------
@@ -48,6 +55,8 @@ class IndependentLinks:
     down: FloatArray
     time: Time
     dt: float
+
+    noun: ClassVar[str] = "link"
 
     def __len__(self) -> int:
         return len(self.up)
@@ -111,17 +120,26 @@ class IndependentLinks:
         mesh = self.mesh
         return Graph(name, mesh.agents, mesh.targets[arcs], mesh.sources[arcs], mesh.weights[arcs])
 
+    def logged(self, name: str, arcs: Sequence[tuple[int, int, float]]) -> Graph:
+        """A graph as a message describes it."""
+        return Graph.of_arcs(name, self.mesh.agents, arcs)
+
+    def _there(self, graph: Graph, found: IntArray) -> BoolArray:
+        """(E,) which links are up in a graph; ``found``: the links of its arcs, E for one of no link."""
+        del graph
+        return np.bincount(found, minlength=len(self) + 1)[:-1] > 0
+
     def schedule(self, graphs: Sequence[Graph], starts: FloatArray, order: IntArray) -> LinkSchedule:
         """A path of graphs, of which it looks up the links."""
         number = np.full((self.mesh.agents, self.mesh.agents), len(self))
         number[self.mesh.targets, self.mesh.sources] = self.link_of
-        there, foreign = np.zeros((len(graphs), len(self) + 1), dtype=np.bool_), {}
+        there, foreign = np.zeros((len(graphs), len(self)), dtype=np.bool_), {}
         for mode, graph in enumerate(graphs):
             found = number[graph.targets, graph.sources]
-            there[mode, found] = True
+            there[mode] = self._there(graph, found)
             for arc in np.flatnonzero(found == len(self))[:1].tolist():
                 foreign[mode] = int(graph.sources[arc]), int(graph.targets[arc])
-        return LinkSchedule(starts, order, len(graphs), np.inf, False, self, there[:, :-1], foreign)
+        return LinkSchedule(starts, order, len(graphs), np.inf, False, self, there, foreign)
 
     def drawn(self, seed: int, steps: int) -> tuple[list[Graph], LinkSchedule]:
         """The graphs of a run, numbered in the order in which they come, and when each of them is active."""
@@ -145,6 +163,45 @@ class IndependentLinks:
         else:
             matrix = reduce(lambda all_, one: np.kron(all_, np.eye(2)) + np.kron(np.eye(len(all_)), one), chains)
         return [self.graph(row) for row in there], MarkovChain(self.time, np.asarray(matrix))
+
+
+class ActiveAgents(IndependentLinks):
+    """Agents, each of which makes every step with a probability, whatever it did before; "links" are the agents."""
+
+    noun = "agent"
+
+    @classmethod
+    def of(cls, mesh: Graph, activation: float, dt: float) -> ActiveAgents:
+        """All with the same probability."""
+        made = np.full(mesh.agents, activation)
+        return cls(mesh, mesh.targets, made, 1.0 - made, "discrete", dt)
+
+    @cached_property
+    def ends(self) -> list[tuple[int, int, bool]]:
+        """Of every agent, itself."""
+        return [(agent, agent, False) for agent in range(len(self))]
+
+    def words(self, link: int, names: Sequence[str] | None) -> str:
+        """An agent in words."""
+        return agent_name(link + 1, names)
+
+    def graph(self, there: BoolArray) -> Graph:
+        """The graph in which only the agents ``there`` (m,) make a step, and listen; its name has a digit for each."""
+        return replace(super().graph(there), whole=self.mesh, active=there)
+
+    def logged(self, name: str, arcs: Sequence[tuple[int, int, float]]) -> Graph:
+        """The same; what agents that never listen do is known by the name only."""
+        given = super().logged(name, arcs)
+        there = np.bincount(given.targets, minlength=len(self)) > 0
+        if len(name) == len(self) and set(name) <= {"0", "1"}:
+            there = there | (np.array(list(name)) == "1")
+        graph = self.graph(there)
+        return replace(graph, name=name) if graph.arcs == given.arcs else replace(given, active=there)
+
+    def _there(self, graph: Graph, found: IntArray) -> BoolArray:
+        del found
+        assert graph.active is not None
+        return graph.active
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,6 +274,37 @@ def with_logged(experiment: Experiment, graphs: Sequence[Graph], modes: IntArray
     path = experiment.links.schedule(graphs, changes * experiment.step_length, order)
     gain = np.broadcast_to(experiment.noise_gain[0], (len(graphs), *experiment.noise_gain.shape[1:]))
     return _of_graphs(experiment, graphs, path, gain)
+
+
+def law_of(
+    switching: SwitchingSpec,
+    noise: NoiseSpec,
+    graphs: Sequence[Graph],
+    time: Time,
+    dt: float,
+    names: Sequence[str] | None,
+    *,
+    protocol: bool,
+) -> tuple[IndependentLinks | None, list[str]]:
+    """What the graphs of every run are drawn from, if not from a chain, and what is wrong with it (then it is None)."""
+    if noise.activation is None or not noise.leaves_out_steps:
+        return links_of(switching.links, graphs[0], time, dt, names) if switching.links else (None, [])
+    others = ["several graphs"] * (len(graphs) > 1) + ["a protocol"] * protocol
+    others += [f"switching.{key}" for key in ("links", "schedule") if getattr(switching, key) is not None]
+    if others:
+        wanted = f"expected one graph that does not switch, not {' and '.join(others)}"
+        return None, [problem("noise.activation", noise.activation, wanted, "remove one of them")]
+    return ActiveAgents.of(graphs[0], noise.activation, dt), []
+
+
+def drawn_sojourns(chain: MarkovChain, switching: SwitchingSpec, names: Sequence[str], run: RunSpec) -> SojournSchedule:
+    """The path of a run whose holding times are not exponential, from the seed."""
+    sojourn = switching.sojourn or {}
+    law = SemiMarkovChain(chain, np.array([sojourn[name].shape if name in sojourn else 1 for name in names]))
+    initial = law.phases.stationary
+    if switching.initial != "stationary":
+        initial = np.eye(len(initial))[law.first[names.index(switching.initial)]]
+    return law.drawn(initial, generator(run.seed, Stream.SWITCHING), run.steps, run.dt)
 
 
 def links_of(

@@ -15,7 +15,6 @@ import numpy as np
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from msg_analysis.arithmetic.reproducible import Stream, generator
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.files import StrictLoader, load_yaml, read_text
 from msg_analysis.common.text import listed
@@ -23,8 +22,8 @@ from msg_analysis.errors import InputError
 from msg_analysis.experiment import graph_files, graph_sources, limits, protocols, traces, validation
 from msg_analysis.experiment.graph_files import ForeignGraph, GraphError
 from msg_analysis.experiment.graphs import Graph
-from msg_analysis.experiment.links import links_of
-from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, SemiMarkovChain, SojournSchedule, Time
+from msg_analysis.experiment.links import drawn_sojourns, law_of
+from msg_analysis.experiment.markov_chain import MarkovChain, Schedule, Time
 from msg_analysis.experiment.problems import WEIGHT, problem, show, translate
 from msg_analysis.experiment.protocols import ChosenProtocol, ProtocolInfo
 from msg_analysis.experiment.spec import BESIDE, ExperimentSpec, GraphSpec, NoiseSpec, RunSpec, SwitchingSpec
@@ -200,38 +199,35 @@ class Sections:
         if time == "continuous" and run and built_in:
             gains = validation.leader_gains(leaders, self.agents)
             self.problems += validation.stability_problems(self.graphs, gains, run.dt, sparse=sparse)
-        if self.values["switching"] and self.values["switching"].links and time and run and not self.problems:
-            self._draw_links(self.values["switching"], time, run)
-        if isinstance(self.switching, MarkovChain) and self.values["switching"].sojourn and run and not self.problems:
-            self.switching = self._drawn(self.switching, self.values["switching"], run)
+        if self._drawn and time and run and not self.problems:
+            self._draw(self.values["switching"], time, run)
 
-    def _drawn(self, chain: MarkovChain, switching: SwitchingSpec, run: RunSpec) -> SojournSchedule:
-        """The path of a run whose holding times are not exponential, from the seed."""
-        names = list(self.values["graphs"])
-        sojourn = switching.sojourn or {}
-        law = SemiMarkovChain(chain, np.array([sojourn[name].shape if name in sojourn else 1 for name in names]))
-        initial = law.phases.stationary
-        if switching.initial != "stationary":
-            initial = np.eye(len(initial))[law.first[names.index(switching.initial)]]
-        return law.drawn(initial, generator(run.seed, Stream.SWITCHING), run.steps, run.dt)
+    @property
+    def _drawn(self) -> bool:
+        """Whether the graphs of a run are drawn from another law than a chain of the graphs of the file."""
+        switching, noise = self.values["switching"], self.values["noise"]
+        return bool((switching and (switching.links or switching.sojourn)) or (noise and noise.leaves_out_steps))
 
-    def _draw_links(self, switching: SwitchingSpec, time: Time, run: RunSpec) -> None:
-        """The graphs of a run whose links switch by themselves, from the seed, in place of the one with all links."""
-        assert switching.links is not None
-        assert self.noise_gain is not None
-        values = {
-            kind: self._numbered(f"switching.links.{kind}", getattr(switching.links, kind)) for kind in ("up", "down")
-        }
+    def _draw(self, switching: SwitchingSpec, time: Time, run: RunSpec) -> None:
+        """The graphs of a run, from the seed, in place of those of the file."""
+        if switching.links:
+            rates = {
+                kind: self._numbered(f"switching.links.{kind}", getattr(switching.links, kind))
+                for kind in ("up", "down")
+            }
+            switching = switching.model_copy(update={"links": switching.links.model_copy(update=rates)})
+            self.values["switching"] = switching
         if self.problems:
             return
-        spec = switching.links.model_copy(update=values)
-        self.values["switching"] = switching.model_copy(update={"links": spec})
-        links, self.problems = links_of(spec, self.graphs[0], time, run.dt, self.values["names"])
-        if not links:
-            return
-        graphs, self.switching = links.drawn(run.seed, run.steps)
-        self.graphs = tuple(graphs)
-        self.noise_gain = np.broadcast_to(self.noise_gain[0], (len(graphs), *self.noise_gain.shape[1:]))
+        assert self.noise_gain is not None
+        given = switching, self.values["noise"], self.graphs, time, run.dt, self.values["names"]
+        law, self.problems = law_of(*given, protocol=self.protocol is not None)
+        if law:
+            graphs, self.switching = law.drawn(run.seed, run.steps)
+            self.graphs = tuple(graphs)
+            self.noise_gain = np.broadcast_to(self.noise_gain[0], (len(graphs), *self.noise_gain.shape[1:]))
+        elif isinstance(self.switching, MarkovChain) and not self.problems:
+            self.switching = drawn_sojourns(self.switching, switching, list(self.values["graphs"]), run)
 
     def parts(self) -> dict[str, Any]:
         """The fields of an ``Experiment``, once there are no problems."""
@@ -276,7 +272,7 @@ class Sections:
             self.problems.append(str(error))
             switching = graphs = None
         self.values |= {"switching": switching, "graphs": graphs}
-        if self.values["run"] and switching and (switching.schedule or switching.links or switching.sojourn):
+        if self.values["run"] and switching and (switching.schedule or self._drawn):
             self.values["run"], found = validation.scheduled_run(self.values["run"], switching)
             self.problems += found
 

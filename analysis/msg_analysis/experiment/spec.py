@@ -269,6 +269,11 @@ class NoiseSpec(Section):
         description="whether a loss takes both directions of a link; by default each direction by itself",
         examples=[True],
     )
+    activation: Annotated[Number, Field(gt=0, le=1)] | None = Field(
+        None,
+        description="probability that an agent makes its step; else it keeps its state, without noise; by default 1",
+        examples=[0.7],
+    )
     delay: Annotated[int, Field(strict=True, ge=0, le=LARGEST_COUNT)] = Field(
         0, description="age, in steps, of the values of others that a step uses", examples=[0]
     )
@@ -292,9 +297,19 @@ class NoiseSpec(Section):
         return self.delay + (1 if self.holds else 0)
 
     @property
-    def steps_only(self) -> bool:
-        """Whether there is noise on the air, loss or delay, which only steps can have."""
+    def on_messages(self) -> bool:
+        """Whether messages are noisy, lost or late."""
         return self.on_air or self.delay > 0
+
+    @property
+    def leaves_out_steps(self) -> bool:
+        """Whether agents leave out steps."""
+        return self.activation not in (None, 1.0)
+
+    @property
+    def steps_only(self) -> bool:
+        """Whether there is noise on the air, loss, delay or activation, which only steps can have."""
+        return self.on_messages or self.leaves_out_steps
 
 
 def _start(value: object) -> str | list[float] | dict[int | str, float]:

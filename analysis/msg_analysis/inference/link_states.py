@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""The question about links that switch by themselves: whether each comes up and goes down with the rates of the file.
+"""The question about links, or steps of agents: whether each comes and goes as often as the file says.
 
 Given the past, what a link does in a step is a coin with a known probability, whatever the other links do.
 """
@@ -17,7 +17,7 @@ from msg_analysis.common.arrays import AnyArray, FloatArray
 from msg_analysis.experiment.links import LinkSchedule
 from msg_analysis.inference.e_values import proportion_evidence
 from msg_analysis.inference.graphs import MIN_EXPECTED
-from msg_analysis.inference.question import Block, Finding, Law, SummedDiagnostic
+from msg_analysis.inference.question import Block, Finding, Law, SummedDiagnostic, agent_words
 from msg_analysis.inference.statistics import binomial_interval, log_chi2_tail
 
 
@@ -25,7 +25,7 @@ class LinkRates(SummedDiagnostic):
     """Steps counted by link and by whether it was up, and those after which it was not any more, or was."""
 
     name = "links"
-    meaning = "a link does not come up and go down with the rates of the file"
+    meaning = "a link, or the steps of an agent, do not come and go as often as the file says"
     kind = "link"
     about_chain = True
 
@@ -82,7 +82,7 @@ class LinkRates(SummedDiagnostic):
         return Finding(
             log_p,
             agent=target,
-            sender=source,
+            sender=None if source == target else source,
             held=bool(up),
             estimate=seen / max(tried, 1) / scale,
             expected=1.0 if chance else 0.0,
@@ -101,16 +101,19 @@ class LinkRates(SummedDiagnostic):
     def about(self, row: int) -> str:
         """A link, or all."""
         if self._links is None or row >= len(self._links):
-            return "the links"
-        return f"link {self._links.words(row, None)}"
+            return f"the {self._links.noun}s" if self._links else "the links"
+        return f"{self._links.noun} {self._links.words(row, None)}"
 
     @classmethod
     def words(cls, found: Finding, names: Sequence[str]) -> str:
-        """How often a link comes up, or goes down, next to the file."""
+        """How often a link, or the steps of an agent, come or go, next to the file."""
         del names
-        assert found.sender is not None
         assert found.agent is not None
-        link, what = f"link {found.sender + 1}-{found.agent + 1}", "goes down" if found.held else "comes up"
+        if found.sender is None:
+            who, what = agent_words(found.agent), "makes a step after one that it left out"
+            what = "leaves out a step after one that it made" if found.held else what
+        else:
+            who, what = f"link {found.sender + 1}-{found.agent + 1}", "goes down" if found.held else "comes up"
         if not found.expected:
-            return f"{link} {what}, which the file excludes"
-        return f"{link} {what} {found.numbers} times as often as the file says"
+            return f"{who} {what}, which the file excludes"
+        return f"{who} {what} {found.numbers} times as often as the file says"

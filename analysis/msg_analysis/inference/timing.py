@@ -179,7 +179,7 @@ class _TimingLog:
         self._clocks = [StepClock(observation.step.dt, phi) for phi in phase.tolist()]
         self._tables = neighbour_tables(observation.step)
         # Which messages are lost is in the seed; else steps from the step to what ideal timers use.
-        self._messages = MessagesUsed(experiment, observation.step) if experiment.noise.steps_only else None
+        self._messages = MessagesUsed(experiment, observation.step) if experiment.noise.on_messages else None
         self._ideal_uses = None if self._messages else ideal_uses(observation.step, phase)
 
     def blocks(self) -> Iterator[tuple[int, int]]:

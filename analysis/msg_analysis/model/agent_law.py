@@ -194,5 +194,5 @@ def agent_law(record: RunRecord, model: Wiring, agent: int) -> AgentLaw | Protoc
     """The law of one agent (index from 0) of a run; ``model`` is that of the record."""
     if not isinstance(model, StepModel):
         return ProtocolLaw(record, model, agent)
-    kind = AgentLawOnAir if record.experiment.noise.steps_only else AgentLaw
+    kind = AgentLawOnAir if record.experiment.noise.on_messages else AgentLaw
     return kind(record, model, agent)

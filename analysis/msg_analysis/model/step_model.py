@@ -239,7 +239,15 @@ def _require_memory(experiment: Experiment) -> None:
 def step_noise_gain(experiment: Experiment) -> FloatArray:
     """(n, m, m) sqrt(dt) F_i: the noise that a step of the built-in law adds is this times N(0, I)."""
     gain = experiment.noise_gain
-    return np.broadcast_to(np.sqrt(experiment.step_length) * once(gain), gain.shape)
+    gain = np.broadcast_to(np.sqrt(experiment.step_length) * once(gain), gain.shape)
+    if experiment.graph_list[0].active is None:
+        return gain
+    return np.where(_active(experiment)[:, :, None], gain, 0.0)
+
+
+def _active(experiment: Experiment) -> BoolArray:
+    """(n, m): which agents make a step with each graph."""
+    return np.array([graph.active for graph in experiment.graph_list], dtype=np.bool_)
 
 
 def _built_in(experiment: Experiment) -> FloatArray:
@@ -247,8 +255,10 @@ def _built_in(experiment: Experiment) -> FloatArray:
     gains, agents = experiment.leader_gains, experiment.agents
     grounded = np.isinf(gains)
     follows = ~grounded
-    weights = np.zeros((len(experiment.graph_list), agents, agents))
-    for mode, graph in enumerate(experiment.graph_list):
+    bases = [graph.whole or graph for graph in experiment.graph_list]
+    different = {id(base): base for base in bases}
+    weights = np.zeros((len(different), agents, agents))
+    for mode, graph in enumerate(different.values()):
         z = graph.laplacian + np.diag(np.where(grounded, 0.0, gains))
         if experiment.time == "continuous":
             weights[mode] = np.eye(agents) - experiment.step_length * z
@@ -257,6 +267,12 @@ def _built_in(experiment: Experiment) -> FloatArray:
             # The limit of exp(-(L + K)) for gains to infinity: leaders forget, followers no longer hear them.
             block = np.ix_(follows, follows)
             weights[mode][block] = exponential(-z[block])
+    if len(different) < len(bases):
+        place = {key: mode for mode, key in enumerate(different)}
+        weights = weights[[place[id(base)] for base in bases]]
+    if experiment.graph_list[0].active is not None:
+        rests = ~_active(experiment) & follows
+        weights[rests] = np.eye(agents)[np.nonzero(rests)[1]]
     return weights
 
 
@@ -308,7 +324,7 @@ def build_run_model(experiment: Experiment, step: StepModel | None = None) -> St
     step, order = step or build_step_model(experiment), turns(experiment)
     if order is None:
         return step
-    if experiment.noise.steps_only:  # with messages that are noisy, late or lost, the micro-steps stay apart
+    if experiment.noise.on_messages:  # with messages that are noisy, late or lost, the micro-steps stay apart
         return dataclasses.replace(step, turns=order)
     return sequential(step, order)
 

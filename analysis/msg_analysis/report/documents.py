@@ -238,7 +238,7 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     law: dict[str, Any] = {}
     chain = None if schedule else experiment.chain
     if links:
-        law = {"links": links.to_json()}
+        law = {"activation": experiment.noise.activation} if links.noun == "agent" else {"links": links.to_json()}
     elif isinstance(switching, SojournSchedule):
         law = {"sojourn": document["switching"]["sojourn"]}
         chain, unit = switching.law.chain, experiment.step_length if experiment.time == "discrete" else 1.0

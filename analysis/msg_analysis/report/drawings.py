@@ -291,6 +291,12 @@ def _switching(experiment: Experiment) -> str:
     modes = len(experiment.graph_list)
     if modes == 1:
         return f"The graph is always {experiment.graph_list[0].name}."
+    if experiment.noise.leaves_out_steps:
+        return (
+            f"Each agent makes a step with probability {experiment.noise.activation:g}, whatever the others do, or "
+            f"keeps its state; the {modes} graphs of the run are those of the agents that make a step. All "
+            "predictions are given these graphs."
+        )
     if links := experiment.links:
         both = [
             f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"

@@ -175,8 +175,9 @@ def print_experiment(document: dict[str, Any], console: Console) -> None:
     facts.add_row("seed", str(run["seed"]))
     schedule, sojourn = (document["switching"].get(key) for key in ("schedule", "sojourn"))
     links = document["switching"].get("links")
+    drawn = links or "activation" in document["switching"]
     first = document["graphs"][0]["name"] if schedule else document["switching"]["initial"]
-    facts.add_row("start", _short(run["start"]) + ("" if links else f", first graph {first}"))
+    facts.add_row("start", _short(run["start"]) + ("" if drawn else f", first graph {first}"))
     if schedule:
         end = "with the run" if schedule["end"] is None else f"at {number_text(schedule['end'])}"
         then = ", then again" if schedule["repeat"] else ""

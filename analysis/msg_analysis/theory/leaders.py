@@ -191,7 +191,7 @@ def resolve_law(experiment: Experiment, law: SelectionLaw | None = None) -> Sele
     if law not in possible:
         reason = "discrete time" if experiment.time == "discrete" else "continuous time"
         if law == "continuous" and experiment.time == "continuous":
-            reason += " with a protocol, noise on the air, loss or delay, which belong to steps"
+            reason += " with a protocol, noise on the air, loss, delay or activation, which belong to steps"
         raise InputError(f"law {law}: {experiment.source} is in {reason}: use {' or '.join(possible)}")
     return law
 

@@ -335,7 +335,7 @@ class Prediction:
 
 def _why_no_paper(experiment: Experiment) -> str:
     if experiment.noise.steps_only:
-        return "with noise on the air, loss or delay"
+        return "with noise on the air, loss, delay or activation"
     return "in discrete time" if experiment.time == "discrete" else "with a protocol"
 
 

@@ -214,10 +214,12 @@ class _Law:
         if links is None and experiment.schedule:
             raise NotAvailableError("switching: the sequence of the graphs is given: expected a Markov chain for this")
         if links is not None and (experiment.time == "discrete" or experiment.protocol):
-            raise NotAvailableError("switching.links: expected the built-in law in continuous time: no sampling here")
+            key = "noise.activation" if noise.leaves_out_steps else "switching.links"
+            raise NotAvailableError(f"{key}: expected the built-in law in continuous time: no sampling here")
         if experiment.protocol and (lines := experiment.protocol.unavailable("predict")):
             raise NotAvailableError(lines[0])
         self.agents, self.consensus, self.links = m, experiment.problem == "consensus", links
+        self.leaves_out_steps = noise.leaves_out_steps  # then "links" are agents
         self.holds, self.delay, self.burst = noise.holds, noise.delay, noise.burst
         self.broadcast, self.link = noise.broadcast, noise.link
         if experiment.protocol or experiment.time == "discrete":
@@ -406,7 +408,7 @@ class _Walk:
             self._lost[law.lossy] = (self._rng.random((len(law.lossy), self._z.shape[1])) < chance)[law.drawn]
         if not law.plain:
             return self._messages()
-        terms = self._noise(self._z)
+        terms = self._noise(self._z * self._up if law.leaves_out_steps else self._z)
         for mode, product in enumerate(law.products):
             there = self._modes == mode
             if there.all():
@@ -418,13 +420,13 @@ class _Walk:
             flow = self._weights * self._z[law.targets]
             if len(law.lossy):
                 flow *= ~self._lost
-            self._z = self._of_graphs(law.rows) * self._z + law.flow @ flow
+            self._z = self._rows() * self._z + law.flow @ flow
         return terms
 
     def _messages(self) -> FloatArray:
         """The same with messages that are noisy, late or held, or agents that step one after the other."""
         law, depth, terms = self.law, len(self._used), np.zeros(self._z.shape[1])
-        noisy, rows = np.empty_like(self._z), self._of_graphs(law.rows)
+        noisy, rows = np.empty_like(self._z), self._rows()
         for agents, heard, said, place, own, into in law.groups:
             # The message of the state after this step, which later steps have used.
             message = self._used[(1 - self.steps) % depth, said]
@@ -440,7 +442,12 @@ class _Walk:
                 flow *= ~self._lost[heard]
             self._z[agents] = rows[agents] * z - own @ flow
             self._used[(law.ahead[heard] - self.steps - law.delay) % depth, heard] = flow
-        return terms + self._noise(noisy)
+        return terms + self._noise(noisy * self._up if law.leaves_out_steps else noisy)
+
+    def _rows(self) -> FloatArray:
+        """(m, 1) or (m, C) sums of the rows of W; 1 of an agent that leaves out the step, unless it is held."""
+        rows = self._of_graphs(self.law.rows)
+        return np.where((self._up == 0) & (rows != 0.0), 1.0, rows) if self.law.leaves_out_steps else rows
 
     def _of_graphs(self, table: FloatArray) -> FloatArray:
         """The columns of the present graphs, of a table (m, n); of one (m, 1), the only one."""

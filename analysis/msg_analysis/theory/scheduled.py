@@ -130,8 +130,14 @@ def outages(experiment: Experiment, modes: IntArray, most: int, error: Callable[
 def without_stacks(experiment: Experiment) -> bool:
     """Whether ``sparse_moments`` has its law: built in, in continuous time, with no values kept from step to step."""
     noise = experiment.noise
-    kept = noise.whole_link or noise.delay or noise.holds or (noise.loss.any and noise.burst is not None)
-    alone = step_law(experiment) == "synchronous" or not noise.steps_only
+    kept = (
+        noise.leaves_out_steps
+        or noise.whole_link
+        or noise.delay
+        or noise.holds
+        or (noise.loss.any and noise.burst is not None)
+    )
+    alone = step_law(experiment) == "synchronous" or not noise.on_messages
     return experiment.time == "continuous" and not experiment.protocol and not kept and alone
 
 

@@ -31,6 +31,7 @@ SAMPLED = 2e9  # multiplications of the steps that are sampled otherwise
 PATHS, REPLICAS = 32, 8  # that are sampled, for at least so many steps:
 FEWEST = 200
 SPARSE = 0.1  # share of entries that are not 0 below which a matrix is multiplied as a sparse one
+ROUNDING = 1e-12  # of entries of a root, relative to its diagonal
 STAGE = 2000.0  # multiplications that take as long as the rest of a stage
 HEAVY = (
     "system error: its time mean has no finite variance, because fourth moments of the states do not exist; lower the "
@@ -232,7 +233,7 @@ class _Drawn:
 
     rows: IntArray
     matrix: Any
-    root: Any  # (r, s) B with B B^T the covariance of the noise without that in messages that may be lost
+    root: Any  # (r, r) B with B B^T the covariance of the noise without that in messages that may be lost
     into: Any
     differences: Any
     losses: FloatArray
@@ -255,7 +256,9 @@ def _sparse(matrix: FloatArray) -> Any:
 
 
 def _root(covariance: FloatArray) -> FloatArray:
-    """(k, r) B with B B^T = covariance, r its rank."""
+    """(k, k) B = B^T with B B = covariance: unlike a root of eigenvectors, the same samples on every processor."""
     values, vectors = np.linalg.eigh(covariance)
     kept = values > 1e-14 * np.abs(values).max(initial=0.0)
-    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+    root = vectors[:, kept] * np.sqrt(values[kept]) @ vectors[:, kept].T
+    scale = np.sqrt(np.abs(np.diagonal(root)))
+    return np.where(np.abs(root) > ROUNDING * np.outer(scale, scale), root, 0.0)

@@ -346,7 +346,7 @@ def _system(experiment: Experiment, law: TransientLaw) -> tuple[JumpSystem, floa
     if experiment.protocol:
         raise InputError(f"law continuous: {experiment.protocol.info} has steps only: leave it out")
     if noise.steps_only:
-        belong = "noise.broadcast, link, loss and delay belong to steps, expected 0"
+        belong = "noise.broadcast, link, loss, delay and activation belong to steps, expected none of them"
         raise InputError(f"law continuous: {belong}: leave it out")
     return systems.continuous(experiment), None
 

@@ -79,7 +79,7 @@ def states_of_all(
 ) -> Iterator[FloatArray]:
     """x(first + 1), x(first + 2), ..., from x(first) under the graphs ``modes`` from there on, in blocks (k, m, R)."""
     # first is a multiple of STEPS_PER_BLOCK; steps before a run are negative.
-    air = AirReception(experiment, model, start, first) if experiment.noise.steps_only else None
+    air = AirReception(experiment, model, start, first) if experiment.noise.on_messages else None
     law, noise = law or law_of_all(experiment, model), noise or noise_of_all(experiment, model)
     past = np.repeat(start[None], experiment.noise.delay + 1, axis=0)  # before the start the states are those of it
     for begin, now, drives in _blocks(noise, model, modes, first):
