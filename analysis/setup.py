@@ -78,5 +78,8 @@ setup(
         "rerun": ["rerun-sdk"],  # msg-analysis export --rrd
         "test": ["pytest"],  # by which colcon knows how to test it
     },
-    entry_points={"console_scripts": ["msg-analysis = msg_analysis.cli.entry_point:msg_analysis"]},
+    entry_points={
+        "console_scripts": ["msg-analysis = msg_analysis.cli.entry_point:msg_analysis"],
+        "pytest11": ["msg_analysis = msg_analysis.pytest_plugin"],
+    },
 )

@@ -17,11 +17,11 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = {"msg_analysis": ROOT / "analysis/msg_analysis", "msg_agents": ROOT / "msg_agents/msg_agents"}
 LAYERS = {  # lowest first; what stands between two slashes may import each other; msg_agents is above msg_analysis
     "msg_analysis": "errors / common / arithmetic / protocol experiment / model / messages / theory / twin / bags / "
-    "inference / sweeps / runs / report / __init__ / testing / paper / cli / __main__",
+    "inference / sweeps / runs / report / __init__ / testing pytest_plugin / paper / cli / __main__",
     "msg_agents": "terminal / discovery / environment / process_layout / channel / stepping / recovery / replay / "
     "watch / run / doctor / nodes / __init__ / testing / cli / __main__",
 }
-MOST_FILES = 218
+MOST_FILES = 220
 MOST_LINES = 500
 ROS = re.compile(r"(rclpy|rosidl|ament|launch)|\w+_(msgs|interfaces)$")
 

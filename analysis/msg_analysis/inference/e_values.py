@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import betaln, gammaln
+from scipy.special import betainc, betaln, gammaln
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 
@@ -126,6 +126,22 @@ def proportion_evidence(successes: IntArray, trials: IntArray, probability: Floa
     a = np.array(PROPORTION_STRENGTHS)
     b = a * (1.0 - p) / p
     return np.asarray(betaln(a + hit, b + miss) - betaln(a, b) - hit * np.log(p) - miss * np.log1p(-p))
+
+
+SHARE_STRENGTH = 5.0  # successes and failures that the alternatives to a share are worth
+
+
+def share_evidence(successes: IntArray, failures: IntArray, share: float) -> FloatArray:
+    """(...) against a probability of success of at least ``share`` (0 to 1, exclusive), in independent trials.
+
+    log of the mixture of q^s (1 - q)^f / (share^s (1 - share)^f) for s and f (...) over q ~ beta of mean ``share``, cut
+    off there: for every probability >= share each factor has a mean of at most 1.
+    """
+    a, b = SHARE_STRENGTH * share, SHARE_STRENGTH * (1.0 - share)
+    with np.errstate(divide="ignore"):
+        found = betaln(a + successes, b + failures) + np.log(betainc(a + successes, b + failures, share))
+        known = betaln(a, b) + np.log(betainc(a, b, share))
+    return np.asarray(found - known - successes * math.log(share) - failures * math.log1p(-share))
 
 
 def log_mean(logarithms: FloatArray, axis: int = 0) -> FloatArray:
