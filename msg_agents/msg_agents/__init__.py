@@ -3,7 +3,7 @@
 
 """ROS 2 networks of agents under Markov-switching graphs.
 
-from msg_agents import run_network
+from msg_agents import ExternalAgent, run_network
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from msg_agents.nodes.external_agent import ExternalAgent
     from msg_analysis import Experiment, Run
 
     __version__: str
 
-__all__ = ["run_network"]
+__all__ = ["ExternalAgent", "run_network"]
 
 
 def run_network(experiment: str | Path | Experiment, out: str | Path = "runs", **options: Any) -> Run:
@@ -66,6 +67,10 @@ def run_network(experiment: str | Path | Experiment, out: str | Path = "runs", *
 
 
 def __getattr__(name: str) -> Any:
+    if name == "ExternalAgent":
+        from msg_agents.nodes.external_agent import ExternalAgent
+
+        return ExternalAgent
     if name != "__version__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib.metadata import PackageNotFoundError, version

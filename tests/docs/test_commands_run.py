@@ -40,6 +40,7 @@ TESTED = {  # and where
     r"msg-analysis sweep (rates|rates_and_loss)\.yaml": "tests/analysis/cli/test_sweep.py",
     r"msg-analysis figures 3": "tests/analysis/paper/test_paper.py",
     r"python docs/cyclone_dds/cyclone_agent\.py": "tests/integration/test_cyclone.py",
+    r"python docs/external_agent/my_agent\.py": "tests/integration/test_external_agent.py",
     r"\.venv/bin/python benchmarks/errata\.py": "tests/analysis/paper/test_errata.py",
     r"sed 's/\"process\"": "tests/integration/test_docs.py",
     r"wait": "tests/integration/test_docs.py",

@@ -171,8 +171,12 @@ class Network:
 
     def execute(self, *arguments: str | Path, machine: Sequence[str] = (), **environment: str) -> subprocess.Popen[str]:
         """The same, as from a shell, by words before it, and with variables that are read when a program starts."""
+        return self.program(*machine, PROGRAM, *arguments, **environment)
+
+    def program(self, *arguments: str | Path, **environment: str) -> subprocess.Popen[str]:
+        """Start any program."""
         command = subprocess.Popen(
-            [*machine, str(PROGRAM), *(str(argument) for argument in arguments)],
+            [*(str(argument) for argument in arguments)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
@@ -29,7 +29,7 @@ from msg_analysis.messages import topics
 from msg_analysis.messages.acceptance import state_frame, state_receiver
 from msg_analysis.messages.messages import ActiveGraph, StateCodec, with_state
 from msg_analysis.messages.topics import Qos, agent_node_name
-from msg_analysis.model.agent_law import agent_law
+from msg_analysis.model.reception import AgentAir
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import Wiring
 
@@ -40,6 +40,31 @@ RETURN_TIME = 2.0  # s for which states are not repeated yet, because a reader i
 RETURN_POLL = 0.02  # s
 PASSIVE_GRACE = 0.3  # s that a reader with best effort has for the last state before its writer leaves
 ANSWER_PERIOD = 0.5  # s between two repetitions of states for peers
+
+
+class StepLaw(Protocol):
+    """What an agent does in a step: an ``AgentLaw``, or what a user has written."""
+
+    agent: int  # index from 0
+    step: int
+    state: bytes
+    heard: tuple[int, ...]
+
+    @property
+    def air(self) -> AgentAir | None:
+        """See AgentLaw."""
+
+    def resume(self, step: int, state: bytes) -> None:
+        """See AgentLaw."""
+
+    def neighbours(self, mode: int) -> list[int]:
+        """See AgentLaw."""
+
+    def published(self, step: int, state: bytes) -> bytes:
+        """See AgentLaw."""
+
+    def advance(self, mode: int, heard: list[bytes], steps: Sequence[int] | None = None) -> bytes:
+        """See AgentLaw."""
 
 
 class Agent(NetworkNode):
@@ -56,16 +81,17 @@ class Agent(NetworkNode):
         *,
         record: RunRecord,
         model: Wiring,
-        agent: int,  # index from 0
+        law: StepLaw,
         peers: Sequence[int],  # every other agent that it exchanges states with at any time, ascending
         local_agents: Collection[int],  # agents of its process, itself included
         readers: Sequence[str],  # other nodes that must read the states before the run starts
         checkpoints: Path | None,  # directory of the published states, from which it resumes after a restart
         group: AgentGroup,
     ) -> None:
+        agent = law.agent
         super().__init__(agent_node_name(agent), record=record)
         experiment = record.experiment
-        self._law = agent_law(record, model, agent)
+        self._law = law
         self._last = experiment.steps
         self._codec = StateCodec(self.run, agent + 1, experiment.width, experiment.step_length)
         self._frame = state_frame(record, whole=False)

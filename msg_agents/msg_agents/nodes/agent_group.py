@@ -15,7 +15,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from msg_agents.discovery.rtps import PREFIX_SIZE, has_profile_for
-from msg_agents.nodes.agent import Agent
+from msg_agents.nodes.agent import Agent, StepLaw
 from msg_agents.nodes.base import NOT_AN_AGENT, NetworkNode
 from msg_agents.nodes.paced_agents import LockstepAgent, RealtimeAgent
 from msg_agents.nodes.ros import every
@@ -27,6 +27,7 @@ from msg_analysis.messages.acceptance import Refusal, fault_of, state_frame, why
 from msg_analysis.messages.cdr import CdrError, decode_batch, encode_batch
 from msg_analysis.messages.messages import with_state
 from msg_analysis.messages.topics import STATE, STATES, Topic, agent_node_name
+from msg_analysis.model.agent_law import agent_law
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import Wiring
 
@@ -195,6 +196,7 @@ class AgentGroup:
         agents: Sequence[int],  # indices from 0, at least one
         readers: Sequence[str],  # other nodes that must read the states before the run starts
         checkpoints: Path | None = None,  # directory of the published states, from which agents resume
+        law: Callable[[RunRecord, Wiring, int], StepLaw] = agent_law,  # of an agent (index from 0)
     ) -> None:
         self.turns = TurnQueue(len(agents), self._defer, self._end_turns)
         self.progress_period = max(PROGRESS_PERIOD, model.agents / MOST_REPORTS)
@@ -206,7 +208,7 @@ class AgentGroup:
             self._agents[i] = kind(
                 record=record,
                 model=model,
-                agent=i,
+                law=law(record, model, i),
                 peers=[int(j) for j in exchanges[i].nonzero()[0]],
                 local_agents=agents,
                 readers=readers,

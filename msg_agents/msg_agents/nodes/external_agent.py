@@ -1,0 +1,166 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""An agent of a run in a program of its user: the step is the user's, all that a run asks of an agent is done here."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rclpy.node import Node
+
+from msg_agents.environment import DISCOVERY_TIMEOUT
+from msg_agents.nodes.agent import Agent
+from msg_agents.nodes.agent_group import AgentGroup
+from msg_agents.nodes.process import run_nodes
+from msg_agents.process_layout import RECORDER
+from msg_analysis.arithmetic.update_law import from_payload, to_payload
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.files import read_text
+from msg_analysis.errors import InputError
+from msg_analysis.experiment.graphs import Graph
+from msg_analysis.experiment.protocols import ProtocolError
+from msg_analysis.model.reception import AgentAir
+from msg_analysis.model.run_record import RunRecord
+from msg_analysis.model.step_model import Wiring
+
+
+class ExternalAgent:
+    """The base class. Subclass it, write ``step``, and call ``run``; the other nodes are started as usual.
+
+    Parameters
+    ----------
+    record
+        file of the run record, of ``msg-agents prepare``
+    agent
+        number of this agent, from 1; the agents of other programs run beside it
+    readers
+        other nodes that must be there before the run starts; by default the recorder
+
+    Attributes
+    ----------
+    experiment
+        what is run: ``graph_list``, ``step_length``, ``run``, ...
+    number
+        of this agent, from 1
+
+    Raises
+    ------
+    InputError
+        a record that cannot be read, an agent that it does not have, or a protocol
+    """
+
+    def __init__(self, record: str | Path, agent: int, *, readers: Sequence[str] = (RECORDER,)) -> None:
+        try:
+            self._record = RunRecord.from_json(read_text(Path(record)), str(record))
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(
+                f"{record}: cannot be read ({error}): expected what `msg-agents prepare` prints"
+            ) from error
+        self.experiment, self.number, self._readers = self._record.experiment, agent, readers
+        if not 1 <= agent <= self.experiment.agents:
+            raise InputError(f"agent: {agent}: expected a number from 1 to {self.experiment.agents}")
+        if self.experiment.protocol:
+            raise InputError("protocol: expected the built-in law: agents of a protocol are in its package")
+
+    def step(self, k: int, graph: Graph, own: FloatArray, heard: Mapping[int, FloatArray]) -> ArrayLike:
+        """The next state: x(k+1), its own noise included.
+
+        Parameters
+        ----------
+        k
+            number of the step, from 0
+        graph
+            the active one: ``name``, ``adjacency`` (weights in the row of this agent), ``arcs``
+        own
+            (R,) x(k), one value for each replica, read-only
+        heard
+            (R,) of each neighbour in this graph, by number, what was received of it; without those whose message
+            was lost (``noise.on_loss: own``)
+
+        Returns
+        -------
+        ArrayLike
+            (R,), or one number for all replicas
+        """
+        raise NotImplementedError
+
+    def connected(self, node: Node) -> None:
+        """Called once with the node of the agent, for topics of one's own, before others are looked for."""
+
+    def run(self, *, discovery_timeout: float = DISCOVERY_TIMEOUT) -> bool:
+        """Take part in the run, to its end; False if it was stopped before, by a signal.
+
+        Raises
+        ------
+        InputError
+            the other nodes were not found within ``discovery_timeout`` [s], or ``step`` has failed: ``__cause__``
+        """
+        record = self._record
+
+        def nodes() -> Sequence[Agent]:
+            law = ExternalLaw(record, record.model, self)
+            group = AgentGroup(
+                record=record,
+                model=record.model,
+                agents=[self.number - 1],
+                readers=list(self._readers),
+                law=lambda _record, _model, _agent: law,
+            )
+            self.connected(group.nodes[0])
+            return group.nodes
+
+        executor = os.environ.get("MSG_AGENTS_EXECUTOR") or "events"
+        throughput = self.experiment.run.pace == "lockstep"
+        return run_nodes(
+            nodes,
+            executor=executor,
+            throughput=throughput,
+            discovery_timeout=discovery_timeout,
+            one_record=False,
+        )
+
+
+class ExternalLaw:
+    """The step of an external agent, with the interface of ``AgentLaw``."""
+
+    def __init__(self, record: RunRecord, model: Wiring, owner: ExternalAgent) -> None:
+        self.agent, self.step = owner.number - 1, 0
+        self.state = to_payload(record.start[self.agent])
+        self.heard: tuple[int, ...] = ()
+        self.air = AgentAir(record.experiment, model, self.agent)
+        self._owner, self._graphs = owner, record.experiment.graph_list
+        self._neighbours = [model.neighbours(mode, self.agent).tolist() for mode in range(model.modes)]
+
+    def resume(self, step: int, state: bytes) -> None:
+        """See AgentLaw."""
+        self.step, self.state = step, state
+
+    def neighbours(self, mode: int) -> list[int]:
+        """See AgentLaw."""
+        return list(self._neighbours[mode])
+
+    def published(self, step: int, state: bytes) -> bytes:
+        """See AgentLaw."""
+        return self.air.published(step, from_payload(state)) if self.air.broadcast else state
+
+    def advance(self, mode: int, heard: list[bytes], steps: Sequence[int] | None = None) -> bytes:
+        """See AgentLaw. ProtocolError: the step of the user has failed."""
+        senders, own = self._neighbours[mode], from_payload(self.state)
+        values, self.heard = self.air.receive(senders, self.step, heard, steps)
+        received = {j + 1: from_payload(value) for j, value in zip(senders, values, strict=True) if value is not None}
+        place = f"{type(self._owner).__name__} of agent {self.agent + 1}, step {self.step}"
+        try:
+            found = np.asarray(self._owner.step(self.step, self._graphs[mode], own, received), dtype=float)
+            state = np.broadcast_to(found, own.shape)
+        except Exception as error:
+            raise ProtocolError(f"{place}: {type(error).__name__}: {error}") from error
+        if not np.isfinite(state).all():
+            raise ProtocolError(f"{place}: {state.tolist()}: expected finite numbers")
+        self.state = to_payload(np.ascontiguousarray(state))
+        self.step += 1
+        return self.state

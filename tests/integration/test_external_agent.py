@@ -1,0 +1,85 @@
+"""An agent in a program of its user, beside the others of a run; the example of the documentation."""
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from networks import run_file
+from pages import ROOT, blocks
+
+from experiments import compare
+from msg_analysis.bags.reading import read_bag
+from msg_analysis.inference.comparison import Comparison
+
+OTHERS = [word for number in "1234" for word in ("--agent", number)]
+EXAMPLE = Path(__file__).parents[2] / "docs/external_agent/my_agent.py"
+
+
+def verdict(network: Any, record: Path, *gain: str) -> Comparison:
+    """Of a run whose agent 5 is the example."""
+    bag, options = network.directory / "runs/mine", ("--await", "recorder")
+    nodes = [
+        network.start("switcher", record, *options),
+        network.start("agent", record, *OTHERS, *options),
+        network.start("recorder", record, "--out", bag),
+        network.program(sys.executable, "-P", EXAMPLE, record, "5", *gain),
+    ]
+    for node in nodes:
+        network.ended(node)
+    run = read_bag(bag)
+    assert run.completeness.complete
+    return compare(run)
+
+
+def test_its_step_is_judged(network: Any, domain: int) -> None:
+    """It obeys the law with noise of its own, of a fixed seed; with 0.7 of the gain it is named."""
+    record = run_file(network.directory, 5, run={"duration": 200})
+    assert verdict(network, record).verdict == "agrees"
+
+
+def test_a_wrong_gain_is_found(network: Any, domain: int) -> None:
+    record = run_file(network.directory, 5, run={"duration": 200}, noise={"loss": 0.2, "link": 0.1})
+    found = verdict(network, record, "0.7")
+    assert (found.verdict, found.causes[0].kind, found.causes[0].agent) == ("disagrees", "gain", 5)
+
+
+def test_in_real_time(network: Any, domain: int) -> None:
+    record = run_file(network.directory, 5, run={"duration": 20, "pace": "realtime", "speed": 5})
+    assert verdict(network, record).verdict == "agrees"
+
+
+@pytest.mark.parametrize(
+    ("step", "words"),
+    [
+        ("return 1 / 0", "Mine of agent 5, step 0: ZeroDivisionError: division by zero"),
+        ("return float('nan')", "Mine of agent 5, step 0: [nan, nan]: expected finite numbers"),
+        ("return [1.0, 2.0, 3.0]", "Mine of agent 5, step 0: ValueError: "),
+    ],
+)
+def test_a_step_that_fails(network: Any, domain: int, step: str, words: str) -> None:
+    """The error names agent and step; the others say that it has left."""
+    record = run_file(network.directory, 5, run={"duration": 20})
+    program = network.directory / "mine.py"
+    program.write_text(
+        "import sys\nfrom msg_agents import ExternalAgent\nfrom msg_analysis import InputError\n"
+        f"class Mine(ExternalAgent):\n    def step(self, k, graph, own, heard):\n        {step}\n"
+        "try:\n    Mine(sys.argv[1], 5, readers=()).run()\n"
+        "except InputError as error:\n    sys.exit(f'error: {error}')\n"
+    )
+    options = ("--timeout", "1")
+    others = [
+        network.start("switcher", record, *options),
+        network.start("agent", record, *OTHERS, *options),
+    ]
+    mine = network.program(sys.executable, "-P", program, record)
+    _, stderr = mine.communicate(timeout=100)
+    assert (mine.returncode, words in stderr) == (1, True), stderr
+    for node in others:
+        assert re.search("left the network|did not discover", network.ended(node, 2)[1])
+
+
+def test_the_page_shows_the_example() -> None:
+    (shown,) = [block for block in blocks(ROOT / "docs/wire.md", "python") if "ExternalAgent" in block]
+    assert shown.strip() in EXAMPLE.read_text()
