@@ -12,6 +12,8 @@ models and the Kalman filter (1989), 3.4); a change of a gain acts on the innova
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -75,6 +77,12 @@ class Filter:
         self.present: BoolArray = ~np.isnan(self.values).any(axis=2)
         self.stretches = law.stretches(times, starts, graphs)
         self.spread = float(np.nanmax(np.abs(self.values), initial=0.0)) or 1.0
+
+    def exchanged(self, order: Sequence[int]) -> Filter:
+        """The same with the states of agent ``order[i]`` as those of agent i."""
+        other = copy.copy(self)
+        other.values, other.present = self.values[:, order], self.present[:, order]
+        return other
 
     def run(
         self,
