@@ -5,13 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, PlainValidator, ValidationError
 
-from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.common.text import listed
+from msg_analysis.errors import InputError
 from msg_analysis.experiment.loading import read_yaml
 from msg_analysis.experiment.problems import ExperimentError, problem, show, translate
 from msg_analysis.experiment.values import NonNegative, Positive, Section, expected, is_agent, is_number
@@ -108,9 +109,15 @@ class LogMap(Section):
         examples=["continuous"],
     )
 
-    def source(self, law: Experiment, number: int) -> Source | None:
-        """Of an agent, from 1; None: the map does not mention it."""
-        name = law.names[number - 1] if law.names else str(number)
+    def sources(self, agents: int, names: Sequence[str] | None = None) -> list[Source]:
+        """Of all agents; InputError: the map does not mention one."""
+        found = [self._source(number, names[number - 1] if names else str(number)) for number in range(1, agents + 1)]
+        missing = [number for number, each in enumerate(found, start=1) if each is None]
+        if missing:
+            raise InputError(f"agents: {listed(missing)}: not in the map: expected all {agents} agents of the law")
+        return [each for each in found if each is not None]
+
+    def _source(self, number: int, name: str) -> Source | None:
         for key in (number, str(number), name):
             if key in self.agents:
                 return self.agents[key]

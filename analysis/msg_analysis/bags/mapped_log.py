@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.bags.files import bag_files, stored_file
-from msg_analysis.bags.log_map import GraphSource, LogMap
+from msg_analysis.bags.log_map import GraphSource, LogMap, Source
 from msg_analysis.bags.message_fields import FieldError, FieldReader, leaves
 from msg_analysis.common.arrays import AnyArray, FloatArray, IntArray
 from msg_analysis.common.resources import require_pyarrow, tell
@@ -65,13 +65,8 @@ def is_table(path: Path) -> bool:
     return path.suffix.lower() in TABLES
 
 
-def read_contents(path: Path, mapped: LogMap, law: Experiment) -> Contents:
-    """What a bag or table has by a map. InputError: a topic, field or column is missing, or no value is in it."""
-    sources = [mapped.source(law, number) for number in range(1, law.agents + 1)]
-    missing = [number for number, each in enumerate(sources, start=1) if each is None]
-    if missing:
-        raise InputError(f"agents: {listed(missing)}: not in the map: expected all {law.agents} agents of the law")
-    several = [each for each in sources if each is not None]
+def read_contents(path: Path, mapped: LogMap, several: Sequence[Source]) -> Contents:
+    """What a bag or table has of the agents. InputError: a topic, field or column is missing, or no value is in it."""
     graph = mapped.graph if mapped.graph and mapped.graph.field else None
     with_topic = [each for each in (*several, *([graph] if graph else [])) if each.topic is not None]
     if is_table(path):
@@ -231,7 +226,7 @@ def _of_table(
 
 def read_log(path: Path, mapped: LogMap, law: Experiment, directory: Path | None = None) -> Log:
     """The log in a bag or table. InputError: it does not fit the map or the law; ``directory``: base of the trace."""
-    contents = read_contents(path, mapped, law)
+    contents = read_contents(path, mapped, mapped.sources(law.agents, law.names))
     notes = list(contents.notes)
     columns, stamps = [], []
     for number, series in enumerate(contents.agents, start=1):
