@@ -114,10 +114,10 @@ def first_map(bag: Path) -> str:
         "# units: {time: 1.0, state: 1.0}  # s per unit of time of the law; units of the log per unit of its states",
         "# period: 0.1  # s: use fewer samples",
         "# law: steps  # if the agents make the steps of a run, and not the continuous law",
-        "# topics that are not used:",
     ]
     used = {topic.name for topic in (*agents, *graphs[:1])}
-    lines += [f"#   {each.name}: {each.type}, {each.messages} messages" for each in topics if each.name not in used]
+    rest = [f"#   {each.name}: {each.type}, {each.messages} messages" for each in topics if each.name not in used]
+    lines += ["# topics that are not used:", *rest] if rest else []
     return "\n".join(lines) + "\n"
 
 
