@@ -77,7 +77,7 @@ KINDS = {
     "directed": Kind(directed=True),
     "r estimated": Kind(estimate=True),
 }
-FAULTS = {
+FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "gain x 0.8": ({"gain": 0.8}, "gain"),
     "missing link": ({"missing": (2, 3)}, "gain"),
     "noise x 1.1": ({"louder": 1.1}, "noise"),
@@ -172,11 +172,12 @@ def judge(kind: Kind, samples: int, seed: int) -> Any:
     """Of one log: rejected tests, causes, and which intervals cover what they should."""
     with one_blas_thread():
         times, states, starts, names = simulate(kind, samples, np.random.default_rng(seed))
-        noise = "estimate" if kind.estimate else kind.r
+        noise: Any = "estimate" if kind.estimate else kind.r
         log = Log.from_arrays(times, states, law=kind.law(), graph=(starts, names), measurement_noise=noise)
         found = log.compare()
-    covered = {name: low <= 1.0 <= high for name, one in found.factors.items() if one.interval
-               for low, high in [one.interval]}
+    covered = {
+        name: low <= 1.0 <= high for name, one in found.factors.items() if one.interval for low, high in [one.interval]
+    }
     if found.system_error and found.system_error.z is not None:
         covered["system error"] = abs(found.system_error.z) < 1.96
     if found.measurement_noise.interval:
@@ -209,7 +210,9 @@ def level(pool: ProcessPoolExecutor, args: argparse.Namespace) -> None:
         kind = replace(kind, jitter=args.jitter * kind.period)
         found = tally(pool, kind, args)
         shares = ", ".join(f"{key} {found.covered[key] / count:.3f}" for key, count in sorted(found.told.items()))
-        print(f"{name:18} rejected {found.rejected} of {found.logs} {dict(found.tests)}; coverage: {shares}", flush=True)
+        print(
+            f"{name:18} rejected {found.rejected} of {found.logs} {dict(found.tests)}; coverage: {shares}", flush=True
+        )
         for one in ("told", "covered"):
             getattr(total, one).update(getattr(found, one))
         total.logs, total.rejected = total.logs + found.logs, total.rejected + found.rejected
@@ -221,7 +224,9 @@ def power(pool: ProcessPoolExecutor, args: argparse.Namespace) -> None:
     """Wrong logs."""
     for name, (changes, cause) in FAULTS.items():
         found = tally(pool, replace(Kind(), **changes), args)
-        print(f"{name:15} found {found.rejected} of {found.logs}; first cause {cause}: {found.first[cause]}", flush=True)
+        print(
+            f"{name:15} found {found.rejected} of {found.logs}; first cause {cause}: {found.first[cause]}", flush=True
+        )
         for words, count in found.words.most_common(2):
             print(f"    {count} {words}")
 
@@ -230,8 +235,13 @@ def speed(_pool: ProcessPoolExecutor, args: argparse.Namespace) -> None:
     """20 agents, 100,000 samples."""
     m, samples, rng = 20, args.samples, np.random.default_rng(1)
     agents = list(range(1, m + 1))
-    law = Experiment.parse({"name": "large", "graphs": {"line": {"path": agents}, "ring": {"cycle": agents}},
-                            "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]}})
+    law = Experiment.parse(
+        {
+            "name": "large",
+            "graphs": {"line": {"path": agents}, "ring": {"cycle": agents}},
+            "switching": {"generator": [[-0.5, 0.5], [0.5, -0.5]]},
+        }
+    )
     times = 0.1 * np.arange(samples)
     starts = np.concatenate([[0.0], np.cumsum(rng.exponential(2.0, samples // 10))])
     starts = starts[starts < times[-1]]

@@ -9,6 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -139,7 +140,9 @@ def _agents(topics: Sequence[Topic]) -> list[Topic]:
     if several:
         best = groups[min(several, key=rank)]
         return [best[number] for number in sorted(best)]
-    types = sorted({topic.type for topic in usable}, key=lambda kind: order.index(kind) if kind in order else len(order))
+    types = sorted(
+        {topic.type for topic in usable}, key=lambda kind: order.index(kind) if kind in order else len(order)
+    )
     return [topic for topic in usable if topic.type == types[0]] if types else []
 
 
@@ -229,7 +232,7 @@ def _graph(contents: Contents, start: int) -> dict[str, Any] | None:
         return None
     times, values = contents.graph.joined()
     names = [str(value) for value in values[np.argsort(times, kind="stable")].tolist()]
-    switches = sum(a != b for a, b in zip(names, names[1:], strict=False))
+    switches = sum(a != b for a, b in pairwise(names))
     return {
         "source": contents.graph.what,
         "messages": len(names),

@@ -159,7 +159,9 @@ def parse_map(document: Mapping[Any, Any], source: str) -> LogMap:
             lines.append(problem(f"agents.{key}", "field", "expected one of `field` and `fields`", "give one"))
     pattern = found.agents.get(EVERY)
     if pattern and not any(mark in str(pattern) for mark in (NUMBER, NAME)):
-        lines.append(problem(f"agents.{EVERY}", "missing {i}", "expected {i} or {name} in the topic or field", "add it"))
+        lines.append(
+            problem(f"agents.{EVERY}", "missing {i}", "expected {i} or {name} in the topic or field", "add it")
+        )
     if len({len(each.all_fields) for each in found.agents.values()}) > 1:
         lines.append(problem("agents", "fields", "expected as many coordinates of every agent", "correct them"))
     if found.graph:

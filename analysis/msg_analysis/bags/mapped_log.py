@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Reads a bag, or a table (CSV, Parquet, NPZ), by a map: as what there is of every agent, and as a log to be compared."""
+"""Reads a bag, or a table (CSV, Parquet, NPZ), by a map: what there is of every agent, and a log to be compared."""
 
 from __future__ import annotations
 
@@ -68,12 +68,13 @@ def is_table(path: Path) -> bool:
 def read_contents(path: Path, mapped: LogMap, several: Sequence[Source]) -> Contents:
     """What a bag or table has of the agents. InputError: a topic, field or column is missing, or no value is in it."""
     graph = mapped.graph if mapped.graph and mapped.graph.field else None
-    with_topic = [each for each in (*several, *([graph] if graph else [])) if each.topic is not None]
+    topics = [each.topic for each in several] + [graph.topic for _ in (0,) if graph]
+    with_topic = [topic for topic in topics if topic is not None]
     if is_table(path):
         if with_topic:
-            raise InputError(f"topic: {with_topic[0].topic}: {path} is a table: expected columns as `field`: remove it")
+            raise InputError(f"topic: {with_topic[0]}: {path} is a table: expected columns as `field`: remove it")
         return _of_table(read_table(path), path, mapped, [each.all_fields for each in several], graph)
-    if len(with_topic) < len(several) + (graph is not None):
+    if len(with_topic) < len(topics):
         raise InputError(f"topic: missing: {path} is a bag: expected a topic for every agent and for the graph")
     wanted = [(str(each.topic), each.all_fields) for each in several]
     if graph:
@@ -82,9 +83,7 @@ def read_contents(path: Path, mapped: LogMap, several: Sequence[Source]) -> Cont
     return Contents(series[: len(several)], series[-1] if graph else None, notes)
 
 
-def _of_bag(
-    path: Path, wanted: list[tuple[str, list[str]]], time: str, agents: int
-) -> tuple[list[Series], list[str]]:
+def _of_bag(path: Path, wanted: list[tuple[str, list[str]]], time: str, agents: int) -> tuple[list[Series], list[str]]:
     if time not in ("header", "log"):
         raise InputError(f"time: {time!r}: {path} is a bag: expected 'header' or 'log'")
     series = [Series(topic) for topic, _ in wanted]
@@ -244,9 +243,9 @@ def read_log(path: Path, mapped: LogMap, law: Experiment, directory: Path | None
         moments, names = _traced(mapped.graph, law, directory or Path())
         graph = ((moments * SECOND - origin) / unit, names)
     elif contents.graph:
-        moments, values = contents.graph.joined()
-        order = np.argsort(moments, kind="stable")
-        graph = ((moments[order] - origin) / unit, _names(values[order], law, contents.graph.what))
+        since, told = contents.graph.joined()
+        order = np.argsort(since, kind="stable")
+        graph = ((since[order] - origin) / unit, _names(told[order], law, contents.graph.what))
     noise = mapped.measurement_noise
     if not isinstance(noise, str):
         noise = (np.asarray(noise, dtype=float) / mapped.units.state).tolist()
@@ -264,7 +263,7 @@ def read_log(path: Path, mapped: LogMap, law: Experiment, directory: Path | None
 def _cleaned(series: Series, number: int, period: float | None, notes: list[str]) -> tuple[IntArray, FloatArray]:
     """Ascending times and values, without duplicates and NaN; InputError: the clock jumps back."""
     times, values = series.joined()
-    finite = np.isfinite(values).all(axis=1)
+    finite = np.asarray(np.isfinite(values).all(axis=1))
     steps = np.diff(times)
     usual = float(np.median(np.abs(steps))) if len(steps) else 0.0
     back = np.flatnonzero(steps < -max(MOST_BACK * usual, 1.0))
@@ -296,7 +295,10 @@ def _cleaned(series: Series, number: int, period: float | None, notes: list[str]
 def _names(values: AnyArray, law: Experiment, what: str) -> list[str]:
     """Names of graphs, from names or numbers from 1."""
     names = [graph.name for graph in law.graph_list]
-    known = {**{name: name for name in names}, **{str(k): name for k, name in enumerate(names, 1) if str(k) not in names}}
+    known = {
+        **{name: name for name in names},
+        **{str(k): name for k, name in enumerate(names, 1) if str(k) not in names},
+    }
     found = [known.get(str(value).strip()) for value in values.tolist()]
     if None in found:
         wrong = values[found.index(None)]
@@ -307,7 +309,7 @@ def _names(values: AnyArray, law: Experiment, what: str) -> list[str]:
 
 
 def _traced(graph: GraphSource, law: Experiment, directory: Path) -> tuple[FloatArray, list[str]]:
-    """Times [s] and names of the graphs in a trace; InputError: it cannot be read, or has a graph that the law lacks."""
+    """Times [s] and names of the graphs in a trace; InputError: not readable, or a graph that the law does not have."""
     file = directory / str(graph.file)
     try:
         trace = read_trace(

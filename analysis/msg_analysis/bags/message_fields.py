@@ -140,7 +140,9 @@ class FieldReader:
                 wanted = "an index such as [0]" if number in (3, 4) else "a field"
                 raise FieldError(f"field {text}: expected {wanted} in the place of {part!r} in {self.name}")
         if int(kind[0]) != 1:
-            inner = [f"{text}.{name}" for name, _ in leaves(self._types, kind[1])] if int(kind[0]) == 2 else [f"{text}[0]"]
+            inner = (
+                [f"{text}.{name}" for name, _ in leaves(self._types, kind[1])] if int(kind[0]) == 2 else [f"{text}[0]"]
+            )
             raise FieldError(f"field {text}: expected a single number, such as {listed(inner, 6)}")
 
     def _fields(self, name: str) -> Fields:

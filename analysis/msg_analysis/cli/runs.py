@@ -171,7 +171,9 @@ def diff(a: Path, b: Path, *, as_json: bool) -> None:
     )
 )
 @click.argument("bags", metavar="BAG...", nargs=-1, required=True, type=LOG)
-@click.option("--law", type=EXPERIMENT, metavar="EXPERIMENT", help="Of a bag or table of others: what it should follow.")
+@click.option(
+    "--law", type=EXPERIMENT, metavar="EXPERIMENT", help="Of a bag or table of others: what it should follow."
+)
 @click.option("--map", "mapped", type=YAML, metavar="MAP", help="With --law: where in it the states and graphs are.")
 @level_option("Probability of a false 'disagrees', over all tests.")
 @max_missed_option

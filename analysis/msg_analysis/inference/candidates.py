@@ -203,6 +203,7 @@ def gains(sums: ResidualSums, excluded: Iterable[int]) -> ParameterGroup | None:
 
 
 def gain_classes(terms: Sequence[Term]) -> list[list[Candidate]]:
+    """Changes of gains, reference and offsets, by the coefficients of the terms."""
     weights = np.array([term.weight for term in terms])
     leaders = sorted({term.agent for term in terms if term.kind == "lead"})
 

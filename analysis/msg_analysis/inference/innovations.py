@@ -74,7 +74,7 @@ class Filter:
     ) -> None:
         self.law, self.times = law, times
         self.values = states - law.reference  # (N, m, R)
-        self.present: BoolArray = ~np.isnan(self.values).any(axis=2)
+        self.present: BoolArray = np.asarray(~np.isnan(self.values).any(axis=2))
         self.stretches = law.stretches(times, starts, graphs)
         self.spread = float(np.nanmax(np.abs(self.values), initial=0.0)) or 1.0
 
@@ -173,9 +173,8 @@ class _Pass:
         self, done: int, last: int, first: int, end: int, apart: bool
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Phi, Q and its parts, where wanted, of the intervals done..last-1, of stretches first..end-1."""
-        interval, graph, length = (
-            part[first:end] for part in (self.of.stretches.interval, self.of.stretches.graph, self.of.stretches.length)
-        )
+        stretches, part = self.of.stretches, slice(first, end)
+        interval, graph, length = stretches.interval[part], stretches.graph[part], stretches.length[part]
         m, count = self.law.agents, len(interval)
         phi, q, parts = np.empty((count, m, m)), np.empty((count, m, m)), np.empty((count, m * apart, m, m))
         for g in np.unique(graph).tolist():

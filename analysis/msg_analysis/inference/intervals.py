@@ -3,7 +3,7 @@
 
 """What the law does between two samples of a log, given the path of the graphs, with switches inside the interval.
 
-x is the deviation from the reference. In a stretch of length s of graph g, dx = -Z_g x dt + F_g dW gives x -> Phi x + w,
+x is the deviation from the reference. A stretch of length s of graph g makes Phi x + w of it,
 
     Phi = exp(-Z_g s),    Cov(w) = Q = int_0^s exp(-Z_g u) F_g F_g^T exp(-Z_g u)^T du
 
@@ -65,7 +65,7 @@ class IntervalLaw(ABC):
 
     @abstractmethod
     def over(self, graph: int, length: FloatArray, apart: bool = True) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(B, m, m) Phi and Q of stretches of these lengths (B,), and (B, m, m, m) each agent's part of Q, if wanted."""
+        """(B, m, m) Phi and Q of stretches of lengths (B,), and (B, m, m, m) each agent's part of Q, if wanted."""
 
     @abstractmethod
     def nodes(self, graph: int, length: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -65,23 +65,28 @@ def size_p(found: Innovations) -> list[tuple[float, float] | None]:
 
 
 def whiteness_p(found: Innovations) -> float | None:
-    """Correlation between innovations up to ``LAGS`` samples apart, of all pairs of agents, chi-square."""
+    """Correlation of innovations up to ``LAGS`` samples apart, of all agents, and between coordinates, chi-square."""
     # As ``WhitenessSums``, where agents may be missing.
-    there = ~np.isnan(found.white).any(axis=2)
+    there = np.asarray(~np.isnan(found.white).any(axis=2))
     white = np.where(there[:, :, None], found.white, 0.0)
     counts = there.sum(axis=0) * found.white.shape[2]
     usable = np.flatnonzero(counts > FEWEST_PAIRS)
     if not len(usable):
         return None
-    white, there = white[:, usable], there[:, usable].astype(float)
+    white, both = white[:, usable], there[:, usable].astype(float)
     size = np.einsum("kir,kir->i", white, white) / counts[usable]
     chi2, dof = 0.0, 0
     for lag in range(1, min(LAGS, len(white) - 1) + 1):
         products = np.tensordot(white[lag:], white[:-lag], axes=([0, 2], [0, 2]))
-        pairs = there[lag:].T @ there[:-lag] * found.white.shape[2]
+        pairs = both[lag:].T @ both[:-lag] * found.white.shape[2]
         tested = pairs > FEWEST_PAIRS
         chi2 += float((products**2 / np.outer(size, size))[tested] @ (1.0 / pairs[tested]))
         dof += int(tested.sum())
+    replicas = white.shape[2]
+    if replicas > 1:
+        together = ((white.sum(axis=2) ** 2 - (white**2).sum(axis=2)) / 2.0).sum(axis=0)
+        chi2 += float((together**2 / size**2 / (both.sum(axis=0) * replicas * (replicas - 1) / 2.0)).sum())
+        dof += len(usable)
     return float(chi2_tail(chi2, dof)) if dof else None
 
 
@@ -199,12 +204,12 @@ def gain_words(one: Selected, law: Experiment, unit: float) -> Cause:
         words = f"agent {what + 1} has an additional drift of {numbers_text(value, interval)} per unit of time"
         return Cause("offset", words, what + 1, None, None, value, interval, 0.0, p, log_p=one.log_p)
     whose, agent, link, graph = whose_gain(part, what)
-    name = None if graph is None else law.graph_list[graph].name
-    where = "" if name is None else f" in graph {name}"
+    where_to = None if graph is None else law.graph_list[graph].name
+    where = "" if where_to is None else f" in graph {where_to}"
     words = f"{whose}{where} is {numbers_text(factor, interval)} times what the law says"
     if part in ("link", "edge") and interval[1] < MISSING:
         words += ": it seems to be missing"
-    return Cause("gain", words, agent, link, name, factor, interval, 1.0, p, log_p=one.log_p)
+    return Cause("gain", words, agent, link, where_to, factor, interval, 1.0, p, log_p=one.log_p)
 
 
 def parameter_causes(
@@ -281,7 +286,7 @@ def path_test(
     held = np.bincount(order, np.diff(np.append(begins, span[1])), n)
     counts = np.zeros((n, n), np.int64)
     np.add.at(counts, (order[:-1], order[1:]), 1)
-    expected = held[:, None] * np.where(np.eye(n, dtype=bool), 0.0, chain.matrix)
+    expected = np.asarray(held[:, None] * np.where(np.eye(n, dtype=bool), 0.0, chain.matrix), dtype=float)
     possible = expected > 0.0
     if counts[~possible].any():
         return PathTest(counts, expected, 0.0, _rate_cause(counts, expected, law, np.argwhere(counts * ~possible)[0]))

@@ -214,8 +214,8 @@ def _tests(
         ("innovations: common noise", parameters.direction_p(parameters.process), "all noise is wrong by one factor"),
         ("innovations: measurement noise", parameters.direction_p(common), "the measurement noise is wrong"),
         ("innovations: largest", largest and largest[0], "a value is far from where the law can have put it"),
-        ("switching", path and path.p, "the graphs switch more or less often than in the law"),
-        ("system error", error and error.p, "the mean-square error differs from its expectation given the path"),
+        ("switching", path.p if path else None, "the graphs switch more or less often than in the law"),
+        ("system error", error.p if error else None, "the mean-square error is not that of this path"),
     ]
     sizes = enumerate(size_p(found), start=1)
     meaning = "the innovations of this agent are larger or smaller than expected"

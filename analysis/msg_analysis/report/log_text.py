@@ -35,8 +35,8 @@ def print_log_comparison(document: dict[str, Any], console: Console, *, verbose:
         say(f"  {cause['words']}")
     between = document["intervals"]
     say(
-        f"{document['law']}: {counted(document['samples'], 'sample')} in {number_text(document['span'])} units of time, "
-        f"intervals {number_text(between['least'], 3)} to {number_text(between['largest'], 3)}, "
+        f"{document['law']}: {counted(document['samples'], 'sample')} in {number_text(document['span'])} units of "
+        f"time, intervals {number_text(between['least'], 3)} to {number_text(between['largest'], 3)}, "
         f"{document['missing']} values missing"
     )
     error = document["system_error"]
