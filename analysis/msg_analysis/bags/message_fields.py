@@ -40,6 +40,7 @@ _CODES = {
     "float32": "f",
     "float64": "d",
 }
+_NO_IDL = re.compile(r"^(=+|IDL: .*|#.*)$", re.MULTILINE)  # between and in definitions; the parser does not know it
 _PART = re.compile(r"([A-Za-z]\w*)((?:\[\d+\])*)")
 _INTEGER = re.compile(r"\[(\d+)\]")
 
@@ -80,7 +81,7 @@ def _definitions(name: str, encoding: str, text: bytes) -> Types:
     try:
         source = text.decode()
         idl = encoding in ("ros2idl", "omgidl") or source.lstrip("=\n ").startswith("IDL: ")
-        found: Types = get_types_from_idl(source) if idl else get_types_from_msg(source, name)
+        found: Types = get_types_from_idl(_NO_IDL.sub("", source)) if idl else get_types_from_msg(source, name)
     except Exception as error:  # the parser raises many kinds of errors on wrong definitions
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise FieldError(f"type {name}: its definition in the bag is not valid ({reason})") from None
