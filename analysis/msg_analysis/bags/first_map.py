@@ -210,7 +210,7 @@ def _agent(number: int, series: Series, start: int) -> dict[str, Any]:
         "last": (int(times.max()) - start) / SECOND,
         "period": usual,
         "rate": 1.0 / usual if usual else None,
-        "jitter": float(regular.std()) if len(regular) else None,
+        "jitter": round(float(regular.std()), 9) if len(regular) else None,
         "gaps": len(gaps),
         "longest_gap": float(gaps.max()) if len(gaps) else None,
         "clock_jumps": int((steps < 0).sum()),
