@@ -28,9 +28,9 @@ from msg_analysis.errors import InputError
 @click.option("--check", is_flag=True, help="Print what is in it: agents, rates, gaps, jumps of the clock, duplicates.")
 @json_option
 def map_(log: Path, *, mapped: Path | None, check: bool, as_json: bool) -> None:
-    """Write a first map of a bag of other robots, or check what a map finds.
+    """Map a bag of other robots, or check a map.
 
-    The map says where the states and the graphs are, for `compare --law --map`. It is guessed from the types and names
+    A map says where the states and the graphs are, for `compare --law --map`. It is guessed from the types and names
     of the topics: read it, and correct it.
     """
     from msg_analysis.bags.first_map import check_log, first_map

@@ -137,7 +137,7 @@ def test_a_first_map_finds_the_robots(write: Write, tmp_path: Path) -> None:
 
 
 def test_a_bag_of_others_points_to_the_map(write: Write) -> None:
-    with pytest.raises(BagError, match="not a run of msg-agents.*`msg-analysis map .*` writes a first map"):
+    with pytest.raises(BagError, match=r"not a run of msg-agents.*`msg-analysis map .*` writes a first map"):
         read_bag(write())
 
 
@@ -235,7 +235,7 @@ def test_hostile_definitions_end_in_one_error(name: str, tmp_path: Path, monkeyp
     shift = "module lab_msgs { module msg { const long A = 1 << 999999999; struct Tank { double x; }; }; };"
     write_tanks(bag, encoding, HOSTILE[name] or shift, [b"\0\1\0\0" + b"\0" * 24] * 60)
     document = {"agents": {"*": {"topic": "/tank_{i}", "field": "x"}}, "time": "log", "graph": {"fixed": "ring"}}
-    with pytest.raises(InputError, match="hostile.mcap: topic /tank_1: "):
+    with pytest.raises(InputError, match=r"hostile\.mcap: topic /tank_1: "):
         read_log(bag, parse_map(document, "map"), LAW)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hostile.mcap"]
 
@@ -321,9 +321,7 @@ def test_tables(form: str, tmp_path: Path) -> None:
         np.savez(file, **columns)
     else:
         pyarrow = pytest.importorskip("pyarrow")
-        import pyarrow.parquet
-
-        pyarrow.parquet.write_table(pyarrow.table(columns), file)
+        pytest.importorskip("pyarrow.parquet").write_table(pyarrow.table(columns), file)
     document = {"agents": {"*": {"field": "tank {i}"}}, "time": "t", "graph": {"field": "topology"}}
     log = read_log(file, parse_map(document, "map"), LAW)
     assert np.array_equal(log.states[:, :, 0], states, equal_nan=True)
@@ -342,7 +340,7 @@ def test_no_pickle_and_no_damaged_table_is_read(tmp_path: Path) -> None:
     hostile = tmp_path / "data.npz"
     np.savez(hostile, t=np.array([print], dtype=object))
     document = parse_map({"agents": {"*": {"field": "x{i}"}}, "time": "t"}, "map")
-    with pytest.raises(InputError, match="cannot be read as NPZ .*pickle"):
+    with pytest.raises(InputError, match=r"cannot be read as NPZ .*pickle"):
         read_log(hostile, document, LAW)
     for name in ("data.parquet", "other.npz", "data.csv"):
         (tmp_path / name).write_bytes(b"\xff\xfe not this")

@@ -3,6 +3,7 @@
 import runpy
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -60,9 +61,10 @@ def likelihood(small: tuple[np.ndarray, np.ndarray], law: Any, noise: np.ndarray
     covariance, mean, x = np.zeros((count * m, count * m)), [states[0]], states[0]
     covariance[:m, :m] = np.diag(noise**2)
     for k in range(count - 1):
-        cuts = [times[k], *STARTS[(STARTS > times[k]) & (STARTS < times[k + 1])], times[k + 1]]
+        inside = [float(start) for start in STARTS if times[k] < start < times[k + 1]]
+        cuts = [float(times[k]), *inside, float(times[k + 1])]
         phi, q = np.eye(m), np.zeros((m, m))
-        for begin, end in zip(cuts[:-1], cuts[1:], strict=True):
+        for begin, end in pairwise(cuts):
             g = GRAPHS[np.flatnonzero(begin >= STARTS)[-1]]
             one, more = van_loan(-law.drift(g), law.noise[g], end - begin)
             phi, q = one @ phi, one @ q @ one.T + more
@@ -108,7 +110,7 @@ def test_scores_of_gains_without_measurement_noise_are_slopes(small: Any) -> Non
     law = ContinuousLaw(Kind().law())
     times, states = small[0], np.nan_to_num(small[1])
     found = Filter(law, times, states[:, :, None], STARTS, GRAPHS).run(np.zeros(5), terms=law.terms())
-    cuts = np.unique(np.concatenate([times, STARTS[STARTS > times[0]]]))
+    cuts = np.unique(np.concatenate([times, STARTS[times[0] < STARTS]]))
     which = [GRAPHS[np.flatnonzero(cut >= STARTS)[-1]] for cut in cuts[:-1]]
 
     def half_square(term: Any, change: float) -> float:
