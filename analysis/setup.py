@@ -75,6 +75,7 @@ setup(
     ],
     extras_require={
         "pandas": ["pandas"],  # run.to_dataframe()
+        "robots": ["rosbags"],  # msg-analysis map, compare --map of a bag
         "rerun": ["rerun-sdk"],  # msg-analysis export --rrd
         "test": ["pytest"],  # by which colcon knows how to test it
     },

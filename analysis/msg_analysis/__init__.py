@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from msg_analysis.experiment.problems import ExperimentError
     from msg_analysis.inference.comparison import Comparison
     from msg_analysis.inference.pool import compare
+    from msg_analysis.model.log import Log
     from msg_analysis.model.run import Run
     from msg_analysis.report.page import write_report
     from msg_analysis.sweeps.in_python import Sweep, sweep
@@ -36,6 +37,7 @@ _MODULES = {
     "experiment.problems": ("ExperimentError",),
     "inference.comparison": ("Comparison",),
     "inference.pool": ("compare",),
+    "model.log": ("Log",),
     "model.run": ("Run",),
     "report.page": ("write_report",),
     "sweeps.in_python": ("Sweep", "sweep"),
@@ -53,6 +55,7 @@ __all__ = [
     "Experiment",
     "ExperimentError",
     "InputError",
+    "Log",
     "Moments",
     "NotAvailableError",
     "Prediction",

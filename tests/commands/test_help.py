@@ -92,8 +92,9 @@ def test_options_of_one_name_are_one_option() -> None:
             helps[long_name(option)].add(option.help)
     several = {name: kind for name, kind in kinds.items() if len(kind) > 1}
     # A rate in Hz, or of a player; the duration of a run, or of a bag; the format of drawings, or of a table;
-    # a table that is also written, or the format of what is; the number of agents, or some of them.
-    assert set(several) == {"--rate", "--duration", "--format", "--csv", "--agents"}
+    # a table that is also written, or the format of what is; the number of agents, or some of them; the law of a
+    # log, or one of several laws of the theory.
+    assert set(several) == {"--rate", "--duration", "--format", "--csv", "--agents", "--law"}
     for name in ("--json", "--seed", "--compression", "--split-size", "--use-sim-time"):
         assert len(helps[name]) == 1, name
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from pages import EXPERIMENTS, FENCED, INDENTED, PAGES, PRINTING, ROOT, blocks, console, experiments, missing
 from programs import PROGRAMS, run
+from robots import write_robots
 
 OTHERS = "cd|colcon|dask|docker (?:build|compose|run)|export|for|make|pip|python3?|rosdep|ros2|scp|sed|source|sudo|wait"
 COMMAND = re.compile(rf"(?:\$ )?((?:[A-Z_]+=\S+ )*(?:\.venv/bin/)?(?:msg-agents|msg-analysis|{OTHERS})\b.*)")
@@ -110,11 +111,12 @@ def test_lists() -> None:
 
 
 DURATION = "20"
+OF_ROBOTS = ("msg-analysis map robots", "msg-analysis compare robots")
 SHOWN = {  # what is printed is on the page
     shown.command: shown.lines
-    for name in ("commands", "experiment")
+    for name in ("commands", "experiment", "own_robots")
     for shown in console(ROOT / f"docs/{name}.md")
-    if shown.command.startswith(("msg-analysis diff ", "msg-analysis predict bad.yaml"))
+    if shown.command.startswith(("msg-analysis diff ", "msg-analysis predict bad.yaml", *OF_ROBOTS))
 }
 BAD = """
 name: bad
@@ -138,6 +140,9 @@ def twins(tmp_path_factory: pytest.TempPathFactory) -> Path:
             result = run("msg-analysis", *call)
             assert result.exit_code == 0, result.output
         (place / f"leader_{seed}.json").write_text(result.stdout)
+    write_robots(place / "robots")
+    (place / "law.yaml").write_text(experiments(ROOT / "docs/own_robots.md")["robots"])
+    (place / "map.yaml").write_text(run("msg-analysis", "map", str(place / "robots")).stdout)
     return place
 
 
@@ -163,8 +168,10 @@ def test_command_runs(command: str, twins: Path, tmp_path: Path, monkeypatch: py
         for bag in names:
             if bag not in made:
                 shutil.copytree(twins / seed, bag)
-    for file in twins.glob("*.json"):
+    for file in (*twins.glob("*.json"), *twins.glob("*.yaml")):
         shutil.copy(file, tmp_path)
+    if command.startswith(OF_ROBOTS):
+        shutil.copytree(twins / "robots", "robots")
     arguments = [match for word in arguments for match in ([*map(str, Path().glob(word))] if "*" in word else [word])]
     result = run(program, *arguments)
     assert result.exit_code == (2 if "bad.yaml" in command else 0), result.output

@@ -133,6 +133,7 @@ class _Contents:
     stops: set[tuple[bytes, int]] = field(default_factory=set)  # run, and the step at which it ended early
     # Run records by text, in order, or why a text is not one: that matters only if none is (another program's topic).
     records: dict[str, RunRecord | InputError] = field(default_factory=dict)
+    ours: bool = False  # whether there is any message on a topic of a network
     copies: dict[str, None] = field(default_factory=dict)  # the texts in the metadata of our files
     refused: Counter[str] = field(default_factory=Counter)
 
@@ -158,7 +159,9 @@ class _Contents:
                     if pattern and (found := pattern.search(channel.topic)):
                         kind_of[number] = _NUMBERS[found[1]]
             known = len(file.channels)
-            yield batch, kind_of[batch.channel]
+            kinds = kind_of[batch.channel]
+            self.ours |= bool(kinds.any())
+            yield batch, kinds
 
     def note_copies(self, file: StoredFile) -> None:
         """Keep the run records in the metadata of a file."""
@@ -235,6 +238,11 @@ def _choose(contents: _Contents) -> RunRecord:
         )
     if not found:
         pid = recording_pid(path)
+        if not pid and not contents.ours:
+            raise BagError(
+                f"{path}: not a run of msg-agents: expected its topics `experiment` and `agent_1/state`: for a bag of "
+                f"other robots `msg-analysis map {path}` writes a first map, for `compare --law --map`"
+            )
         hint = f" (process {pid} is still recording it)" if pid else ""
         raise BagError(
             f"{path}: the latched topic `experiment` is missing, so the run is not known{hint}: record that topic too, "

@@ -299,10 +299,10 @@ class SqliteFile(StoredFile):
             raise BagError(
                 f"{self.path}: not a bag: expected the tables of ROS 2's sqlite3 storage, topics and messages"
             )
-        definitions: dict[str, str] = {}
+        definitions: dict[str, list[str]] = {}
         if "message_definitions" in names:
-            query = "SELECT topic_type, encoded_message_definition FROM message_definitions WHERE encoding = 'ros2msg'"
-            definitions = dict(connection.execute(f"{query} LIMIT {MOST_CHANNELS}"))
+            query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            definitions = {kind: rest for kind, *rest in connection.execute(f"{query} LIMIT {MOST_CHANNELS}")}
         wanted = ", ".join(name if name in columns else "''" for name in _COLUMNS)
         numbers: dict[int, int] = {}
         schemas: dict[str, int] = {}
@@ -311,8 +311,8 @@ class SqliteFile(StoredFile):
             kind = ros_type(kind)
             if kind not in schemas:
                 schemas[kind] = len(schemas) + 1
-                definition = str(definitions.get(kind, "")).encode()
-                self.schemas[schemas[kind]] = Schema(schemas[kind], definition, "ros2msg", kind)
+                form, definition = map(str, definitions.get(kind, ("ros2msg", "")))
+                self.schemas[schemas[kind]] = Schema(schemas[kind], definition.encode(), form, kind)
             numbers[topic] = len(numbers) + 1
             metadata = {"offered_qos_profiles": qos, "topic_type_hash": type_hash}
             self.add_channel(Channel(numbers[topic], name, encoding, metadata, schemas[kind]))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from msg_analysis.cli import runs, sweep, theory
+from msg_analysis.cli import logs, runs, sweep, theory
 from msg_analysis.cli.console import (
     CommandGroup,
     complain,
@@ -329,11 +329,13 @@ def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Pa
 @click.command(
     epilog=examples("msg-analysis schema > experiment.schema.json", "msg-analysis schema sweep > sweep.schema.json")
 )
-@click.argument("what", type=click.Choice(["experiment", "sweep"]), default="experiment")
+@click.argument("what", type=click.Choice(["experiment", "sweep", "map"]), default="experiment")
 def schema(what: str) -> None:
     """Print the JSON Schema of a kind of file, for editors."""
     if what == "sweep":
         from msg_analysis.sweeps.grid import json_schema
+    elif what == "map":
+        from msg_analysis.bags.log_map import json_schema
     else:
         from msg_analysis.experiment.spec import json_schema
 
@@ -342,7 +344,7 @@ def schema(what: str) -> None:
 
 main.add_section("Start here", predict, simulate, runs.compare, theory.plan, schema)
 main.add_section("Runs", runs.runs, runs.tabulate, runs.diff, sweep.sweep)
-main.add_section("Bags", info, export, salvage)
+main.add_section("Bags", info, export, salvage, logs.map_)
 main.add_section("Theory", theory.transient, theory.spectrum, leaders, theory.facts, figures)
 
 

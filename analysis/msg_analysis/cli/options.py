@@ -103,6 +103,7 @@ YAML = InputPath(".yaml", ".yml", ".json")  # sweeps, hosts
 EXPERIMENT = ExperimentPath(".yaml", ".yml", ".json")
 BAG = InputPath(*BAG_SUFFIXES, holds=("metadata.yaml", "*.mcap", "*.db3"))
 SOURCE = ExperimentPath(".yaml", ".yml", ".json", *BAG_SUFFIXES, holds=("metadata.yaml", "*.mcap", "*.db3"))
+LOG = InputPath(*BAG_SUFFIXES, ".csv", ".parquet", ".npz", holds=("metadata.yaml", "*.mcap", "*.db3"))
 RESULT = InputPath(".json", holds=(RESULT_FILE,))
 RUN_RECORD = InputPath(".json")
 PATH = click.Path(path_type=Path)

@@ -11,12 +11,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from msg_analysis.cli.console import examples, print_json, print_note, print_result, print_text, result_console
+from msg_analysis.cli.logs import compare_mapped
 from msg_analysis.cli.options import (
-    BAG,
+    EXPERIMENT,
     FILE,
+    LOG,
     PATH,
     RESULT,
     SOURCE,
+    YAML,
     choice_option,
     is_bag,
     json_option,
@@ -164,9 +167,14 @@ def diff(a: Path, b: Path, *, as_json: bool) -> None:
         "msg-analysis compare line_ring_twin",
         "msg-analysis compare line_ring_twin --report report.html",
         "msg-analysis compare runs/line_ring_* --level 0.001 --json > pooled.json",
+        "msg-analysis compare robots --law law.yaml --map map.yaml",
     )
 )
-@click.argument("bags", metavar="BAG...", nargs=-1, required=True, type=BAG)
+@click.argument("bags", metavar="BAG...", nargs=-1, required=True, type=LOG)
+@click.option(
+    "--law", type=EXPERIMENT, metavar="EXPERIMENT", help="Of a bag or table of others: what it should follow."
+)
+@click.option("--map", "mapped", type=YAML, metavar="MAP", help="With --law: where in it the states and graphs are.")
 @level_option("Probability of a false 'disagrees', over all tests.")
 @max_missed_option
 @click.option("--save/--no-save", default=True, help="Keep the result with a single bag (result.json), for `runs`.")
@@ -178,6 +186,8 @@ def compare(
     context: click.Context,
     bags: tuple[Path, ...],
     *,
+    law: Path | None,
+    mapped: Path | None,
     level: float,
     max_missed: float,
     save: bool,
@@ -187,16 +197,22 @@ def compare(
 ) -> None:
     """Compare the run in BAG with its prediction.
 
-    Several bags, runs of one experiment with different seeds, get one joint verdict.
+    Several bags, runs of one experiment with different seeds, get one joint verdict. With --law and --map, BAG may be
+    a bag of other robots, or a CSV, Parquet or NPZ file; `map` makes a first MAP.
 
     Exit code 0: agrees, 1: disagrees, 3: data incomplete, no verdict, 4: late (real time).
     """
     from msg_analysis.cli.console import WorkProgress
     from msg_analysis.common.files import require_place
+    from msg_analysis.errors import InputError
     from msg_analysis.inference.pool import compare as compare_runs
     from msg_analysis.runs import keep_result
 
     require_place(report)
+    if law or mapped or any(bag.suffix.lower() in (".csv", ".parquet", ".npz") for bag in bags):
+        if report:
+            raise InputError("--report: expected without --law: the report of a log of others is its --json")
+        context.exit(compare_mapped(bags, law, mapped, level, verbose=verbose, as_json=as_json))
     with WorkProgress() as progress, watched(progress):
         comparison = compare_runs(*bags, level=level, max_missed=max_missed)
         if report:

@@ -199,10 +199,11 @@ def gains(sums: ResidualSums, excluded: Iterable[int]) -> ParameterGroup | None:
     back = sums.gram[square] @ inverse
     score, information = np.zeros(len(sums.terms)), np.zeros_like(sums.gram)
     score[kept], information[square] = back @ sums.score[kept], back @ sums.gram[square]
-    return ParameterGroup(score, information, _gain_classes(sums.terms))
+    return ParameterGroup(score, information, gain_classes(sums.terms))
 
 
-def _gain_classes(terms: Sequence[Term]) -> list[list[Candidate]]:
+def gain_classes(terms: Sequence[Term]) -> list[list[Candidate]]:
+    """Changes of gains, reference and offsets, by the coefficients of the terms."""
     weights = np.array([term.weight for term in terms])
     leaders = sorted({term.agent for term in terms if term.kind == "lead"})
 

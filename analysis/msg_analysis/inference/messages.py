@@ -253,7 +253,7 @@ class Gains(Question):
             )
             return Cause("ignored", words, agent, None, None, value, interval, 0.0, p)
         factor, interval = 1.0 + one.estimate, (1.0 + low, 1.0 + high)
-        whose, agent, link, graph = _whose_gain(part, what)
+        whose, agent, link, graph = whose_gain(part, what)
         name = None if graph is None else search.names[graph]
         where = "" if name is None else f" in graph {name}"
         words = f"{whose}{where} is {numbers_text(factor, interval)} times what the file says"
@@ -275,7 +275,7 @@ class CommonGain(Question):
         return coefficient_evidence(sums.common_score, sums.common_information)[:, None]
 
 
-def _whose_gain(part: str, what: Any) -> tuple[str, int | None, tuple[int, int] | None, int | None]:
+def whose_gain(part: str, what: Any) -> tuple[str, int | None, tuple[int, int] | None, int | None]:
     """In words; agent and link from 1, graph from 0."""
     if part == "link":
         sender, receiver, graph = what

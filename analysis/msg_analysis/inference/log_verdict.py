@@ -1,0 +1,301 @@
+# SPDX-FileCopyrightText: 2026 msg_agents contributors
+# SPDX-License-Identifier: Apache-2.0
+
+"""The verdict on a log of any origin: all tests of its innovations, its path and its errors, decided together."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from msg_analysis.common.arrays import FloatArray
+from msg_analysis.common.resources import blas_threads
+from msg_analysis.common.text import HALF_WIDTH_95, counted, number_text
+from msg_analysis.errors import ExitCode, InputError
+from msg_analysis.inference.candidates import Cause
+from msg_analysis.inference.estimates import Estimate
+from msg_analysis.inference.innovations import Filter, Innovations, Variance, estimate_noise
+from msg_analysis.inference.intervals import interval_law
+from msg_analysis.inference.log_tests import (
+    Parameters,
+    PathTest,
+    covariance_p,
+    largest_p,
+    parameter_causes,
+    path_test,
+    size_p,
+    swapped,
+    system_error,
+    whiteness_p,
+)
+from msg_analysis.inference.question import Test
+from msg_analysis.inference.statistics import holm
+from msg_analysis.model.log import Log
+
+FEWEST = 50  # samples
+ESTIMATED_FROM = 20_000  # samples with which the measurement noise is searched for
+MOST_MATRICES = 60_000_000  # numbers in the matrices that the mean error needs
+OTHER_FAMILIES = 3  # of causes: rates, exchanged agents, a held leader
+
+
+@dataclass(frozen=True, slots=True)
+class Factor:
+    """A measured number over that of the law or map; None: the log says nothing about it."""
+
+    estimate: float | None
+    interval: tuple[float, float] | None  # 95 %
+
+
+@dataclass(frozen=True, slots=True)
+class MeasurementNoise:
+    """Standard deviations of the measurement noise."""
+
+    values: tuple[float, ...]  # (m,)
+    estimated: bool
+    interval: tuple[float, float] | None = None  # 95 %, where it was estimated
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LogComparison:
+    """The result of ``msg-analysis compare --law --map``.
+
+    Attributes
+    ----------
+    log
+        what was compared
+    level
+        probability of a false "disagrees", at most
+    tests
+        the family; the verdict is "disagrees" where one is rejected
+    causes
+        what is wrong, the clearest first
+    system_error
+        mean-square error over the samples, without the measurement noise, and its expectation given the path of the
+        graphs; None where it was not computed
+    ratios
+        (m,) mean square of the standardised innovations of each agent, 1 under the law; None: never measured
+    factors
+        of all gains, all noise variances, and the variance of the measurement noise, estimated together
+    measurement_noise
+        as the map says it, or estimated
+    path
+        test of the switches; None where there is nothing to test
+    exact, approximate, untested
+        what the verdict rests on, in sentences
+    """
+
+    log: Log
+    level: float
+    tests: list[Test]
+    causes: Sequence[Cause]
+    system_error: Estimate | None
+    ratios: tuple[float | None, ...]
+    factors: dict[str, Factor]
+    measurement_noise: MeasurementNoise
+    path: PathTest | None
+    exact: tuple[str, ...]
+    approximate: tuple[str, ...]
+    untested: tuple[str, ...]
+
+    @property
+    def verdict(self) -> Literal["agrees", "disagrees"]:
+        """Whether no test is rejected."""
+        return "disagrees" if any(test.rejected for test in self.tests) else "agrees"
+
+    @property
+    def exit_code(self) -> int:
+        """0 agrees, 1 disagrees."""
+        return ExitCode.DISAGREES if self.verdict == "disagrees" else ExitCode.FINE
+
+    def __repr__(self) -> str:
+        error = self.system_error
+        numbers = "" if error is None else f"; system error {number_text(error.measured)}, predicted "
+        numbers += "" if error is None else number_text(error.predicted)
+        return f"<LogComparison with {self.log.law.name!r}: {self.verdict}{numbers}>"
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of ``--json``."""
+        log, path = self.log, self.path
+        lengths = np.diff(log.times)
+        return {
+            "verdict": self.verdict,
+            "law": log.law.name,
+            "sampled_law": log.sampled_law,
+            "names": log.law.names,
+            "level": self.level,
+            "samples": len(log.times),
+            "coordinates": log.states.shape[2],
+            "span": float(log.times[-1] - log.times[0]),
+            "intervals": {
+                "least": float(lengths.min()),
+                "median": float(np.median(lengths)),
+                "largest": float(lengths.max()),
+            },
+            "missing": int(np.isnan(log.states).any(axis=2).sum()),
+            "measurement_noise": asdict(self.measurement_noise),
+            "system_error": None if self.system_error is None else self.system_error.to_json(),
+            "ratios": list(self.ratios),
+            "factors": {name: asdict(factor) for name, factor in self.factors.items()},
+            "switching": None
+            if path is None
+            else {"counts": path.counts.tolist(), "expected": path.expected.tolist(), "p": path.p},
+            "tests": [{**test.to_json(), "meaning": test.meaning} for test in self.tests],
+            "causes": [asdict(cause) for cause in self.causes],
+            "exact": list(self.exact),
+            "approximate": list(self.approximate),
+            "untested": list(self.untested),
+            "notes": list(log.notes),
+        }
+
+
+def compare_log(log: Log, level: float = 0.01) -> LogComparison:
+    """Compare a log with its law; see ``Log.compare``."""
+    if not 0.0 < level <= 0.5:
+        raise InputError(f"level: {level}: expected a probability above 0, at most 0.5")
+    if len(log.times) < FEWEST:
+        raise InputError(f"{len(log.times)} samples: expected at least {FEWEST}: record for longer")
+    law = interval_law(log.law, log.sampled_law)
+    never = np.flatnonzero(np.isnan(log.states).all(axis=(0, 2)) & ~law.held)
+    if len(never):
+        raise InputError(f"agent {int(never[0]) + 1}: no value in the log: expected some of every agent")
+    of = Filter(law, log.times, log.states, log.starts, log.graphs)
+    with blas_threads(law.agents):
+        noise, measured = _measurement_noise(log, of)
+        keep = law.agents**2 * len(log.times) * 2 <= MOST_MATRICES
+        found = of.run(noise, terms=law.terms(), keep=keep)
+        error = system_error(of, found) if keep else None
+        found.maps = found.gains = None
+        parameters = Parameters.of(found, estimated=measured.estimated)
+        path = path_test(
+            log.law, log.starts, log.graphs, (float(log.times[0]), float(log.times[-1])), log.sampled_law == "steps"
+        )
+        tests = _tests(found, parameters, path, error, level)
+        causes = _causes(log, of, found, parameters, path, noise, tests, level)
+    sizes = size_p(found)
+    return LogComparison(
+        log=log,
+        level=level,
+        tests=tests,
+        causes=causes,
+        system_error=error,
+        ratios=tuple(None if one is None else one[0] for one in sizes),
+        factors=_factors(parameters),
+        measurement_noise=measured,
+        path=path,
+        **_grounds(log, found, measured, path, error),
+    )
+
+
+def _measurement_noise(log: Log, of: Filter) -> tuple[FloatArray, MeasurementNoise]:
+    m = of.law.agents
+    if log.measurement_noise is not None:
+        return log.measurement_noise, MeasurementNoise(tuple(log.measurement_noise.tolist()), estimated=False)
+    value, error = estimate_noise(of, ESTIMATED_FROM)
+    half = HALF_WIDTH_95 * error
+    return np.full(m, value), MeasurementNoise((value,) * m, True, (max(value - half, 0.0), value + half))
+
+
+def _tests(
+    found: Innovations, parameters: Parameters, path: PathTest | None, error: Estimate | None, level: float
+) -> list[Test]:
+    """The family, decided by Holm's method."""
+    terms, largest = len(found.terms), largest_p(found)
+    common = parameters.variance(Variance("measurement"))
+    listed: list[tuple[str, float | None, str]] = [
+        ("innovations: covariance", covariance_p(found), "innovations vary, or vary together, otherwise than expected"),
+        ("innovations: whiteness", whiteness_p(found), "what the law did not expect can be foretold from the past"),
+        ("innovations: gains", parameters.joint_p(slice(0, terms)), "a gain, a reference or an offset is wrong"),
+        ("innovations: common gain", parameters.direction_p(parameters.gains), "all gains are wrong by one factor"),
+        ("innovations: variances", parameters.joint_p(slice(terms, None)), "noise or measurement noise is wrong"),
+        ("innovations: common noise", parameters.direction_p(parameters.process), "all noise is wrong by one factor"),
+        ("innovations: measurement noise", parameters.direction_p(common), "the measurement noise is wrong"),
+        ("innovations: largest", largest and largest[0], "a value is far from where the law can have put it"),
+        ("switching", path.p if path else None, "the graphs switch more or less often than in the law"),
+        ("system error", error.p if error else None, "the mean-square error is not that of this path"),
+    ]
+    sizes = enumerate(size_p(found), start=1)
+    meaning = "the innovations of this agent are larger or smaller than expected"
+    listed[1:1] = [(f"innovations: size, agent {i}", one and one[1], meaning) for i, one in sizes]
+    if found.off_reference:
+        listed.append(("held leader", 0.0, "a leader that is held at the reference is elsewhere"))
+    known = [(name, 0.0 if math.isnan(p) else p, meaning) for name, p, meaning in listed if p is not None]
+    adjusted = holm(np.array([p for _, p, _ in known]))
+    return [
+        Test(name, p, float(all_), bool(all_ < level), error if name == "system error" else None, None, meaning)
+        for (name, p, meaning), all_ in zip(known, adjusted, strict=True)
+    ]
+
+
+def _causes(
+    log: Log,
+    of: Filter,
+    found: Innovations,
+    parameters: Parameters,
+    path: PathTest | None,
+    noise: FloatArray,
+    tests: Sequence[Test],
+    level: float,
+) -> list[Cause]:
+    rejected = [test.name for test in tests if test.rejected]
+    causes: list[Cause] = []
+    if not rejected:
+        return causes
+    if found.off_reference:
+        k, agent, off = found.off_reference
+        words = f"agent {agent + 1} is held at the reference by the law, but {off:.3g} away at {log.times[k]:g}"
+        causes.append(Cause("held", words, agent + 1, p=0.0))
+    if any(name.startswith(("innovations", "system")) for name in rejected):
+        unit = of.law.unit
+        several, most = parameter_causes(parameters, log.law, unit, OTHER_FAMILIES, level)
+        exchanged = swapped(of, noise, OTHER_FAMILIES + len(parameters.classes()))
+        if exchanged and exchanged[0].order < math.log(level) and exchanged[1] > most:
+            several = [exchanged[0]]  # it explains more than all other changes together
+        causes += several
+    if path and path.cause and "switching" in rejected:
+        causes.append(path.cause)
+    if not causes and "innovations: largest" in rejected and (largest := largest_p(found)):
+        p, k, i = largest
+        words = f"agent {i + 1} jumps at {log.times[k]:g}: the value there is far from where the law can have put it"
+        causes.append(Cause("jump", words, i + 1, p=p, log_p=math.log(p) if p > 0.0 else None))
+    if not causes:
+        words = f"no single cause that is searched for explains the rejected tests ({', '.join(rejected)})"
+        causes.append(Cause("unknown", words))
+    return sorted(causes, key=lambda cause: cause.order)
+
+
+def _factors(parameters: Parameters) -> dict[str, Factor]:
+    named = {
+        "gains": parameters.gains,
+        "noise": parameters.process,
+        "measurement_noise": parameters.variance(Variance("measurement")),
+    }
+    factors = {}
+    for name, one in zip(named, parameters.factor(list(named.values())), strict=True):
+        half = 0.0 if one is None else HALF_WIDTH_95 * one[1]
+        factors[name] = Factor(None, None) if one is None else Factor(one[0], (one[0] - half, one[0] + half))
+    return factors
+
+
+def _grounds(
+    log: Log, found: Innovations, measured: MeasurementNoise, path: PathTest | None, error: Estimate | None
+) -> dict[str, tuple[str, ...]]:
+    """What is exact, approximate and not tested, in sentences."""
+    law = "the steps of length run.dt" if log.sampled_law == "steps" else "the continuous law"
+    exact = [f"The innovations are those of {law} over the path of the graphs in the log, with all its intervals."]
+    approximate = ["The tests of gains, variances and errors are exact in the limit of many samples."]
+    untested = ["Which messages were received, lost or late: a log of states does not say it."]
+    if measured.estimated:
+        approximate.append("The measurement noise is estimated from the log, the same for all agents.")
+    if found.scored < found.samples:
+        approximate.append(f"The tests of variances use the first {counted(found.scored, 'sample')} only.")
+    if path is None and len(log.law.graph_list) > 1:
+        untested.append("The switching: the law has a given sequence of graphs.")
+    if path is not None and len(log.starts) == 1:
+        approximate.append("The log has one graph all the time: the test of the switching is about that alone.")
+    if error is None:
+        untested.append("The mean-square error: the log is too large for its matrices.")
+    return {"exact": tuple(exact), "approximate": tuple(approximate), "untested": tuple(untested)}

@@ -1,0 +1,91 @@
+"""The commands on logs of other robots: a first map, what is in a bag, the verdict and its exit codes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from programs import run
+from robots import LAW, write_robots
+
+
+@pytest.fixture(scope="module")
+def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A right bag, and one whose link 2-3 is missing."""
+    place = tmp_path_factory.mktemp("robots")
+    write_robots(place / "good", 1500)
+    write_robots(place / "bad", 3000, missing=(2, 3))
+    (place / "law.yaml").write_text(LAW)
+    (place / "map.yaml").write_text(call("map", place / "good").stdout)
+    return place
+
+
+def call(*words: Any) -> Any:
+    return run("msg-analysis", *map(str, words))
+
+
+def test_a_right_bag_agrees(robots: Path) -> None:
+    result = call("compare", robots / "good", "--law", robots / "law.yaml", "--map", robots / "map.yaml")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith("The log agrees with the law.\nrobots: 1500 samples in 149.9 units of time")
+    assert "All 15 tests are ok" in result.stdout or "All 14 tests are ok" in result.stdout
+    assert not (robots / "good/result.json").exists()
+
+
+def test_a_missing_link_is_named(robots: Path) -> None:
+    words = robots / "bad", "--law", robots / "law.yaml", "--map", robots / "map.yaml"
+    result = call("compare", *words, "--json")
+    document = json.loads(result.stdout)
+    assert (result.exit_code, document["verdict"]) == (1, "disagrees")
+    assert document["causes"][0]["link"] == [2, 3]
+    assert document["causes"][0]["words"].endswith("it seems to be missing")
+    shown = call("compare", *words, "--verbose").stdout
+    assert shown.startswith("The log disagrees with the law.\n  the gain of edge 2-3 in both directions")
+    assert "rejected" in shown
+
+
+def test_what_is_in_a_bag(robots: Path) -> None:
+    result = call("map", robots / "good", "--check")
+    assert result.exit_code == 0, result.output
+    assert "/robot_3/odom" in result.stdout
+    assert "All agents have a value at 100 % of the sample times." in result.stdout
+    document = json.loads(call("map", robots / "good", "--map", robots / "map.yaml", "--check", "--json").stdout)
+    assert [each["rate"] for each in document["agents"]] == pytest.approx([10.0] * 5)
+
+
+def test_a_table_needs_no_map(robots: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    np.savez(tmp_path / "data.npz", time=np.arange(100.0), **{f"x{i}": rng.normal(size=100) for i in range(1, 6)})
+    result = call("compare", tmp_path / "data.npz", "--law", robots / "law.yaml")
+    assert result.exit_code == 2
+    assert "graph: missing: expected which of line, ring was there when" in result.stderr
+    (tmp_path / "law.yaml").write_text("{name: one, graphs: {line: {path: [1, 2, 3, 4, 5]}}}")
+    result = call("compare", tmp_path / "data.npz", "--law", tmp_path / "law.yaml")
+    assert (result.exit_code, result.stdout.splitlines()[0]) == (1, "The log disagrees with the law.")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["compare", "good"], "for a bag of other robots `msg-analysis map good` writes a first map"),
+        (["compare", "good", "--law", "law.yaml"], "--map: missing: expected where the states in good are"),
+        (["compare", "good", "--map", "map.yaml"], "--law: missing: expected the experiment file"),
+        (["compare", "good", "bad", "--law", "law.yaml", "--map", "map.yaml"], "bad: expected one bag or table"),
+        (["compare", "good", "--law", "law.yaml", "--map", "law.yaml"], "name: unknown key"),
+        (["compare", "good", "--law", "law.yaml", "--map", "map.yaml", "--report", "a.html"], "--report: expected"),
+        (["map", "good", "--json"], "--json: expected with --check"),
+        (["map", "absent"], "absent: not found"),
+    ],
+)
+def test_mistakes(words: list[str], message: str, robots: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(robots)
+    result = call(*words)
+    assert result.exit_code == 2
+    assert message in " ".join(result.stderr.split())
+    assert "Traceback" not in result.stderr
+
+
+def test_the_schema_is_that_of_the_docs() -> None:
+    file = Path(__file__).parents[3] / "docs/map.schema.json"
+    assert call("schema", "map").stdout == file.read_text(encoding="utf-8")
