@@ -1,10 +1,12 @@
 """An agent in a program of its user, beside the others of a run; the example of the documentation."""
 
+import json
 import re
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from networks import run_file
 from pages import ROOT, blocks
@@ -48,6 +50,59 @@ def test_a_wrong_gain_is_found(network: Any, domain: int) -> None:
 def test_in_real_time(network: Any, domain: int) -> None:
     record = run_file(network.directory, 5, run={"duration": 20, "pace": "realtime", "speed": 5})
     assert verdict(network, record).verdict == "agrees"
+
+
+@pytest.mark.parametrize("gain", ["1.0", "20.0"])
+def test_a_robot_with_a_topic(network: Any, domain: int, gain: str) -> None:
+    """A program of plain rclpy: with twenty times the gain it is named. Level 0.001: its times are not ours to fix."""
+    run = {"duration": 10, "pace": "realtime", "speed": 1, "replicas": 1, "start": "zero"}
+    record = run_file(network.directory, 5, run=run)
+    mapped, bag = network.directory / "robots.yaml", network.directory / "runs/mine"
+    mapped.write_text('agents: {"*": {topic: "/robot_{i}/x", field: data}}')
+    options = ("--await", "recorder")
+    robot = network.program(sys.executable, "-P", EXAMPLE.with_name("robot.py"), "5", "1", "4", gain)
+    nodes = [
+        network.start("switcher", record, *options),
+        network.start("agent", record, *OTHERS, *options),
+        network.start("recorder", record, "--out", bag),
+        network.start("external", record, "--agent", "5", "--map", mapped, *options),
+    ]
+    for node in nodes:
+        network.ended(node)
+    robot.terminate()
+    network.ended(robot)
+    found = read_bag(bag)
+    assert found.completeness.complete
+    assert (np.diff(found.states[10:, 4, 0]) != 0.0).mean() > 0.9
+    comparison = compare(found, level=0.001)
+    if gain == "1.0":
+        assert comparison.verdict == "agrees"
+    else:
+        assert (comparison.verdict, comparison.causes[0].agent) == ("disagrees", 5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "field", "words"),
+    [
+        ({"pace": "lockstep", "replicas": 1}, "data", "run: pace lockstep, replicas 1: expected realtime and 1"),
+        ({"pace": "realtime", "replicas": 2}, "data", "run: pace realtime, replicas 2: expected realtime and 1"),
+        ({"pace": "realtime", "replicas": 1}, "a b", "'a b': expected a field such as pose.position.x or data[0]"),
+    ],
+)
+def test_robots_that_cannot_take_part(
+    network: Any, domain: int, changes: dict[str, Any], field: str, words: str
+) -> None:
+    record, mapped = run_file(network.directory, 5, run=changes), network.directory / "robots.yaml"
+    mapped.write_text(json.dumps({"agents": {"*": {"topic": "/robot_{i}/x", "field": field}}}))
+    assert words in network.ended(network.start("external", record, "--agent", "5", "--map", mapped), 2)[1]
+
+
+def test_a_robot_that_does_not_come(network: Any, domain: int) -> None:
+    record = run_file(network.directory, 5, run={"pace": "realtime", "replicas": 1})
+    mapped = network.directory / "robots.yaml"
+    mapped.write_text('agents: {"*": {topic: "/robot_{i}/x", field: data}}')
+    options = ("--agent", "5", "--map", mapped, "--discovery-timeout", "1")
+    assert "/robot_5/x" in network.ended(network.start("external", record, *options), 2)[1]
 
 
 @pytest.mark.parametrize(

@@ -317,4 +317,4 @@ def host(
 main.add_section("Start here", begin.demo_of(run), begin.examples, begin.new, begin.doctor)
 main.add_section("Runs", run, host, runs, watching.live, watching.markers, begin.schema)
 main.add_section("Bags", replay.check, replay.play)
-main.add_section("Single nodes", nodes.prepare, nodes.agent, nodes.switcher, nodes.recorder)
+main.add_section("Single nodes", nodes.prepare, nodes.agent, nodes.external, nodes.switcher, nodes.recorder)

@@ -23,6 +23,7 @@ from msg_analysis.cli.console import examples
 from msg_analysis.cli.options import (
     PATH,
     RUN_RECORD,
+    YAML,
     experiment_argument,
     load_experiment,
     out_option,
@@ -104,6 +105,18 @@ def _agents_of_record(context: click.Context, _option: click.Parameter, incomple
     return [CompletionItem(str(i)) for i in range(1, agents + 1) if str(i).startswith(incomplete)]
 
 
+_agent = click.option(
+    "--agent",
+    "agents",
+    type=int,
+    metavar="I",
+    multiple=True,
+    required=True,
+    shell_complete=_agents_of_record,
+    help="Number of an agent, from 1. Repeatable.",
+)
+
+
 @click.command(epilog=examples("msg-agents prepare line_ring > run.json"))
 @experiment_argument
 def prepare(experiment: Path) -> None:
@@ -120,16 +133,7 @@ def prepare(experiment: Path) -> None:
 
 @click.command(cls=RosCommand, epilog=examples("msg-agents agent run.json --agent 1 --agent 2 --await recorder"))
 @_node_options
-@click.option(
-    "--agent",
-    "agents",
-    type=int,
-    metavar="I",
-    multiple=True,
-    required=True,
-    shell_complete=_agents_of_record,
-    help="Number of an agent, from 1. Repeatable.",
-)
+@_agent
 @_await
 @_checkpoint
 @_timeout
@@ -162,6 +166,33 @@ def agent(
         return list(group.nodes)
 
     _run_nodes(nodes, record, **options)
+
+
+@click.command(epilog=examples("msg-agents external run.json --agent 5 --map map.yaml --await recorder"))
+@click.argument("run_record", type=RUN_RECORD)
+@_agent
+@click.option("--map", "mapped", type=YAML, metavar="MAP", required=True, help="Where its state is: topic and field.")
+@_await
+@positive_option(
+    "--discovery-timeout", "SECONDS", "How long to wait for the other nodes [s].", default=DISCOVERY_TIMEOUT
+)
+def external(
+    run_record: Path, *, agents: tuple[int, ...], mapped: Path, readers: tuple[str, ...], discovery_timeout: float
+) -> None:
+    """Stand in a run for a robot of one's own.
+
+    The robot publishes its state on the topic that the map names, in real time, and may read what it hears of agent J
+    on agent_I/heard/agent_J (std_msgs/Float64). `msg-analysis compare BAG --law --map` judges the bag.
+    """
+    from msg_agents.nodes.topic_agent import TopicAgent
+    from msg_analysis.bags.log_map import load_map
+    from msg_analysis.errors import InputError
+
+    if len(agents) > 1:
+        raise InputError(f"--agent: {list(agents)}: expected one agent: start a process for each robot")
+    robot = TopicAgent(run_record, agents[0], load_map(mapped), readers=readers)
+    if not robot.run(discovery_timeout=discovery_timeout):
+        sys.exit(ExitCode.INCOMPLETE)
 
 
 @click.command(cls=RosCommand, epilog=examples("msg-agents switcher run.json --await recorder"))

@@ -87,6 +87,7 @@ class Agent(NetworkNode):
         readers: Sequence[str],  # other nodes that must read the states before the run starts
         checkpoints: Path | None,  # directory of the published states, from which it resumes after a restart
         group: AgentGroup,
+        missing: Callable[[], list[str]] = list,  # what else must be there before the run starts
     ) -> None:
         agent = law.agent
         super().__init__(agent_node_name(agent), record=record)
@@ -102,6 +103,7 @@ class Agent(NetworkNode):
         )
         self._resumed = self._take_over()
         self._group = group
+        self._missing = missing
         self._inputs = [self._law.neighbours(mode) for mode in range(model.modes)]
         self._peers = list(peers)
         self._options: dict[str, Any] = {
@@ -155,11 +157,16 @@ class Agent(NetworkNode):
         ):
             return False
         expected = self._awaited() + self._others
-        return self.has_readers(self._states, expected) and not self._group.missing_recorder()
+        there = self.has_readers(self._states, expected) and not self._group.missing_recorder()
+        return there and not self._missing()
 
     def missing_nodes(self) -> list[str]:
         """See NetworkNode."""
-        return self.missing_readers(self._states, self._awaited() + self._others) + self._group.missing_recorder()
+        return (
+            self.missing_readers(self._states, self._awaited() + self._others)
+            + self._group.missing_recorder()
+            + self._missing()
+        )
 
     def _awaited(self) -> list[str]:
         """Names of the peers that must read its topic: not those that its batches reach."""

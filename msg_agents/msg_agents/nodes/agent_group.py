@@ -197,6 +197,7 @@ class AgentGroup:
         readers: Sequence[str],  # other nodes that must read the states before the run starts
         checkpoints: Path | None = None,  # directory of the published states, from which agents resume
         law: Callable[[RunRecord, Wiring, int], StepLaw] = agent_law,  # of an agent (index from 0)
+        missing: Callable[[], list[str]] = list,  # what else must be there before the run starts
     ) -> None:
         self.turns = TurnQueue(len(agents), self._defer, self._end_turns)
         self.progress_period = max(PROGRESS_PERIOD, model.agents / MOST_REPORTS)
@@ -214,6 +215,7 @@ class AgentGroup:
                 readers=readers,
                 checkpoints=checkpoints,
                 group=self,
+                missing=missing,
             )
         self.nodes = list(self._agents.values())  # in the order of ``agents``
         self._host = self.nodes[0]

@@ -92,6 +92,10 @@ class ExternalAgent:
     def connected(self, node: Node) -> None:
         """Called once with the node of the agent, for topics of one's own, before others are looked for."""
 
+    def missing(self) -> list[str]:
+        """What must be there before the run starts, beside its nodes; asked again and again until it is empty."""
+        return []
+
     def run(self, *, discovery_timeout: float = DISCOVERY_TIMEOUT) -> bool:
         """Take part in the run, to its end; False if it was stopped before, by a signal.
 
@@ -110,6 +114,7 @@ class ExternalAgent:
                 agents=[self.number - 1],
                 readers=list(self._readers),
                 law=lambda _record, _model, _agent: law,
+                missing=self.missing,
             )
             self.connected(group.nodes[0])
             return group.nodes
