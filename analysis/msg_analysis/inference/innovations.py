@@ -84,6 +84,12 @@ class Filter:
         other.values, other.present = self.values[:, order], self.present[:, order]
         return other
 
+    def under(self, law: IntervalLaw) -> Filter:
+        """The same log with another law."""
+        other = copy.copy(self)
+        other.law = law
+        return other
+
     def run(
         self,
         noise: FloatArray,

@@ -13,9 +13,12 @@ for a graph; long stretches are doubled: Phi(2s) = Phi(s)^2, Q(2s) = Q(s) + Phi(
 
 from __future__ import annotations
 
+import copy
 import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -83,6 +86,23 @@ class IntervalLaw(ABC):
         parts[:, each, :, each] += self.noise.transpose(2, 0, 1) / 2.0
         return parts
 
+    @abstractmethod
+    def with_drifts(self, drifts: FloatArray) -> Self:
+        """The same law with other drifts (n, m, m)."""
+
+    def changed(self, terms: Sequence[Term], change: FloatArray) -> Self:
+        """With the gains of the terms larger by (K,); constants stay as they are."""
+        drifts = np.array([self.drift(graph) for graph in range(self.modes)])
+        for term, more in zip(terms, change.tolist(), strict=True):
+            graphs, i = slice(None) if term.graph is None else term.graph, term.agent
+            if term.kind == "pull":
+                drifts[graphs, i] *= 1.0 + more
+            elif term.kind != "constant":
+                drifts[graphs, i, i] += more if term.kind == "lead" else -more
+                if term.sender is not None:
+                    drifts[graphs, i, term.sender] += more
+        return self.with_drifts(drifts)
+
     def terms(self) -> list[Term]:
         """Regressors: a constant of every agent, all links, all leaders; without links apart where these are many."""
         m, drifts = self.agents, [self.drift(graph) for graph in range(self.modes)]
@@ -127,9 +147,19 @@ class ContinuousLaw(IntervalLaw):
         self._drift = drift * follows[:, None]  # (n, m, m) Z_g; a held leader does not move
         gain = experiment.noise_gain * follows[:, None]
         self._noise = np.asarray(gain @ gain.transpose(0, 2, 1))
+        self._expand()
+
+    def _expand(self) -> None:
         self._norm = np.abs(self._drift).sum(axis=2).max(axis=1)
         parts = self.parts()
         self._series = [self._powers(graph, parts[graph]) for graph in range(self.modes)]
+
+    def with_drifts(self, drifts: FloatArray) -> Self:
+        """-Z_g."""
+        other = copy.copy(self)
+        other._drift = -drifts
+        other._expand()
+        return other
 
     def drift(self, graph: int) -> FloatArray:
         """-Z_g."""
@@ -212,6 +242,12 @@ class StepsLaw(IntervalLaw):
     def drift(self, graph: int) -> FloatArray:
         """W_g - I."""
         return np.asarray(self._step.nominal[graph] - np.eye(self.agents)) * ~self.held[:, None]
+
+    def with_drifts(self, drifts: FloatArray) -> Self:
+        """W_g - I."""
+        other, moved = copy.copy(self), ~self.held[:, None]
+        other._step = replace(self._step, nominal=np.where(moved, drifts + np.eye(self.agents), self._step.nominal))
+        return other
 
     @property
     def noise(self) -> FloatArray:

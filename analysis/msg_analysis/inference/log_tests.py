@@ -138,6 +138,11 @@ class Parameters:
         """(K + V,): the logarithms of all noise variances larger by 1."""
         return self.variance(*(one for one in self.found.variances if one.kind == "process"))
 
+    @property
+    def explained(self) -> float:
+        """How much the logarithm of the likelihood grows with all of them, in quadratic approximation."""
+        return 0.5 * quadratic_form(self.score, self.information)[0]
+
     def joint_p(self, part: slice) -> float | None:
         """Of all gains, or of all variances."""
         chi2, dof = quadratic_form(self.score[part], self.information[part, part])
@@ -214,12 +219,11 @@ def gain_words(one: Selected, law: Experiment, unit: float) -> Cause:
 
 def parameter_causes(
     parameters: Parameters, law: Experiment, unit: float, families: int, level: float
-) -> tuple[list[Cause], float]:
-    """What is wrong with gains and variances, and the logarithm of the likelihood that all of them can explain."""
+) -> tuple[list[Cause], FloatArray]:
+    """What is wrong with gains and variances, and (K,) by how much the gains are larger, all causes together."""
     classes = parameters.classes()
-    selected, _ = select(parameters.score, parameters.information, classes, families + len(classes), level)
-    most = 0.5 * quadratic_form(parameters.score, parameters.information)[0]
-    return [gain_words(one, law, unit) for one in selected], most
+    selected, change = select(parameters.score, parameters.information, classes, families + len(classes), level)
+    return [gain_words(one, law, unit) for one in selected], change[: len(parameters.found.terms)]
 
 
 def swapped(of: Filter, noise: FloatArray, families: int) -> tuple[Cause, float] | None:

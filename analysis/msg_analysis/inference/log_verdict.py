@@ -39,6 +39,7 @@ from msg_analysis.model.log import Log
 FEWEST = 50  # samples
 ESTIMATED_FROM = 20_000  # samples with which the measurement noise is searched for
 MOST_MATRICES = 60_000_000  # numbers in the matrices that the mean error needs
+VARIANCES = ("noise", "measurement_noise")  # kinds of causes
 OTHER_FAMILIES = 3  # of causes: rates, exchanged agents, a held leader
 
 
@@ -250,9 +251,17 @@ def _causes(
         causes.append(Cause("held", words, agent + 1, p=0.0))
     if any(name.startswith(("innovations", "system")) for name in rejected):
         unit = of.law.unit
-        several, most = parameter_causes(parameters, log.law, unit, OTHER_FAMILIES, level)
+        several, change = parameter_causes(parameters, log.law, unit, OTHER_FAMILIES, level)
+        if change.any() and any(cause.kind in VARIANCES for cause in several):
+            # A wrong gain makes innovations larger, too: variances are judged with the gains that were found.
+            law = of.law.changed(found.terms, change)
+            again = of.under(law).run(noise, terms=found.terms, most=min(len(log.times), ESTIMATED_FROM))
+            left = Parameters.of(again, estimated=log.measurement_noise is None)
+            others, _ = parameter_causes(left, log.law, unit, OTHER_FAMILIES, level)
+            several = [cause for cause in several if cause.kind not in VARIANCES]
+            several += [cause for cause in others if cause.kind in VARIANCES]
         exchanged = swapped(of, noise, OTHER_FAMILIES + len(parameters.classes()))
-        if exchanged and exchanged[0].order < math.log(level) and exchanged[1] > most:
+        if exchanged and exchanged[0].order < math.log(level) and exchanged[1] > parameters.explained:
             several = [exchanged[0]]  # it explains more than all other changes together
         causes += several
     if path and path.cause and "switching" in rejected:

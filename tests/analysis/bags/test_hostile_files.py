@@ -48,7 +48,7 @@ def test_metadata_in_a_chunk_is_not_kept(tmp_path: Path) -> None:
     """Chunks have messages, channels and schemas; the others could be a thousand times as large as the file."""
     inventory: list[FileInventory] = []
     file = _file(tmp_path / "x.mcap", chunk(metadata("msg_agents") * 1000 + channel(1, "/t") + message(1)))
-    with pytest.raises(BagError, match="`experiment` is missing"):
+    with pytest.raises(BagError, match="not a run of msg-agents"):
         read_bag(file, inventory)
     assert inventory[0].file.metadata == []
     assert inventory[0].count.messages == 1

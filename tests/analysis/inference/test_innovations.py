@@ -309,3 +309,16 @@ def test_data_frames() -> None:
     assert len(log.starts) <= len(starts)
     with pytest.raises(InputError, match="expected one of 5, x5, agent_5"):
         Log.from_dataframe(pandas.DataFrame(columns).drop(columns="x5"), law=Kind().law())
+
+
+@pytest.mark.parametrize("kind", [ContinuousLaw, StepsLaw])
+def test_a_law_with_changed_gains_is_that_of_another_file(kind: type[ContinuousLaw] | type[StepsLaw]) -> None:
+    """Without edge 2-3: by its terms, and as a file says it."""
+    law = kind(document())
+    terms = law.terms()
+    gone = np.array([-term.weight if {term.agent, term.sender} == {1, 2} else 0.0 for term in terms])
+    graphs = {"line": {"edges": [[1, 2], [3, 4], [4, 5]]}, "ring": {"edges": [[1, 2], [3, 4], [4, 5], [5, 1]]}}
+    changed, wanted = law.changed(terms, gone), kind(document(graphs=graphs))
+    for graph in (0, 1):
+        for found, other in zip(changed.over(graph, np.ones(1)), wanted.over(graph, np.ones(1)), strict=True):
+            np.testing.assert_allclose(found, other, atol=1e-12)
