@@ -16,8 +16,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
+from itertools import count as numbers_from
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -138,6 +141,8 @@ def sampled_prediction(
     within: float = 60.0,
     agents: Sequence[int | str] = (),
     seed: int | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
 ) -> SampledPrediction:
     """Sample the steady errors of the run's steps.
 
@@ -152,13 +157,18 @@ def sampled_prediction(
     agents
         whose errors are sampled, too, by number from 1 or name; with up to 20 agents, by default all
     seed
-        of the random numbers, >= 0; for one seed, the time decides nothing but how many samples there are. None:
-        ``run.seed``
+        of the random numbers, >= 0; for one seed, time and workers decide nothing but how many samples there are.
+        None: ``run.seed``
+    workers
+        processes of this machine that make the samples; None: this one
+    scheduler
+        address of a Dask scheduler, whose workers make them
 
     Raises
     ------
     InputError
-        an argument that is not valid, a given sequence of graphs, unstable steps, or too little time for an interval
+        an argument that is not valid, a given sequence of graphs, unstable steps, too little time for an interval, or
+        workers that are not there
     """
     began = time.monotonic()
     for key, value, most in (("precision", precision, 1.0), ("within", within, math.inf)):
@@ -171,18 +181,21 @@ def sampled_prediction(
     units = list(range(m)) if every else experiment.indices(agents)
     width = len(units) + (not every)
     rounds = max(1, min(MOST_TOGETHER, max(LEAST_TOGETHER, NUMBERS // max(1, len(law.targets)))) // width)
-    seeds, count, sums, squares = np.random.SeedSequence(seed), 0, np.zeros(1 + len(units)), np.zeros(1 + len(units))
+    make = partial(_batch, law, units, every, rounds, seed, time.time() + within)
+    count, sums, squares = 0, np.zeros(1 + len(units)), np.zeros(1 + len(units))
     mean = half = sums
-    while count < FEWEST or (half[: None if agents else 1] > precision * mean[: None if agents else 1]).any():
-        batch = _batch(law, units, every, rounds, np.random.default_rng(seeds.spawn(1)[0]), began + within)
-        if batch is None:
-            break
-        sums, squares, count = sums + batch.sum(axis=0), squares + (batch**2).sum(axis=0), count + len(batch)
-        mean = sums / count
-        variance = np.maximum(squares / count - mean**2, 0.0) / max(1, count - 1)
-        half = scipy.special.stdtrit(max(1, count - 1), 0.5 + LEVEL / 2.0) * np.sqrt(variance)
-        share = precision * mean[0] / half[0] if half[0] else 1.0
-        tell("samples", count, max(count, math.ceil(count / min(1.0, share) ** 2)))
+    with closing(_batches(make, workers, scheduler)) as batches:
+        for batch in batches:
+            if batch is None:
+                break
+            sums, squares, count = sums + batch.sum(axis=0), squares + (batch**2).sum(axis=0), count + len(batch)
+            mean = sums / count
+            variance = np.maximum(squares / count - mean**2, 0.0) / max(1, count - 1)
+            half = scipy.special.stdtrit(max(1, count - 1), 0.5 + LEVEL / 2.0) * np.sqrt(variance)
+            share = precision * mean[0] / half[0] if half[0] else 1.0
+            tell("samples", count, max(count, math.ceil(count / min(1.0, share) ** 2)))
+            if count >= FEWEST and (half <= precision * mean)[: None if agents else 1].all():
+                break
     if count < 2:
         wanted = "expected time for two samples at least, each of which ends when the agents have forgotten its start"
         raise InputError(f"within: {within:g} s: {wanted}: raise it")
@@ -310,10 +323,32 @@ class _Law:
         self.noise = float(process + on_air) / self.agents  # of an agent in a step, in the mean
 
 
+Samples = FloatArray | None
+
+
+def _batches(
+    make: Callable[[int, Callable[[], bool]], Samples], workers: int | None, scheduler: str | None
+) -> Iterator[Samples]:
+    """Samples by the number of their batch, which are the same wherever they are made; see ``sampled_prediction``."""
+    if not (workers or scheduler):
+        return (make(number, lambda: False) for number in numbers_from())
+    from msg_analysis.sweeps.workers import in_order
+
+    return in_order(make, workers, scheduler)
+
+
 def _batch(
-    law: _Law, units: Sequence[int], every: bool, rounds: int, rng: np.random.Generator, deadline: float
-) -> FloatArray | None:
+    law: _Law,
+    units: Sequence[int],
+    every: bool,
+    rounds: int,
+    seed: int,
+    until: float,  # of the clock that all hosts have
+    batch: int,
+    stopping: Callable[[], bool],
+) -> Samples:
     """(rounds, 1 + units) independent samples of the system error and of those of agents; None: not done in time."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(batch,)))
     m, width = law.agents, len(units) + (not every)
     z: FloatArray = np.zeros((m, rounds, width))
     z[units, :, np.arange(width - len(units), width)] = 1.0
@@ -326,9 +361,10 @@ def _batch(
     with np.errstate(over="ignore", invalid="ignore"):
         while number.size:
             steps = max(BLOCK + 2 * law.delay, walk.steps // 4)
-            terms, size = walk.block(steps, deadline)
-            if time.monotonic() > deadline:
+            found = walk.block(steps, lambda: time.time() > until or stopping())
+            if found is None:
                 return None
+            terms, size = found
             if not (size <= GROWTH * m * first[number]).all():
                 raise InputError(
                     "second moments: a walk backwards through the steps has grown a million times: the steps are "
@@ -456,13 +492,13 @@ class _Walk:
             terms[there] = ((gain @ z[:, there]) ** 2).sum(axis=0)
         return terms
 
-    def block(self, steps: int, deadline: float) -> tuple[FloatArray, FloatArray]:
-        """(C,) terms of the sum over these steps, and |z|^2 after them, of what messages carry, too."""
+    def block(self, steps: int, ended: Callable[[], bool]) -> tuple[FloatArray, FloatArray] | None:
+        """(C,) terms of the sum over these steps, and |z|^2 after them, of what messages carry, too; None: ended."""
         terms = np.zeros(self._z.shape[1])
         for _ in range(steps):
             terms += self._back()
-            if time.monotonic() > deadline:
-                break
+            if ended():
+                return None
         return terms, (self._z**2).sum(axis=0) + (self._used**2).sum(axis=(0, 1)) + (self._passed**2).sum(axis=0)
 
     def keep(self, lives: BoolArray) -> None:

@@ -5,6 +5,7 @@ import dataclasses
 import os
 import signal
 import sys
+import time
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ from msg_analysis.sweeps.results import (
     rows_of,
     write_tables,
 )
-from msg_analysis.sweeps.workers import LocalWorkers, Lost, WorkersLostError, run_jobs
+from msg_analysis.sweeps.workers import LocalWorkers, Lost, WorkersLostError, in_order, run_jobs
 
 
 def document(rate: float = 1.0, **run: Any) -> dict[str, Any]:
@@ -207,6 +208,28 @@ def test_workers_that_do_not_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/nowhere")
     with LocalWorkers(2) as pool, pytest.raises(InputError, match="--workers: number 1 cannot be started"):
         list(pool.outcomes(cubes, list(range(30))))
+
+
+def first_last(item: int, _: Any) -> int:
+    time.sleep(0.0 if item else 0.3)
+    return item**3
+
+
+def killed_by_the_third(item: int, _: Any) -> int:
+    if item == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item
+
+
+def test_results_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without end, whichever comes first, over the end of a sequence of batches too."""
+    monkeypatch.setattr(conducting, "MANY", 5)
+    with closing(in_order(first_last, 2, None)) as results:
+        assert [next(results) for _ in range(12)] == [k**3 for k in range(12)]
+    with closing(in_order(killed_by_the_third, 2, None)) as results:
+        assert [next(results), next(results)] == [0, 1]
+        with pytest.raises(InputError, match="batch 2: killed every worker that tried it"):
+            next(results)
 
 
 def test_a_scheduler_that_does_not_answer() -> None:
