@@ -22,6 +22,7 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.writing import recording_pid
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.files import write_whole
+from msg_analysis.common.resources import few_blas_threads
 from msg_analysis.common.text import agent_name
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import limits, validation
@@ -224,6 +225,7 @@ def _mean_squares(document: dict[str, Any]) -> tuple[str, str]:
     return f"system_{kind}", f"node_{kind}s"
 
 
+@few_blas_threads
 def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     """The document of ``info EXPERIMENT``, also of one that cannot be run; None: infinite or not known."""
     if limits.needs_sampling(experiment):

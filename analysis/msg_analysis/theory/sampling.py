@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -328,7 +328,7 @@ Samples = FloatArray | None
 
 def _batches(
     make: Callable[[int, Callable[[], bool]], Samples], workers: int | None, scheduler: str | None
-) -> Iterator[Samples]:
+) -> Generator[Samples, None, None]:
     """Samples by the number of their batch, which are the same wherever they are made; see ``sampled_prediction``."""
     if not (workers or scheduler):
         return (make(number, lambda: False) for number in numbers_from())
