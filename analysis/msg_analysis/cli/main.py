@@ -91,8 +91,9 @@ def predict(
     They are sampled, with an interval, where the exact way is too large, or with --precision (1%), --within (60s),
     --agents (all of up to 20), --workers, --scheduler or --seed.
     """
+    from msg_analysis.experiment.limits import prediction_method
     from msg_analysis.report.theory_text import print_prediction
-    from msg_analysis.theory.sampling import prediction_method, sampled_prediction
+    from msg_analysis.theory.sampling import sampled_prediction
 
     loaded = load_experiment(experiment, changes)
     given = {key: value for key, value in sampling.items() if value is not None}

@@ -169,8 +169,8 @@ def _rows(key: str, file: Path) -> tuple[str, float, Iterator[_Row]]:
         raise GraphError(key, f"{file}, line 1: {show(','.join(names))}", _WANTED, "correct the header")
     wanted = [*COLUMNS[found], *([OPTIONAL[found]] if OPTIONAL.get(found) in names else [])]
     if found in ("contacts", "intervals") and (count := content.count(b"\n")) > MOST_ROWS:
-        wanted = f"expected at most {MOST_ROWS}"
-        raise GraphError(key, f"{file}: {count} lines", wanted, "split it, or give intervals instead of contacts")
+        room = f"expected at most {MOST_ROWS}"
+        raise GraphError(key, f"{file}: {count} lines", room, "split it, or give intervals instead of contacts")
     if twice := next((name for name in wanted if names.count(name) > 1), None):
         raise GraphError(key, f"{file}, line 1: {twice} twice", "expected it once", "remove one")
     pick, times = itemgetter(*map(names.index, wanted)), 2 if found == "intervals" else 1

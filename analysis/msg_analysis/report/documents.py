@@ -42,7 +42,7 @@ from msg_analysis.theory.first_steps import simplification
 from msg_analysis.theory.graph_indices import algebraic_connectivity, error_bounds, graph_indices, two_topology
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.sampling import prediction_method, sampled_prediction
+from msg_analysis.theory.sampling import sampled_prediction
 from msg_analysis.theory.settling import asymptotic_rates, settling_time
 from msg_analysis.theory.spectrum import Spectrum, spectrum
 from msg_analysis.theory.transient import TransientLaw, point_start, solve_transient, start_of
@@ -296,7 +296,7 @@ SHORT, ONE_PERCENT = 2.0, 0.01  # s for which errors are sampled to say how long
 
 def _method(experiment: Experiment) -> dict[str, Any]:
     """How the steady errors are known: "exact", "sampled", or "measured" in runs only; why; and the system error."""
-    method, why = prediction_method(experiment)
+    method, why = limits.prediction_method(experiment)
     found: dict[str, Any] = {"method": method, "why": why, "seconds": None, "system_error": None}
     if method == "sampled":
         with suppress(InputError):  # not known so fast

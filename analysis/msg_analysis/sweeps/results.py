@@ -362,8 +362,8 @@ def _drawn_columns(rows: Sequence[Row], wanted: str) -> dict[str, str | None]:
     numeric = _numeric(rows)
     for value, error, predicted, reference in (
         (f"{wanted}.measured", f"{wanted}.standard_error", f"{wanted}.predicted", None),
-        (f"emulated.{wanted}", None, None, f"continuous.{wanted}"),
-        (f"discrete.{wanted}", None, None, None),
+        (f"emulated.{wanted}", f"emulated.{wanted}.standard_error", None, f"continuous.{wanted}"),
+        (f"discrete.{wanted}", f"discrete.{wanted}.standard_error", None, None),
         (wanted, None, None, None),
     ):
         if value in numeric:

@@ -21,7 +21,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from itertools import count as numbers_from
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.special
@@ -32,9 +32,7 @@ from msg_analysis.common.resources import tell
 from msg_analysis.common.text import agent_text, finite, markdown_table, number_text
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment.graphs import Graph
-from msg_analysis.experiment.limits import why_sampled
 from msg_analysis.experiment.links import expanded
-from msg_analysis.experiment.markov_chain import DrawnSchedule
 from msg_analysis.model.step_model import step_law, step_matrices, turns
 
 if TYPE_CHECKING:
@@ -121,17 +119,6 @@ class SampledPrediction:
         tails = dict.fromkeys(("radius", "lower", "upper", "finite"))
         rest = {"static": None, "disconnected": [], "fourth_moment": tails, "notes": list(self.experiment.notes)}
         return document | laws | rest
-
-
-def prediction_method(experiment: Experiment) -> tuple[Literal["exact", "sampled", "measured"], str | None]:
-    """How the steady errors of an experiment are known, or those of runs only; and why not exactly."""
-    if experiment.protocol and (reason := experiment.protocol.unpredictable()):
-        return "measured", reason
-    if not (lines := why_sampled(experiment)):
-        return "exact", None
-    given = experiment.schedule and not isinstance(experiment.schedule, DrawnSchedule)
-    apart = experiment.links and (experiment.time == "discrete" or experiment.protocol)  # no steps of single links
-    return "measured" if given or apart else "sampled", lines[0]
 
 
 def sampled_prediction(
