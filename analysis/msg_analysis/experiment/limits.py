@@ -73,7 +73,7 @@ def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
     """What the experiment asks for that this version cannot do, one line each."""
     lines = why_sampled(experiment)
     if lines and not needs_sampling(experiment) and prediction_method(experiment)[0] == "sampled":
-        lines[-1] += "; `predict` samples the steady errors, and `plan` the length of runs"
+        lines[-1] += "; `predict` samples the steady errors"
     if purpose == "run":
         lines = needs_sampling(experiment) or matrix_problems(experiment)
     if purpose == "steady" and experiment.schedule and not isinstance(experiment.schedule, DrawnSchedule):

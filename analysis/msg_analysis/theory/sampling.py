@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -163,7 +163,7 @@ def sampled_prediction(
             wanted = "expected a number above 0" + ", below 1" * (most < math.inf)
             raise InputError(f"{key}: {value:g}: {wanted}: for example 0.01")
     seed = experiment.run.seed if seed is None else seed
-    law, m = _Law(experiment if experiment.links else expanded(experiment)), experiment.agents
+    law, m = Law(experiment if experiment.links else expanded(experiment)), experiment.agents
     every = not agents and m <= ALL_AGENTS
     units = list(range(m)) if every else experiment.indices(agents)
     width = len(units) + (not every)
@@ -171,7 +171,12 @@ def sampled_prediction(
     make = partial(_batch, law, units, every, rounds, seed, time.time() + within)
     count, sums, squares = 0, np.zeros(1 + len(units)), np.zeros(1 + len(units))
     mean = half = sums
-    with closing(_batches(make, workers, scheduler)) as batches:
+    batches = (make(number, lambda: False) for number in numbers_from())
+    if workers or scheduler:
+        from msg_analysis.sweeps.workers import in_order
+
+        batches = in_order(make, workers, scheduler)
+    with closing(batches):
         for batch in batches:
             if batch is None:
                 break
@@ -200,7 +205,7 @@ def sampled_prediction(
     )
 
 
-class _Law:
+class Law:
     """The step of a run, sparse. An arc is a pair of agents of which the first hears the second in some graph."""
 
     targets: IntArray  # (l,)
@@ -310,22 +315,8 @@ class _Law:
         self.noise = float(process + on_air) / self.agents  # of an agent in a step, in the mean
 
 
-Samples = FloatArray | None
-
-
-def _batches(
-    make: Callable[[int, Callable[[], bool]], Samples], workers: int | None, scheduler: str | None
-) -> Generator[Samples, None, None]:
-    """Samples by the number of their batch, which are the same wherever they are made; see ``sampled_prediction``."""
-    if not (workers or scheduler):
-        return (make(number, lambda: False) for number in numbers_from())
-    from msg_analysis.sweeps.workers import in_order
-
-    return in_order(make, workers, scheduler)
-
-
 def _batch(
-    law: _Law,
+    law: Law,
     units: Sequence[int],
     every: bool,
     rounds: int,
@@ -333,7 +324,7 @@ def _batch(
     until: float,  # of the clock that all hosts have
     batch: int,
     stopping: Callable[[], bool],
-) -> Samples:
+) -> FloatArray | None:
     """(rounds, 1 + units) independent samples of the system error and of those of agents; None: not done in time."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(batch,)))
     m, width = law.agents, len(units) + (not every)
@@ -343,7 +334,7 @@ def _batch(
         z[:, :, 0] = 2.0 * rng.integers(0, 2, (m, rounds)) - 1.0
     if law.consensus:
         z -= z.mean(axis=0)
-    walk, first = _Walk(law, z.reshape(m, -1), rng), np.einsum("irw,irw->rw", z, z).ravel()
+    walk, first = Walk(law, z.reshape(m, -1), rng), np.einsum("irw,irw->rw", z, z).ravel()
     total, counts, number = np.zeros(rounds * width), np.ones(rounds * width), np.arange(rounds * width)
     with np.errstate(over="ignore", invalid="ignore"):
         while number.size:
@@ -369,17 +360,17 @@ def _batch(
     return np.concatenate([table.sum(axis=1, keepdims=True), table], axis=1) if every else table
 
 
-class _Walk:
+class Walk:
     """Vectors (m, C), each of which goes backwards through the steps of a path of its own."""
 
-    def __init__(self, law: _Law, z: FloatArray, rng: np.random.Generator) -> None:
-        self.law, self.steps, self._rng, self._z = law, 0, rng, z
+    def __init__(self, law: Law, z: FloatArray, rng: np.random.Generator) -> None:
+        self.law, self.steps, self._rng, self.z = law, 0, rng, z
         count = z.shape[1]
-        self._modes: IntArray = np.asarray(rng.choice(len(law.stationary), count, p=law.stationary))
-        self._until = self._held(law.leave[self._modes])
+        self.modes: IntArray = np.asarray(rng.choice(len(law.stationary), count, p=law.stationary))
+        self._until = self._held(law.leave[self.modes])
         self._up = self._flip = np.empty((0, count), dtype=np.int64)
         self._shared = not law.links and (bool(law.products) or law.weights.shape[1] == 1)
-        self._weights = law.weights if self._shared else law.weights[:, self._modes]
+        self._weights = law.weights if self._shared else law.weights[:, self.modes]
         if law.links:  # each link starts in its stationary law
             up = rng.random((law.rates.shape[1], count)) * law.rates.sum(axis=0)[:, None] < law.rates[0, :, None]
             self._up = up.astype(np.int64)
@@ -397,12 +388,29 @@ class _Walk:
         held = self._rng.geometric(np.maximum(leave, NEVER))
         return np.minimum(held, LONGEST).astype(np.int64) + self.steps
 
-    def _switch(self) -> None:
+    def switch(self) -> None:
+        """Go on by a step to its graphs and losses."""
+        law = self.law
+        if self.steps:
+            self._flip_graphs()
+        self.steps += 1
+        if len(law.lossy):
+            chance = law.losses[1]
+            if law.burst is not None:
+                chance = np.where(self._lost[law.lossy], law.losses[2], chance)
+            self._lost[law.lossy] = (self._rng.random((len(law.lossy), self.z.shape[1])) < chance)[law.drawn]
+
+    def weights(self) -> FloatArray:
+        """(l, C) of the messages that arrive."""
+        weights = self._weights if not self._shared or len(self._weights[0]) == 1 else self._weights[:, self.modes]
+        return weights * ~self._lost if len(self.law.lossy) else weights
+
+    def _flip_graphs(self) -> None:
         """The graphs one step earlier: a stationary chain of two states is the same backwards."""
         law = self.law
         if (ends := np.flatnonzero(self._until == self.steps)).size:
-            jumps = law.jumps[self._modes[ends]]
-            self._modes[ends] = new = (self._rng.random((len(ends), 1)) > jumps).sum(axis=1)
+            jumps = law.jumps[self.modes[ends]]
+            self.modes[ends] = new = (self._rng.random((len(ends), 1)) > jumps).sum(axis=1)
             self._until[ends] = self._held(law.leave[new])
             if not self._shared:
                 self._weights[:, ends] = law.weights[:, new]
@@ -416,38 +424,29 @@ class _Walk:
                 self._weights[arc[more], column[more]] = law.weights[arc[more], 0] * up[more]
                 arc = arc + 1
 
-    def _back(self) -> FloatArray:
+    def back(self) -> FloatArray:
         """Go back by a step: (C,) the terms of its noise."""
         law = self.law
-        if self.steps:
-            self._switch()
-        self.steps += 1
-        if len(law.lossy):
-            chance = (
-                law.losses[1] if law.burst is None else np.where(self._lost[law.lossy], law.losses[2], law.losses[1])
-            )
-            self._lost[law.lossy] = (self._rng.random((len(law.lossy), self._z.shape[1])) < chance)[law.drawn]
+        self.switch()
         if not law.plain:
             return self._messages()
-        terms = self._noise(self._z)
+        terms = self._noise(self.z)
         for mode, product in enumerate(law.products):
-            there = self._modes == mode
+            there = self.modes == mode
             if there.all():
-                self._z = product @ self._z
+                self.z = product @ self.z
                 break
             if there.any():
-                self._z[:, there] = product @ self._z[:, there]
+                self.z[:, there] = product @ self.z[:, there]
         if not law.products:
-            flow = self._weights * self._z[law.targets]
-            if len(law.lossy):
-                flow *= ~self._lost
-            self._z = self._of_graphs(law.rows) * self._z + law.flow @ flow
+            flow = self.weights() * self.z[law.targets]
+            self.z = self._of_graphs(law.rows) * self.z + law.flow @ flow
         return terms
 
     def _messages(self) -> FloatArray:
         """The same with messages that are noisy, late or held, or agents that step one after the other."""
-        law, depth, terms = self.law, len(self._used), np.zeros(self._z.shape[1])
-        noisy, rows = np.empty_like(self._z), self._of_graphs(law.rows)
+        law, depth, terms = self.law, len(self._used), np.zeros(self.z.shape[1])
+        noisy, rows = np.empty_like(self.z), self._of_graphs(law.rows)
         for agents, heard, said, place, own, into in law.groups:
             # The message of the state after this step, which later steps have used.
             message = self._used[(1 - self.steps) % depth, said]
@@ -457,17 +456,17 @@ class _Walk:
                 message *= ~self._lost[said]
             published = into @ message
             terms += law.link**2 * (message**2).sum(axis=0) + law.broadcast**2 * (published**2).sum(axis=0)
-            noisy[agents] = z = self._z[agents] + published
+            noisy[agents] = z = self.z[agents] + published
             flow = self._weights[heard] * z[place]
             if len(law.lossy) and not law.holds:
                 flow *= ~self._lost[heard]
-            self._z[agents] = rows[agents] * z - own @ flow
+            self.z[agents] = rows[agents] * z - own @ flow
             self._used[(law.ahead[heard] - self.steps - law.delay) % depth, heard] = flow
         return terms + self._noise(noisy)
 
     def _of_graphs(self, table: FloatArray) -> FloatArray:
         """The columns of the present graphs, of a table (m, n); of one (m, 1), the only one."""
-        return table if table.shape[1] == 1 else table[:, self._modes]
+        return table if table.shape[1] == 1 else table[:, self.modes]
 
     def _noise(self, z: FloatArray) -> FloatArray:
         """(C,) |B^T z|^2."""
@@ -475,24 +474,24 @@ class _Walk:
             return np.asarray(np.einsum("ic,ic->c", z * self._of_graphs(self.law.squares), z))
         terms = np.zeros(z.shape[1])
         for mode, gain in enumerate(self.law.gains):
-            there = self._modes == mode if len(self.law.gains) > 1 else slice(None)
+            there = self.modes == mode if len(self.law.gains) > 1 else slice(None)
             terms[there] = ((gain @ z[:, there]) ** 2).sum(axis=0)
         return terms
 
     def block(self, steps: int, ended: Callable[[], bool]) -> tuple[FloatArray, FloatArray] | None:
         """(C,) terms of the sum over these steps, and |z|^2 after them, of what messages carry, too; None: ended."""
-        terms = np.zeros(self._z.shape[1])
+        terms = np.zeros(self.z.shape[1])
         for _ in range(steps):
-            terms += self._back()
+            terms += self.back()
             if ended():
                 return None
-        return terms, (self._z**2).sum(axis=0) + (self._used**2).sum(axis=(0, 1)) + (self._passed**2).sum(axis=0)
+        return terms, (self.z**2).sum(axis=0) + (self._used**2).sum(axis=(0, 1)) + (self._passed**2).sum(axis=0)
 
     def keep(self, lives: BoolArray) -> None:
         """Only these vectors go on."""
         if lives.all():
             return
-        for name in ("_z", "_modes", "_until", "_up", "_flip", "_lost", "_used", "_passed"):
+        for name in ("z", "modes", "_until", "_up", "_flip", "_lost", "_used", "_passed"):
             setattr(self, name, getattr(self, name)[..., lives])
         if not self._shared:
             self._weights = self._weights[:, lives]
