@@ -425,16 +425,15 @@ def describe_sweep(
 
 def print_sweep(sweep: SweepGrid, document: dict[str, Any], picture: Picture, console: Console) -> None:
     """Print a table of what the figure shows, what failed, and the verdict; ``document`` of ``describe_sweep``."""
-    predicted = document["kind"] == "predict"
-    heads = [picture.y, "in continuous time"] if predicted else ["measured", "predicted"]
-    if picture.measured:
+    heads = ["measured", "predicted"] if picture.measured else [picture.y, "in continuous time"]
+    if picture.intervals:
         heads.insert(1, "± (95 %)")
     several = len(picture.series) > 1
     heads = [*([""] if several else []), picture.x, *heads]
     rows = []
     for label, place in ((series.label, place) for series in picture.series for place in series.places):
-        numbers = [number_text(place.value), number_text(place.reference if predicted else place.predicted)]
-        if picture.measured:
+        numbers = [number_text(place.value), number_text(place.predicted if picture.measured else place.reference)]
+        if picture.intervals:
             numbers.insert(1, half_width_text((place.low, place.high)))
         rows.append([*([label] if several else []), value_text(place.x), *numbers])
     print_rows(console, f"{sweep.name}: {picture.y}", heads, rows, "rows")

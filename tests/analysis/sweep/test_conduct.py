@@ -32,6 +32,7 @@ from msg_analysis.sweeps.results import (
     write_tables,
 )
 from msg_analysis.sweeps.workers import LocalWorkers, Lost, WorkersLostError, in_order, run_jobs
+from msg_analysis.theory.sampling import sampled_prediction
 
 
 def document(rate: float = 1.0, **run: Any) -> dict[str, Any]:
@@ -242,6 +243,24 @@ def numbers(cell: str) -> str | float:
         return float(cell)
     except ValueError:
         return cell
+
+
+def test_sampled_predictions_are_drawn_with_their_intervals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    in_this_process(monkeypatch)
+    lossy = document() | {"noise": {"loss": 0.2, "burst": 5}}
+    file = {"experiment": lossy, "kind": "predict", "over": {"noise.process": [1.0, 2.0]}}
+    (tmp_path / "try.yaml").write_text(yaml.safe_dump(file, sort_keys=False))
+    sweep = load_sweep(tmp_path / "try.yaml")
+    with ResultStore.open(tmp_path) as store:
+        outcomes = run_jobs([point.job for point in sweep.points], store).outcomes
+    rows = rows_of(sweep, outcomes, evaluate_sweep(outcomes, 0.01))
+    wanted = sampled_prediction(experiments.Experiment.parse(lossy))
+    names = ("system_error", "system_error.low", "system_error.high")
+    assert [rows[0][f"emulated.{name}"] for name in names] == [wanted.system_error, *wanted.interval]
+    shown = picture(sweep, rows)
+    place = shown.series[0].places[0]
+    assert (shown.measured, shown.intervals) == (False, True)
+    assert (place.value, place.low, place.high) == pytest.approx((wanted.system_error, *wanted.interval))
 
 
 def test_columns_and_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
