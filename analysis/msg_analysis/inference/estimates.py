@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
@@ -34,6 +35,13 @@ def sampled_beside(experiment: Experiment) -> SampledPrediction | None:
         with suppress(InputError):
             return sampled_prediction(experiment, precision=SAMPLED_TO, within=SAMPLED_WITHIN)
     return None
+
+
+def beside_sampled(measured: FloatArray, expected: FloatArray | None) -> list[Estimate]:
+    """Errors (q,) next to sampled ones, nan where these are not known; None: of none."""
+    known = np.full(len(measured), np.nan) if expected is None else expected
+    pairs = zip(measured.tolist(), known.tolist(), strict=True)
+    return [Estimate(error, None if math.isnan(predicted) else predicted) for error, predicted in pairs]
 
 
 @dataclass(frozen=True, slots=True)

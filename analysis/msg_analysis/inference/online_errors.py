@@ -8,7 +8,6 @@ Only sums are kept; a step takes O(m^2), and while the effect of a start that is
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -17,7 +16,7 @@ import numpy as np
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import number_text
 from msg_analysis.experiment.limits import unpredictable
-from msg_analysis.inference.estimates import Estimate, beside, sampled_beside
+from msg_analysis.inference.estimates import Estimate, beside, beside_sampled, sampled_beside
 from msg_analysis.inference.observation import bounded, deviations
 from msg_analysis.inference.online_evidence import AnyTime, ReceivedEvidence, RunningEvidence, needs_log, supports
 from msg_analysis.inference.online_steps import Lateness, LoggedStates, Recent, RecentSteps, StateLog, StepCollector
@@ -254,11 +253,10 @@ class RunningErrors:
             return Estimate(), [Estimate()] * self._agents
         measured = np.concatenate([[self._squares.sum()], self._squares]) / self.count
         if self._expected is None:
-            steady = [np.nan] * len(measured)
+            known = None
             if self._sampled is not None:
-                steady = [self._sampled.system_error, *self._sampled.node_errors.tolist()]
-            pairs = zip(measured.tolist(), steady, strict=True)
-            found = [Estimate(error, None if math.isnan(expected) else expected) for error, expected in pairs]
+                known = np.append(self._sampled.system_error, self._sampled.node_errors)
+            found = beside_sampled(measured, known)
             return found[0], found[1:]
         nodes = self._expected.total / self.count
         predicted = np.concatenate([[nodes.sum()], nodes])

@@ -21,6 +21,7 @@ from msg_analysis.inference.e_values import log_mean
 from msg_analysis.inference.estimates import (
     CovarianceTest,
     Estimate,
+    beside_sampled,
     covariance_test,
     estimates,
     rank_agents,
@@ -304,7 +305,7 @@ def _measured(trajectory: Run, level: float, unpredicted: str, block_numbers: in
         level=level,
         steps=measurement.steps,
         system_error=Estimate(float(np.trace(covariance)), sampled.system_error if sampled else None),
-        node_errors=[Estimate(float(error)) for error in np.diag(covariance)],
+        node_errors=beside_sampled(np.diag(covariance), sampled.node_errors if sampled else None),
         covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
         switching=switching,
         batch=batch_interval(series),
