@@ -6,8 +6,7 @@ from typing import Any
 import pytest
 
 from experiments import TRACKING, line_ring, simulate
-from msg_analysis.experiment.limits import unavailable
-from msg_analysis.theory.sampling import prediction_method
+from msg_analysis.experiment.limits import prediction_method, unavailable
 
 BY_LINK = {"loss": {"default": 0.1, "arcs": [[1, 2, 0.5]]}}
 BURSTS, HOLD = {"loss": 0.2, "burst": 5}, {"on_loss": "hold"}

@@ -12,6 +12,7 @@ import pytest
 import yaml
 from programs import put_foreign_files
 
+from msg_analysis.errors import ExitCode
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.inference.pool import compare
 from msg_analysis.paper import figures as emulation
@@ -80,6 +81,22 @@ def test_a_worker_is_killed_in_the_middle(network: Any, cluster: tuple[str, list
     places = {json.loads(line)["place"] for line in (out / "points.jsonl").read_text().splitlines()}
     assert len(places) <= 2
     check_against_the_twin(network, result["points"][::3])
+
+
+def test_errors_sampled_on_a_cluster(network: Any, cluster: tuple[str, list[subprocess.Popen[bytes]]]) -> None:
+    """The same numbers to the last bit with two workers, with one of them, and without."""
+    address, workers = cluster
+    file, found = network.file(), []
+    for words in (["--scheduler", address], ["--scheduler", address], []):
+        process = network.start("predict", file, "--precision", "0.5%", *words, "--json", program="msg-analysis")
+        emulated = network.result(process)["emulated"]
+        found.append([emulated[key] for key in ("interval", "node_intervals", "paths")])
+        workers[0].kill()
+    assert found[0] == found[1] == found[2]
+    workers[1].kill()
+    workers[1].wait()
+    process = network.start("predict", file, "--scheduler", address, program="msg-analysis")
+    assert "has no workers: expected some: start `dask worker`" in network.ended(process, ExitCode.BAD_INPUT)[1]
 
 
 @pytest.mark.timeout(300)  # waits of several sweeps, on a machine that has much else to do

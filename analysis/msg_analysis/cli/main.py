@@ -79,6 +79,8 @@ def main() -> None:
 @click.option("--precision", metavar="SHARE", help="Sample; half-width of the 95 % interval, relative: 1% or 0.01.")
 @click.option("--within", metavar="TIME", help="Sample for at most this time: 90s, 10min.")
 @click.option("--agents", metavar="LIST", help="Sample the errors of these agents, too: 1,17.")
+@click.option("--workers", type=click.IntRange(1), metavar="N", help="Sample with so many processes.")
+@click.option("--scheduler", metavar="tcp://HOST:PORT", help="Sample on the workers of this Dask scheduler.")
 @seed_option
 @json_option
 def predict(
@@ -87,10 +89,11 @@ def predict(
     """Predict the steady errors, exactly or by sampling.
 
     They are sampled, with an interval, where the exact way is too large, or with --precision (1%), --within (60s),
-    --agents (all of up to 20) or --seed.
+    --agents (all of up to 20), --workers, --scheduler or --seed.
     """
+    from msg_analysis.experiment.limits import prediction_method
     from msg_analysis.report.theory_text import print_prediction
-    from msg_analysis.theory.sampling import prediction_method, sampled_prediction
+    from msg_analysis.theory.sampling import sampled_prediction
 
     loaded = load_experiment(experiment, changes)
     given = {key: value for key, value in sampling.items() if value is not None}
@@ -101,6 +104,8 @@ def predict(
             raise InputError(f"--outages {outages}: expected with an exact prediction of a schedule: leave it out")
         if start:
             raise InputError(f"--from {start:g}: expected with a schedule; a steady state has no time: leave it out")
+        if "workers" in given and "scheduler" in given:
+            raise InputError(sweep.BOTH)
         if "seed" in given:
             loaded = loaded.with_run(seed=given.pop("seed"))
         if "agents" in given:

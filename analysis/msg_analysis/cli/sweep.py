@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import signal
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -32,6 +31,8 @@ if TYPE_CHECKING:
     from msg_analysis.sweeps.results import ResultStore
     from msg_analysis.sweeps.workers import OtherSoftware
 
+
+BOTH = "--workers: not together with --scheduler, which has workers of its own: give one of them"
 
 other_software = choice_option(
     "--other-software",
@@ -86,9 +87,7 @@ def sweep(
     result.
     """
     if workers and scheduler:
-        raise InputError("--workers: not together with --scheduler, which has workers of its own: give one of them")
-    if scheduler and importlib.util.find_spec("distributed") is None:
-        raise InputError("distributed: not installed: --scheduler needs it: pip install distributed")
+        raise InputError(BOTH)
     from msg_analysis.cli.console import SweepProgress
     from msg_analysis.sweeps.grid import load_sweep
 

@@ -308,8 +308,7 @@ class Experiment(Variants):
         """
         from msg_analysis.inference.sample_size import plan
 
-        self.require_available("steady")
-        return plan(self.predict(), precision, seconds=seconds, rate=rate, level=level)
+        return plan(self, precision, seconds=seconds, rate=rate, level=level)
 
     def spectrum(self, lags: ArrayLike | None = None, frequencies: ArrayLike | None = None) -> Spectrum:
         """Autocovariance and spectral density of the errors in the steady state, exactly.

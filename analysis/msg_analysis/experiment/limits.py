@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -72,6 +72,8 @@ def needs_sampling(experiment: Experiment) -> list[str]:
 def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
     """What the experiment asks for that this version cannot do, one line each."""
     lines = why_sampled(experiment)
+    if lines and not needs_sampling(experiment) and prediction_method(experiment)[0] == "sampled":
+        lines[-1] += "; `predict` samples the steady errors"
     if purpose == "run":
         lines = needs_sampling(experiment) or matrix_problems(experiment)
     if purpose == "steady" and experiment.schedule and not isinstance(experiment.schedule, DrawnSchedule):
@@ -80,6 +82,17 @@ def unavailable(experiment: Experiment, purpose: Purpose = "run") -> list[str]:
             problem("switching.schedule", "a given sequence of graphs", wanted, "use predict, run and compare")
         )
     return lines + (experiment.protocol.unavailable(purpose) if experiment.protocol else [])
+
+
+def prediction_method(experiment: Experiment) -> tuple[Literal["exact", "sampled", "measured"], str | None]:
+    """How the steady errors of an experiment are known, or those of runs only; and why not exactly."""
+    if experiment.protocol and (reason := experiment.protocol.unpredictable()):
+        return "measured", reason
+    if not (lines := why_sampled(experiment)):
+        return "exact", None
+    given = experiment.schedule and not isinstance(experiment.schedule, DrawnSchedule)
+    apart = experiment.links and (experiment.time == "discrete" or experiment.protocol)  # no steps of single links
+    return "measured" if given or apart else "sampled", lines[0]
 
 
 def why_sampled(experiment: Experiment) -> list[str]:

@@ -17,14 +17,15 @@ from pathlib import Path
 
 import numpy as np
 
-from msg_analysis.common.text import listed
+from msg_analysis.common.text import counted, listed
 from msg_analysis.experiment.graph_files import ForeignGraph, GraphError, file_content, node_name
 from msg_analysis.experiment.problems import show
 from msg_analysis.experiment.spec import SwitchingSpec
 from msg_analysis.experiment.values import LARGEST_NUMBER
 
 MOST_AGENTS = 20_000  # one matrix of them takes 3 GB
-MOST_LINKS = 3_000_000  # in all graphs together, which take 1 GB
+MOST_LINKS = 1_500_000  # in all graphs together, which take 0.6 GB
+MOST_ROWS = 1_500_000  # of contacts or intervals, which are read in 10 s
 ROUNDING = 1e-9  # of times: what differs by less, relative to its size, is the same time
 
 COLUMNS: Mapping[str, Sequence[str]] = {
@@ -156,9 +157,10 @@ def _unit_of(first: float) -> str | None:
 def _rows(key: str, file: Path) -> tuple[str, float, Iterator[_Row]]:
     """The kind of trace, its first time, and its rows in the order of time."""
     try:
-        text = file_content(key, file).decode("utf-8-sig")
-        separator = max((",", ";", "\t"), key=next(io.StringIO(text), "").count)
-        table = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
+        content = file_content(key, file)
+        separator = max((",", ";", "\t"), key=content.decode("utf-8-sig").partition("\n")[0].count)
+        text = io.TextIOWrapper(io.BytesIO(content), "utf-8-sig", newline="")  # StringIO has 4 bytes a character
+        table = csv.reader(text, delimiter=separator, skipinitialspace=True)
         names = [name.strip().lower() for name in next(table, [])]
         found = next((kind for kind, columns in COLUMNS.items() if set(columns) <= set(names)), None)
     except (UnicodeDecodeError, csv.Error) as error:
@@ -166,12 +168,15 @@ def _rows(key: str, file: Path) -> tuple[str, float, Iterator[_Row]]:
     if not found:
         raise GraphError(key, f"{file}, line 1: {show(','.join(names))}", _WANTED, "correct the header")
     wanted = [*COLUMNS[found], *([OPTIONAL[found]] if OPTIONAL.get(found) in names else [])]
+    if found in ("contacts", "intervals") and (count := content.count(b"\n")) > MOST_ROWS:
+        room = f"expected at most {MOST_ROWS}"
+        raise GraphError(key, f"{file}: {count} lines", room, "split it, or give intervals instead of contacts")
     if twice := next((name for name in wanted if names.count(name) > 1), None):
         raise GraphError(key, f"{file}, line 1: {twice} twice", "expected it once", "remove one")
     pick, times = itemgetter(*map(names.index, wanted)), 2 if found == "intervals" else 1
 
     def cells() -> Iterator[tuple[str, Sequence[Decimal], Sequence[str]]]:
-        before = Decimal("-Infinity")
+        before, known, now = Decimal("-Infinity"), [""], [Decimal()]
         try:
             for row in table:
                 if not any(row):
@@ -182,7 +187,9 @@ def _rows(key: str, file: Path) -> tuple[str, float, Iterator[_Row]]:
                 except IndexError:
                     shown = f"{place}: {show(separator.join(row))}"
                     raise GraphError(key, shown, f"expected {len(names)} values as in the header", _CORRECT) from None
-                now = [_number(key, place, column, text) for column, text in zip(wanted[:times], values, strict=False)]
+                if values[:times] != known:  # many contacts have the same time
+                    known = values[:times]
+                    now = [_number(key, place, column, text) for column, text in zip(wanted, known, strict=False)]
                 if now[0] < before:
                     expected = f"expected at least {before}, the one before"
                     raise GraphError(key, f"{place}: {wanted[0]} {now[0]}", expected, "sort the file by it")
@@ -214,10 +221,11 @@ def _number(key: str, place: str, column: str, text: str) -> Decimal:
 
 
 def _agent(key: str, text: str, nodes: dict[str, int]) -> int:
-    found = nodes.get(text)  # a million rows have few different ones
-    if len(nodes) > MOST_AGENTS:
+    if (found := nodes.get(text)) is not None:  # a million rows have few different ones
+        return found
+    if len(nodes) >= MOST_AGENTS:
         raise GraphError(key, f"more than {MOST_AGENTS} agents", "expected fewer", "correct the columns, or split it")
-    return nodes.setdefault(node_name(key, text, _CORRECT), len(nodes)) if found is None else found
+    return nodes.setdefault(node_name(key, text, _CORRECT), len(nodes))
 
 
 def _same(one: float, other: float) -> bool:
@@ -249,7 +257,7 @@ def _intervals(
             raise GraphError(key, f"{place}: {begin:g} after the first", wanted, "divide them, if they are nanoseconds")
         if end <= begin or _same(begin, end):
             raise GraphError(key, place, "expected the end of an interval after its start", _CORRECT)
-        a, b = (_agent(key, cell, nodes) for cell in cells[:2])
+        a, b = _agent(key, cells[0], nodes), _agent(key, cells[1], nodes)
         weight = float(_number(key, place, "weight", cells[2])) if cells[2:] else 1.0
         if a == b or weight <= 0.0:
             shown, wanted = (
@@ -306,8 +314,12 @@ def _near(
 
     def links() -> frozenset[Link]:
         agents = sorted(places)
-        pairs = KDTree([places[agent][1] for agent in agents]).query_pairs(radius) if len(agents) > 1 else ()
-        return frozenset((agents[a], agents[b], 1.0) for a, b in pairs)
+        if len(agents) < 2:
+            return frozenset()
+        tree = KDTree([places[agent][1] for agent in agents])
+        if len(agents) ** 2 > MOST_LINKS:
+            _check_size(key, int(tree.count_neighbors(tree, radius) - len(agents)) // 2, 1)
+        return frozenset((agents[a], agents[b], 1.0) for a, b in tree.query_pairs(radius))
 
     def forget(until: float) -> Iterator[tuple[float, frozenset[Link]]]:
         for end in sorted({end for end, _ in places.values() if end < until}):
@@ -326,6 +338,13 @@ def _near(
     yield time + (hold or 0.0), frozenset()
 
 
+def _check_size(key: str, links: int, graphs: int) -> None:
+    """GraphError: more links than fit in memory."""
+    if links > MOST_LINKS:
+        wanted = f"expected at most {MOST_LINKS} in all graphs together"
+        raise GraphError(key, f"{links} links in {counted(graphs, 'graph')}", wanted, "lower `radius`, or split it")
+
+
 def _trace(
     key: str,
     nodes: Mapping[str, int],
@@ -340,9 +359,7 @@ def _trace(
     end, count = 0.0, 0
     for (time, links), (end, _) in pairwise(moments):
         count += len(links) if links not in numbers else 0
-        if count > MOST_LINKS:
-            wanted = f"expected at most {MOST_LINKS} in all graphs together"
-            raise GraphError(key, f"{count} links in {len(numbers) + 1} graphs", wanted, "lower `radius`, or split it")
+        _check_size(key, count, len(numbers) + 1)
         number = numbers.setdefault(links, len(numbers))
         if not _same(time, end) and which[-1:] != [number]:
             starts.append(time)

@@ -5,17 +5,43 @@
 
 from __future__ import annotations
 
+import math
+from contextlib import suppress
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.common.text import HALF_WIDTH_95, markdown_table, number_text
+from msg_analysis.errors import InputError
+from msg_analysis.experiment.limits import prediction_method
 from msg_analysis.inference.statistics import chi2_tail, holm, quadratic_form, two_sided
 from msg_analysis.inference.time_means import TimeMeans
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.jump_system import JumpSystem
+from msg_analysis.theory.sampling import SampledPrediction, sampled_prediction
+
+if TYPE_CHECKING:
+    from msg_analysis.experiment.experiment import Experiment
+
+
+SAMPLED_TO, SAMPLED_WITHIN = 0.02, 10.0  # relative half width, and time [s], of a sampled error next to a run
+
+
+def sampled_beside(experiment: Experiment) -> SampledPrediction | None:
+    """The sampled errors next to those of a run; None: not sampled, or not known in this time."""
+    if prediction_method(experiment)[0] == "sampled":
+        with suppress(InputError):
+            return sampled_prediction(experiment, precision=SAMPLED_TO, within=SAMPLED_WITHIN)
+    return None
+
+
+def beside_sampled(measured: FloatArray, expected: FloatArray | None) -> list[Estimate]:
+    """Errors (q,) next to sampled ones, nan where these are not known; None: of none."""
+    known = np.full(len(measured), np.nan) if expected is None else expected
+    pairs = zip(measured.tolist(), known.tolist(), strict=True)
+    return [Estimate(error, None if math.isnan(predicted) else predicted) for error, predicted in pairs]
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ import numpy as np
 from msg_analysis.common.arrays import BLOCK_NUMBERS, BoolArray, FloatArray, IntArray
 from msg_analysis.common.text import number_text
 from msg_analysis.experiment.limits import unpredictable
-from msg_analysis.inference.estimates import Estimate, beside
+from msg_analysis.inference.estimates import Estimate, beside, beside_sampled, sampled_beside
 from msg_analysis.inference.observation import bounded, deviations
 from msg_analysis.inference.online_evidence import AnyTime, ReceivedEvidence, RunningEvidence, needs_log, supports
 from msg_analysis.inference.online_steps import Lateness, LoggedStates, Recent, RecentSteps, StateLog, StepCollector
@@ -26,6 +26,7 @@ from msg_analysis.messages.acceptance import Refusal
 from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.theory import packed_symmetric
 from msg_analysis.theory.prediction import Prediction, predict_run
+from msg_analysis.theory.sampling import SampledPrediction
 from msg_analysis.theory.scheduled import course
 
 TUNING_STEPS = 500  # before the interval is given: their variances say how it is tuned
@@ -97,7 +98,8 @@ class LiveEstimate:
         self.record = record
         reason = unpredictable(experiment)
         prediction = None if reason else predict_run(experiment, record.step_model)
-        self._errors = RunningErrors(record, prediction, nodes=nodes)
+        sampled = sampled_beside(experiment) if reason else None
+        self._errors = RunningErrors(record, prediction, nodes=nodes, sampled=sampled)
         self._plain: RunningEvidence | None = None
         self._received: ReceivedEvidence | None = None
         self.log: StateLog | None = None  # None: the messages are not needed
@@ -123,6 +125,9 @@ class LiveEstimate:
         self._lateness = None if lockstep else Lateness(experiment)
         self._newest = -1
         self._note = reason
+        if sampled is not None:
+            low, high = map(number_text, sampled.interval)
+            self._note = f"predicted: of the steady state, sampled, {low} to {high} (95 %), without a test: {reason}"
         if prediction is not None and not lockstep:
             self._note = "in real time the expected errors depend on the lateness of the agents: compare the bag"
         elif prediction is not None and prediction.path:
@@ -199,10 +204,16 @@ class RunningErrors:
     """Sums over steps that give errors and standard errors at any time; without a prediction, errors only."""
 
     def __init__(
-        self, record: RunRecord, prediction: Prediction | None, *, nodes: bool = True, most_bytes: int = MOST_BYTES
+        self,
+        record: RunRecord,
+        prediction: Prediction | None,
+        *,
+        nodes: bool = True,
+        most_bytes: int = MOST_BYTES,
+        sampled: SampledPrediction | None = None,
     ) -> None:
         experiment = record.experiment
-        self._record, self._prediction = record, prediction
+        self._record, self._prediction, self._sampled = record, prediction, sampled
         self._agents, self._replicas = experiment.agents, experiment.run.replicas
         self.first = self.last = -1  # first and last step that was added; -1: none
         self.count = 0  # steps that were added
@@ -242,7 +253,11 @@ class RunningErrors:
             return Estimate(), [Estimate()] * self._agents
         measured = np.concatenate([[self._squares.sum()], self._squares]) / self.count
         if self._expected is None:
-            return Estimate(float(measured[0])), [Estimate(float(error)) for error in measured[1:]]
+            known = None
+            if self._sampled is not None:
+                known = np.append(self._sampled.system_error, self._sampled.node_errors)
+            found = beside_sampled(measured, known)
+            return found[0], found[1:]
         nodes = self._expected.total / self.count
         predicted = np.concatenate([[nodes.sum()], nodes])
         if self._variances is None:

@@ -8,18 +8,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from msg_analysis.common.text import HALF_WIDTH_95, agent_text, counted, percent
 from msg_analysis.errors import InputError
+from msg_analysis.experiment.limits import prediction_method
 from msg_analysis.inference.fault_power import FaultPower, fault_powers
 from msg_analysis.inference.statistics import simultaneous_half_width
 from msg_analysis.inference.time_means import expected_switches, few_switches
 from msg_analysis.theory.first_steps import simplification
-from msg_analysis.theory.prediction import Prediction
+from msg_analysis.theory.prediction import Prediction, predict
+from msg_analysis.theory.sampled_variance import sampled_mean_variance, sampled_warm_up
+from msg_analysis.theory.sampling import sampled_prediction
 from msg_analysis.theory.settling import settling_time
 from msg_analysis.theory.time_mean_variance import MeanVariance, mean_variance
 from msg_analysis.theory.transient import start_of
+
+if TYPE_CHECKING:
+    from msg_analysis.experiment.experiment import Experiment
 
 REPLICAS: tuple[int, ...] = tuple(2**k for k in range(9))  # that are tried: 1 to 256
 HARDLY_WORSE = 1.05  # a half-width up to so many times the least one is as good, if it needs fewer replicas
@@ -105,14 +111,21 @@ def precision_of(prediction: Prediction, sought: float) -> Precision:
     return Precision(error, mean_variance(prediction), math.ceil(warm_up), plain)
 
 
+def sampled_precision(experiment: Experiment, sought: float) -> Precision:
+    """The same, sampled, where the errors are."""
+    error = sampled_prediction(experiment).system_error
+    variance, warm_up = sampled_mean_variance(experiment), sampled_warm_up(experiment, sought)
+    return Precision(error, variance, warm_up, any_time=False)
+
+
 @dataclass(frozen=True, slots=True)
 class RunPlan:
     """What runs of an experiment will show.
 
     Attributes
     ----------
-    prediction
-        of the experiment
+    experiment
+        that is planned
     sought
         half-width of the 95 % interval of the system error, relative to the predicted one
     precision
@@ -125,24 +138,27 @@ class RunPlan:
         steps per second of wall time, or None where it is not known
     powers
         one for each fault
+    notes
+        what limits the plan, in words
     """
 
-    prediction: Prediction
+    experiment: Experiment
     sought: float
     precision: Precision
     level: float
     seconds: float | None
     rate: float | None
     powers: Sequence[FaultPower]
+    notes: Sequence[str]
 
     def __repr__(self) -> str:
-        experiment = self.prediction.experiment
+        experiment = self.experiment
         steps = self.precision.steps(self.sought, experiment.run.replicas)
         return f"<Plan of {experiment.name!r}: {steps} steps for {self.sought:.3g} of the system error>"
 
     def to_json(self) -> dict[str, Any]:
         """The document of ``msg-analysis plan --json``."""
-        experiment, precision = self.prediction.experiment, self.precision
+        experiment, precision = self.experiment, self.precision
         replicas, variance = experiment.run.replicas, precision.variance
         return {
             "experiment": experiment.name,
@@ -159,14 +175,14 @@ class RunPlan:
             "budget": self._budget(),
             "level": self.level,
             "faults": [self._fault(power) for power in self.powers],
-            "notes": self._notes(),
+            "notes": list(self.notes),
         }
 
     def _length(self, steps: int | None) -> dict[str, float | None]:
         if steps is None:
             return dict.fromkeys(("steps", "duration", "wall_time"))
         wall_time = steps / self.rate if self.rate else None
-        return {"steps": steps, "duration": steps * self.prediction.step.dt, "wall_time": wall_time}
+        return {"steps": steps, "duration": steps * self.experiment.step_length, "wall_time": wall_time}
 
     def _run(self, steps: int, replicas: int) -> dict[str, float | None]:
         error = self.precision.standard_error(steps, replicas)
@@ -191,7 +207,7 @@ class RunPlan:
         return {"time": self.seconds} | self._run(steps, self.precision.best_replicas(steps))
 
     def _fault(self, power: FaultPower) -> dict[str, Any]:
-        steps = self.prediction.experiment.steps
+        steps = self.experiment.steps
         best = max(power.tests, key=lambda test: power.power_of(test, steps))
         return {
             "fault": self._fault_words(power),
@@ -206,7 +222,7 @@ class RunPlan:
         }
 
     def _fault_words(self, power: FaultPower) -> str:
-        names, factor = self.prediction.experiment.names, power.fault.factor
+        names, factor = self.experiment.names, power.fault.factor
         if power.fault.kind == "switching":
             return f"all rates x {factor:g}"
         assert power.agent is not None
@@ -216,30 +232,30 @@ class RunPlan:
         assert power.sender is not None
         return f"gain of {agent} on {agent_text(power.sender + 1, names)} x {factor:g}"
 
-    def _notes(self) -> list[str]:
-        step, precision = self.prediction.step, self.precision
-        notes = []
-        replicas = self.prediction.experiment.run.replicas
-        if not precision.variance.exact:
-            notes.append(
-                "the network is large, so the scatter of the mean is sampled: standard errors and half-widths with "
-                f"{counted(replicas, 'replica')} are known to {percent(precision.variance.error(replicas))} (standard "
-                "error)"
-            )
-        for steps in sorted({self.prediction.experiment.steps, precision.steps(self.sought, replicas)}):
-            if few := few_switches(expected_switches(step, steps)):
-                notes.append(f"a run of {steps} steps {few}: its standard error is not yet that of a long run")
-        if precision.warm_up and (note := simplification(self.prediction.system)):
-            notes.append(note)
-        if not precision.any_time:
-            notes.append(
-                "with noise, losses or delay of messages and in real time there is no interval that holds at all times"
-            )
-        return notes
+
+def _notes(prediction: Prediction, sought: float, precision: Precision) -> list[str]:
+    notes, replicas = [], prediction.experiment.run.replicas
+    if not precision.variance.exact:
+        notes.append(f"the network is large, so the scatter of the mean is sampled: {_known_to(precision, replicas)}")
+    for steps in sorted({prediction.experiment.steps, precision.steps(sought, replicas)}):
+        if few := few_switches(expected_switches(prediction.step, steps)):
+            notes.append(f"a run of {steps} steps {few}: its standard error is not yet that of a long run")
+    if precision.warm_up and (note := simplification(prediction.system)):
+        notes.append(note)
+    if not precision.any_time:
+        notes.append(
+            "with noise, losses or delay of messages and in real time there is no interval that holds at all times"
+        )
+    return notes
+
+
+def _known_to(precision: Precision, replicas: int) -> str:
+    share = percent(precision.variance.error(replicas))
+    return f"standard errors and half-widths with {counted(replicas, 'replica')} are known to {share} (standard error)"
 
 
 def plan(
-    prediction: Prediction,
+    experiment: Experiment,
     precision: float = 0.01,
     *,
     seconds: float | None = None,
@@ -247,7 +263,7 @@ def plan(
     level: float = 0.01,
 ) -> RunPlan:
     """Plan runs of an experiment, see ``Experiment.plan``; nothing is simulated."""
-    run, dt = prediction.experiment.run, prediction.step.dt
+    run, dt = experiment.run, experiment.step_length
     if not 0.0 < precision < 1.0:
         raise InputError(f"precision: {precision:g}: expected a share of the error above 0, below 1: for example 0.01")
     if not 0.0 < level <= 0.5:
@@ -268,8 +284,23 @@ def plan(
             "budget: a run in lockstep is as fast as the machine: give its speed in steps per second too, which "
             "`msg-agents run` prints"
         )
+    zero = "precision: the predicted system error is 0, expected noise: set noise.process"
+    if prediction_method(experiment)[0] == "sampled":
+        experiment.require_available()
+        if not experiment.noise_gain.any():
+            raise InputError(zero)
+        found = sampled_precision(experiment, precision)
+        notes = [
+            f"the errors are sampled, since there is no exact prediction: {_known_to(found, run.replicas)}",
+            "without an exact prediction nothing is known of the power of the tests, nor an interval that holds at all "
+            "times",
+        ]
+        return RunPlan(experiment, precision, found, level, seconds, rate, (), notes)
+    experiment.require_available("steady")
+    prediction = predict(experiment)
     if not prediction.emulated.system_error > 0.0:
-        raise InputError("precision: the predicted system error is 0, expected noise: set noise.process")
+        raise InputError(zero)
     found = precision_of(prediction, precision)
     powers = fault_powers(prediction, run.replicas, level)
-    return RunPlan(prediction, precision, found, level, seconds, rate, powers)
+    notes = _notes(prediction, precision, found)
+    return RunPlan(experiment, precision, found, level, seconds, rate, powers, notes)

@@ -6,21 +6,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from msg_analysis.common.arrays import BLOCK_NUMBERS, FloatArray, IntArray
 from msg_analysis.common.resources import blas_threads
-from msg_analysis.errors import InputError
 from msg_analysis.experiment.limits import unpredictable
 from msg_analysis.experiment.markov_chain import Schedule
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.comparison import MAX_MISSED, Comparison, few_digits, trusted
 from msg_analysis.inference.counts import LossTally, Transitions, loss_test
 from msg_analysis.inference.e_values import log_mean
-from msg_analysis.inference.estimates import CovarianceTest, Estimate, covariance_test, estimates, rank_agents
+from msg_analysis.inference.estimates import (
+    CovarianceTest,
+    Estimate,
+    beside_sampled,
+    covariance_test,
+    estimates,
+    rank_agents,
+    sampled_beside,
+)
 from msg_analysis.inference.event_order import order_events
 from msg_analysis.inference.evidence_sums import AnyTimeEvidence, WatchedEvidence, any_time_evidence
 from msg_analysis.inference.exact_values import exact_findings, of_runs
@@ -39,7 +45,6 @@ from msg_analysis.model.run import Run
 from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import Wiring
 from msg_analysis.theory.prediction import Prediction, predict_run
-from msg_analysis.theory.sampling import prediction_method, sampled_prediction
 
 ANALYSES = 20, 80  # at the evidence over time, in short and in long runs: each takes as long as some hundred steps
 STEPS_PER_ANALYSIS = 100  # between these
@@ -171,7 +176,6 @@ def _coarser(means: TimeMeans, other: TimeMeans) -> TimeMeans:
     )
 
 
-SAMPLED_TO, SAMPLED_WITHIN = 0.02, 10.0  # relative half width, and time [s], of a sampled error next to a run
 MIN_STEPS = 100  # fewest steps of an incomplete run for which numbers are given
 
 
@@ -291,10 +295,7 @@ def _measured(trajectory: Run, level: float, unpredicted: str, block_numbers: in
             running=_running(np.empty(0), None, step.dt),
             unpredicted=unpredicted,
         )
-    sampled = None
-    if prediction_method(trajectory.record.experiment)[0] == "sampled":
-        with suppress(InputError):  # not known in this time, or not at all
-            sampled = sampled_prediction(trajectory.record.experiment, precision=SAMPLED_TO, within=SAMPLED_WITHIN)
+    sampled = sampled_beside(trajectory.record.experiment)
     transitions, loss = _transitions(step, measurement.modes), loss_test(measurement)
     switching = transitions.test(step.transition) if transitions else None
     start, wrong_stamp = trajectory.record.start, trajectory.wrong_stamp
@@ -304,7 +305,7 @@ def _measured(trajectory: Run, level: float, unpredicted: str, block_numbers: in
         level=level,
         steps=measurement.steps,
         system_error=Estimate(float(np.trace(covariance)), sampled.system_error if sampled else None),
-        node_errors=[Estimate(float(error)) for error in np.diag(covariance)],
+        node_errors=beside_sampled(np.diag(covariance), sampled.node_errors if sampled else None),
         covariance=CovarianceTest(measured=covariance, note="there is no prediction"),
         switching=switching,
         batch=batch_interval(series),

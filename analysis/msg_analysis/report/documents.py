@@ -22,6 +22,7 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.writing import recording_pid
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.files import write_whole
+from msg_analysis.common.resources import few_blas_threads
 from msg_analysis.common.text import agent_name
 from msg_analysis.errors import InputError
 from msg_analysis.experiment import limits, validation
@@ -41,7 +42,7 @@ from msg_analysis.theory.first_steps import simplification
 from msg_analysis.theory.graph_indices import algebraic_connectivity, error_bounds, graph_indices, two_topology
 from msg_analysis.theory.jump_system import JumpSystem
 from msg_analysis.theory.prediction import predict
-from msg_analysis.theory.sampling import prediction_method, sampled_prediction
+from msg_analysis.theory.sampling import sampled_prediction
 from msg_analysis.theory.settling import asymptotic_rates, settling_time
 from msg_analysis.theory.spectrum import Spectrum, spectrum
 from msg_analysis.theory.transient import TransientLaw, point_start, solve_transient, start_of
@@ -224,6 +225,7 @@ def _mean_squares(document: dict[str, Any]) -> tuple[str, str]:
     return f"system_{kind}", f"node_{kind}s"
 
 
+@few_blas_threads
 def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     """The document of ``info EXPERIMENT``, also of one that cannot be run; None: infinite or not known."""
     if limits.needs_sampling(experiment):
@@ -294,7 +296,7 @@ SHORT, ONE_PERCENT = 2.0, 0.01  # s for which errors are sampled to say how long
 
 def _method(experiment: Experiment) -> dict[str, Any]:
     """How the steady errors are known: "exact", "sampled", or "measured" in runs only; why; and the system error."""
-    method, why = prediction_method(experiment)
+    method, why = limits.prediction_method(experiment)
     found: dict[str, Any] = {"method": method, "why": why, "seconds": None, "system_error": None}
     if method == "sampled":
         with suppress(InputError):  # not known so fast

@@ -53,6 +53,7 @@ from msg_analysis.report.drawings import explain, graph_facts, interval_bars, pl
 from msg_analysis.report.error_plots import covariances
 from msg_analysis.report.plot_style import Candidates
 from msg_analysis.report.run_plots import Event, run_events
+from msg_analysis.report.tables import interval_text
 from msg_analysis.theory.prediction import LAW_NAMES
 from msg_analysis.twin.check import check
 
@@ -361,7 +362,9 @@ def _explanation(document: dict[str, Any]) -> str:
     if document["unpredicted"]:
         results = [f"{test['name']}: {'rejected' if test['rejected'] else 'ok'}" for test in tests]
         cut = f" Errors are measured from step {document['transient']} on." if document["transient"] else ""
-        return f"No prediction: {document['unpredicted']}. Tests: {', '.join(results) or 'none'}.{cut}"
+        sampled = document.get("sampled")
+        interval = f" Sampled instead: {interval_text(sampled['interval'])} (95 %)." if sampled else ""
+        return f"No prediction: {document['unpredicted']}.{interval} Tests: {', '.join(results) or 'none'}.{cut}"
     chance = f"A correct run fails a test with probability at most {percent(level)}."
     rejected = [test for test in tests if test["rejected"]]
     if not rejected:

@@ -136,19 +136,19 @@ def lines(picture: Picture, panel: Panel, name: str) -> UIElement:
 def _series(plot: Any, picture: Picture, source: ColumnDataSource, number: int) -> Any:
     """Draw one series; the points that show values under the pointer."""
     colour, marker = LINES[number], list(MARKERS)[number]
-    if picture.measured:
-        plot.line("x", "predicted", source=source, color=colour, line_width=1.5)
-        whisker = Whisker(source=source, base="beside", lower="low", upper="high", line_color=colour, level="glyph")
+    place = "beside" if picture.measured else "x"
+    if picture.intervals:
+        whisker = Whisker(source=source, base=place, lower="low", upper="high", line_color=colour, level="glyph")
         whisker.line_width = 1.5
         whisker.upper_head.size = whisker.lower_head.size = 5
         whisker.upper_head.line_color = whisker.lower_head.line_color = colour
         plot.add_layout(whisker)
+    if picture.measured:
+        plot.line("x", "predicted", source=source, color=colour, line_width=1.5)
     else:
         plot.line("x", "value", source=source, color=colour, line_width=1.8)
         plot.line("x", "reference", source=source, color=colour, line_dash="dashed")
-    return plot.scatter(
-        "beside" if picture.measured else "x", "value", source=source, marker=marker, size=7, color=colour
-    )
+    return plot.scatter(place, "value", source=source, marker=marker, size=7, color=colour)
 
 
 def dashed(picture: Picture) -> bool:
@@ -353,10 +353,10 @@ def _draw_series(
     order = np.argsort(x, kind="stable")
     values, predicted, reference = (_column(series.places, key)[order] for key in ("value", "predicted", "reference"))
     x, beside = x[order], beside[order]
+    low, high = (_column(series.places, key)[order] for key in ("low", "high"))
+    bars = np.abs(np.array([values - low, high - values]))
     if picture.measured:
-        low, high = (_column(series.places, key)[order] for key in ("low", "high"))
         axes.plot(x, predicted, color=colour, lw=1.2, alpha=0.8)
-        bars = np.abs(np.array([values - low, high - values]))
         axes.errorbar(
             beside, values, bars, fmt=marker, ms=4.5, color=colour, mec="white", mew=0.5, elinewidth=1.1, capsize=2.5
         )
@@ -364,6 +364,8 @@ def _draw_series(
     few = len(x) <= 40
     axes.plot(x, values, color=colour, lw=1.5, marker=marker if few else None, ms=4, mec="white", mew=0.5)
     axes.plot(x, reference, color=colour, lw=1.0, ls=(0, (4, 2)))
+    if picture.intervals:
+        axes.errorbar(x, values, bars, fmt="none", color=colour, elinewidth=1.1, capsize=2.5)
 
 
 def _add_legend(figure: Figure, axes: Axes, picture: Picture, colours: Sequence[Any]) -> None:
@@ -379,6 +381,8 @@ def _add_legend(figure: Figure, axes: Axes, picture: Picture, colours: Sequence[
     elif any(place.reference is not None for place in picture.places):
         enter(LAW_NAMES["emulated"], marker="o", lw=1.5, ms=4)
         enter(LAW_NAMES["continuous"], lw=1.0, ls=(0, (4, 2)))
+    elif picture.intervals:
+        enter("sampled, 95 % interval", marker="o", lw=1.5, ms=4)
     if any(place.value is None for place in picture.places):
         enter("no result", BLACK, marker="x", ls="", ms=5)
     if entries:

@@ -426,13 +426,16 @@ def describe_sweep(
 
 def print_sweep(sweep: SweepGrid, document: dict[str, Any], picture: Picture, console: Console) -> None:
     """Print a table of what the figure shows, what failed, and the verdict; ``document`` of ``describe_sweep``."""
-    heads = ["measured", "± (95 %)", "predicted"] if picture.measured else [picture.y, "in continuous time"]
+    heads = ["measured", "predicted"] if picture.measured else [picture.y, "in continuous time"]
+    if picture.intervals:
+        heads.insert(1, "± (95 %)")
     several = len(picture.series) > 1
     heads = [*([""] if several else []), picture.x, *heads]
     rows = []
     for label, place in ((series.label, place) for series in picture.series for place in series.places):
-        others = [half_width_text((place.low, place.high)), number_text(place.predicted)]
-        numbers = [number_text(place.value), *(others if picture.measured else [number_text(place.reference)])]
+        numbers = [number_text(place.value), number_text(place.predicted if picture.measured else place.reference)]
+        if picture.intervals:
+            numbers.insert(1, half_width_text((place.low, place.high)))
         rows.append([*([label] if several else []), value_text(place.x), *numbers])
     print_rows(console, f"{sweep.name}: {picture.y}", heads, rows, "rows")
     for row in [row for row in document["points"] if row["status"] == FAILED][:ROWS]:

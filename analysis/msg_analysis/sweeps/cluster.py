@@ -10,6 +10,7 @@ import concurrent.futures
 import logging
 import time
 import uuid
+import warnings
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Self
@@ -43,6 +44,7 @@ class ClusterWorkers(Workers):
         for name in list(logging.root.manager.loggerDict):
             if name.partition(".")[0] == "distributed":
                 logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+        warnings.filterwarnings("ignore", "Sending large graph")  # once for each batch, which takes longer
         try:
             self._client = distributed.Client(self._scheduler, timeout=self._patience, name="msg-analysis")
         except (OSError, ValueError, TypeError) as error:
@@ -84,7 +86,7 @@ class ClusterWorkers(Workers):
             error = future.exception()
             if isinstance(error, KilledWorker):
                 return None
-            if isinstance(error, ModuleNotFoundError | InputError):
+            if isinstance(error, ImportError):
                 raise InputError(f"a worker cannot do it: {error}: install the same software there") from error
             assert error is not None
             raise error
@@ -101,9 +103,9 @@ class ClusterWorkers(Workers):
 
 
 def _do_on_cluster(function: Function[T, R], batch: Sequence[T], stop_name: str, software: str) -> Answer:
-    """On a worker of a cluster: see ``do``. InputError: it has other software."""
+    """On a worker of a cluster: see ``do``. ImportError: it has other software."""
     if installed_software() != software:
-        raise InputError(f"it has {installed_software()}: expected {software}")
+        raise ImportError(f"it has {installed_software()}: expected {software}")
     return do(function, batch, _Stopping(stop_name))
 
 

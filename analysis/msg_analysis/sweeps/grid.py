@@ -22,13 +22,12 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PlainValidato
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.examples import find
 from msg_analysis.experiment.experiment import Experiment
-from msg_analysis.experiment.limits import unavailable
+from msg_analysis.experiment.limits import prediction_method, unavailable
 from msg_analysis.experiment.loading import other_kind, read_yaml
 from msg_analysis.experiment.problems import ExperimentError, problem, show, translate
 from msg_analysis.experiment.values import Count, expected, is_number
 from msg_analysis.model.run_record import Until
 from msg_analysis.sweeps.points import Job, JobKind
-from msg_analysis.theory.sampling import prediction_method
 
 MOST_POINTS = 20_000  # of a sweep: the experiments of all are held in memory
 

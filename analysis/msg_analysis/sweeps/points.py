@@ -28,6 +28,7 @@ from msg_analysis.common import programs
 from msg_analysis.common.files import lock
 from msg_analysis.common.resources import SINGLE_THREAD, __version__
 from msg_analysis.common.shared_folders import own_folder
+from msg_analysis.common.text import HALF_WIDTH_95
 from msg_analysis.errors import InputError
 
 # What the result of a job depends on: the folders and modules that ``evaluate`` imports.
@@ -264,8 +265,9 @@ def _result(job: Job, stopping: Callable[[], bool]) -> Mapping[str, Any]:
         return of_comparison(run_network(job, stopping))
     experiment = Experiment.parse(json.loads(job.document), source="experiment")
     if job.kind == "predict":
+        from msg_analysis.experiment.limits import prediction_method
         from msg_analysis.theory.prediction import predict
-        from msg_analysis.theory.sampling import prediction_method, sampled_prediction
+        from msg_analysis.theory.sampling import sampled_prediction
 
         if prediction_method(experiment)[0] == "sampled":
             return of_prediction(sampled_prediction(experiment).to_json())
@@ -283,6 +285,11 @@ def of_prediction(document: Mapping[str, Any]) -> dict[str, Any]:
     keys = ("system_error", "system_certainty", "node_errors")
     laws = {law: document[law] for law in LAW_NAMES if document.get(law)}
     kept: dict[str, Any] = {law: {key: found[key] for key in keys} for law, found in laws.items()}
+    for law, found in laws.items():
+        if "interval" in found:  # it is sampled
+            low, high = found["interval"]
+            numbers = {"standard_error": (high - low) / 2.0 / HALF_WIDTH_95, "low": low, "high": high}
+            kept[law] |= {f"system_error.{key}": number for key, number in numbers.items()}
     return {"agents": document["agents"], "stationary": document["stationary"], **kept}
 
 

@@ -302,9 +302,14 @@ class Picture:
     x: str  # the key along the axis
     y: str  # the column
     logarithmic: bool  # the axis of x
-    measured: bool  # whether there are intervals
+    measured: bool  # whether it is of runs, which have intervals
     series: tuple[Series, ...]  # one for each combination of values of the other keys
     names: Sequence[str] | None = None  # of the agents, if all points have the same
+
+    @property
+    def intervals(self) -> bool:
+        """Whether some value has one: a run, or a prediction that is sampled."""
+        return any(place.low is not None for place in self.places)
 
     def words(self, values: Iterable[tuple[str, Any]]) -> str:
         """Keys in words, with their values; empty where there are none."""
@@ -354,7 +359,8 @@ def picture(sweep: SweepGrid, rows: Sequence[Row], column: str | None = None, al
         Series(values[group], tuple(_place(along, rows_here, names) for rows_here in places.values()))
         for group, places in groups.items()
     )
-    return Picture(along, wanted, _logarithmic(sweep, along), names["error"] is not None, found, sweep.names)
+    measured = sweep.kind != "predict" and names["error"] is not None
+    return Picture(along, wanted, _logarithmic(sweep, along), measured, found, sweep.names)
 
 
 def _drawn_columns(rows: Sequence[Row], wanted: str) -> dict[str, str | None]:
@@ -362,8 +368,8 @@ def _drawn_columns(rows: Sequence[Row], wanted: str) -> dict[str, str | None]:
     numeric = _numeric(rows)
     for value, error, predicted, reference in (
         (f"{wanted}.measured", f"{wanted}.standard_error", f"{wanted}.predicted", None),
-        (f"emulated.{wanted}", None, None, f"continuous.{wanted}"),
-        (f"discrete.{wanted}", None, None, None),
+        (f"emulated.{wanted}", f"emulated.{wanted}.standard_error", None, f"continuous.{wanted}"),
+        (f"discrete.{wanted}", f"discrete.{wanted}.standard_error", None, None),
         (wanted, None, None, None),
     ):
         if value in numeric:

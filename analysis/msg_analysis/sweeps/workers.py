@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
+import itertools
 import math
 import os
 import resource
@@ -342,9 +344,40 @@ def run_jobs(
     return JobResults(tuple(store.outcomes[job.id] for job in jobs), reused)
 
 
+MANY = 2**20  # numbers in one sequence of batches
+JOINING = 5.0  # s in which the first worker of a cluster joins it
+
+
+def in_order(function: Function[int, R], workers: int | None, scheduler: str | None) -> Generator[R, None, None]:
+    """Results for 0, 1, ... without end, in this order, whichever comes first. InputError: no workers, or they went."""
+    try:
+        with _workers(workers, scheduler) as pool:
+            began = time.monotonic()
+            while not pool.threads and time.monotonic() < began + JOINING:
+                time.sleep(0.1)
+            if not pool.threads:
+                raise InputError(f"--scheduler {scheduler}: has no workers: expected some: start `dask worker`")
+            for first in itertools.count(step=MANY):
+                early: dict[int, R | Lost] = {}
+                with closing(pool.outcomes(function, range(first, first + MANY))) as batches:
+                    wanted = first
+                    for batch in batches:
+                        early.update(batch)
+                        while wanted in early:
+                            found = early.pop(wanted)
+                            if isinstance(found, Lost):
+                                raise InputError(f"batch {wanted}: {found.reason}: use fewer workers, with more memory")
+                            yield found
+                            wanted += 1
+    except WorkersLostError as error:
+        raise InputError(f"{error}: expected workers until the end: start them again") from error
+
+
 def _workers(count: int | None, scheduler: str | None) -> Workers:
     if scheduler is None:
         return LocalWorkers(count)
+    if importlib.util.find_spec("distributed") is None:
+        raise InputError("distributed: not installed: --scheduler needs it: pip install distributed")
     from msg_analysis.sweeps.cluster import ClusterWorkers  # Dask
 
     return ClusterWorkers(scheduler)

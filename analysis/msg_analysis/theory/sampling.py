@@ -16,23 +16,23 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from functools import partial
+from itertools import count as numbers_from
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.special
-from scipy import sparse
 
-from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
+from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.resources import tell
 from msg_analysis.common.text import agent_text, finite, markdown_table, number_text
-from msg_analysis.errors import InputError, NotAvailableError
-from msg_analysis.experiment.graphs import Graph
-from msg_analysis.experiment.limits import why_sampled
+from msg_analysis.errors import InputError
 from msg_analysis.experiment.links import expanded
-from msg_analysis.experiment.markov_chain import DrawnSchedule
-from msg_analysis.model.step_model import step_law, step_matrices, turns
+from msg_analysis.model.step_model import step_law
+from msg_analysis.theory.sparse_walks import Law, Walk
 
 if TYPE_CHECKING:
     from msg_analysis.experiment.experiment import Experiment
@@ -42,12 +42,10 @@ ALL_AGENTS = 20  # most agents of which each has walks of its own by default
 FEWEST = 32  # samples before an interval is believed
 NUMBERS = 2**17  # on arcs, that walks which are made together have at a time: they fit in a cache
 LEAST_TOGETHER, MOST_TOGETHER = 4, 512
-FEW_GRAPHS = 8  # whose matrices are multiplied, and not the arcs of each walk
 BLOCK = 16  # steps of a walk before it may end, and twice the delay; later a quarter of those that it has made
 SMALL = 0.03  # of the sum so far, terms of a block: then the walk may end
 NOTHING = 1e-30  # of |z|^2, is rounding
 GROWTH = 1e6  # of |z|^2, beyond what weights that are not negative can do: the steps are unstable
-LONGEST, NEVER = 2**60, 1e-18  # steps, and probability in a step, that are not told from infinity and 0
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -120,17 +118,6 @@ class SampledPrediction:
         return document | laws | rest
 
 
-def prediction_method(experiment: Experiment) -> tuple[Literal["exact", "sampled", "measured"], str | None]:
-    """How the steady errors of an experiment are known, or those of runs only; and why not exactly."""
-    if experiment.protocol and (reason := experiment.protocol.unpredictable()):
-        return "measured", reason
-    if not (lines := why_sampled(experiment)):
-        return "exact", None
-    given = experiment.schedule and not isinstance(experiment.schedule, DrawnSchedule)
-    apart = experiment.links and (experiment.time == "discrete" or experiment.protocol)  # no steps of single links
-    return "measured" if given or apart else "sampled", lines[0]
-
-
 def sampled_prediction(
     experiment: Experiment,
     *,
@@ -138,6 +125,8 @@ def sampled_prediction(
     within: float = 60.0,
     agents: Sequence[int | str] = (),
     seed: int | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
 ) -> SampledPrediction:
     """Sample the steady errors of the run's steps.
 
@@ -152,13 +141,18 @@ def sampled_prediction(
     agents
         whose errors are sampled, too, by number from 1 or name; with up to 20 agents, by default all
     seed
-        of the random numbers, >= 0; for one seed, the time decides nothing but how many samples there are. None:
-        ``run.seed``
+        of the random numbers, >= 0; for one seed, time and workers decide nothing but how many samples there are.
+        None: ``run.seed``
+    workers
+        processes of this machine that make the samples; None: this one
+    scheduler
+        address of a Dask scheduler, whose workers make them
 
     Raises
     ------
     InputError
-        an argument that is not valid, a given sequence of graphs, unstable steps, or too little time for an interval
+        an argument that is not valid, a given sequence of graphs, unstable steps, too little time for an interval, or
+        workers that are not there
     """
     began = time.monotonic()
     for key, value, most in (("precision", precision, 1.0), ("within", within, math.inf)):
@@ -166,23 +160,31 @@ def sampled_prediction(
             wanted = "expected a number above 0" + ", below 1" * (most < math.inf)
             raise InputError(f"{key}: {value:g}: {wanted}: for example 0.01")
     seed = experiment.run.seed if seed is None else seed
-    law, m = _Law(experiment if experiment.links else expanded(experiment)), experiment.agents
+    law, m = Law(experiment if experiment.links else expanded(experiment)), experiment.agents
     every = not agents and m <= ALL_AGENTS
     units = list(range(m)) if every else experiment.indices(agents)
     width = len(units) + (not every)
     rounds = max(1, min(MOST_TOGETHER, max(LEAST_TOGETHER, NUMBERS // max(1, len(law.targets)))) // width)
-    seeds, count, sums, squares = np.random.SeedSequence(seed), 0, np.zeros(1 + len(units)), np.zeros(1 + len(units))
+    make = partial(_batch, law, units, every, rounds, seed, time.time() + within)
+    count, sums, squares = 0, np.zeros(1 + len(units)), np.zeros(1 + len(units))
     mean = half = sums
-    while count < FEWEST or (half[: None if agents else 1] > precision * mean[: None if agents else 1]).any():
-        batch = _batch(law, units, every, rounds, np.random.default_rng(seeds.spawn(1)[0]), began + within)
-        if batch is None:
-            break
-        sums, squares, count = sums + batch.sum(axis=0), squares + (batch**2).sum(axis=0), count + len(batch)
-        mean = sums / count
-        variance = np.maximum(squares / count - mean**2, 0.0) / max(1, count - 1)
-        half = scipy.special.stdtrit(max(1, count - 1), 0.5 + LEVEL / 2.0) * np.sqrt(variance)
-        share = precision * mean[0] / half[0] if half[0] else 1.0
-        tell("samples", count, max(count, math.ceil(count / min(1.0, share) ** 2)))
+    batches = (make(number, lambda: False) for number in numbers_from())
+    if workers or scheduler:
+        from msg_analysis.sweeps.workers import in_order
+
+        batches = in_order(make, workers, scheduler)
+    with closing(batches):
+        for batch in batches:
+            if batch is None:
+                break
+            sums, squares, count = sums + batch.sum(axis=0), squares + (batch**2).sum(axis=0), count + len(batch)
+            mean = sums / count
+            variance = np.maximum(squares / count - mean**2, 0.0) / max(1, count - 1)
+            half = scipy.special.stdtrit(max(1, count - 1), 0.5 + LEVEL / 2.0) * np.sqrt(variance)
+            share = precision * mean[0] / half[0] if half[0] else 1.0
+            tell("samples", count, max(count, math.ceil(count / min(1.0, share) ** 2)))
+            if count >= FEWEST and (half <= precision * mean)[: None if agents else 1].all():
+                break
     if count < 2:
         wanted = "expected time for two samples at least, each of which ends when the agents have forgotten its start"
         raise InputError(f"within: {within:g} s: {wanted}: raise it")
@@ -200,122 +202,18 @@ def sampled_prediction(
     )
 
 
-class _Law:
-    """The step of a run, sparse. An arc is a pair of agents of which the first hears the second in some graph."""
-
-    targets: IntArray  # (l,)
-    sources: IntArray  # (l,)
-    weights: FloatArray  # (l, n) W_ij
-    rows: FloatArray  # (m, 1) or (m, n) sums of the rows of W
-
-    def __init__(self, experiment: Experiment) -> None:
-        links = experiment.links
-        m, dt, noise = experiment.agents, experiment.step_length, experiment.noise
-        if links is None and experiment.schedule:
-            raise NotAvailableError("switching: the sequence of the graphs is given: expected a Markov chain for this")
-        if links is not None and (experiment.time == "discrete" or experiment.protocol):
-            key = "noise.activation" if noise.leaves_out_steps else "switching.links"
-            raise NotAvailableError(f"{key}: expected the built-in law in continuous time: no sampling here")
-        if experiment.protocol and (lines := experiment.protocol.unavailable("predict")):
-            raise NotAvailableError(lines[0])
-        self.agents, self.consensus, self.links = m, experiment.problem == "consensus", links
-        self.leaves_out_steps = noise.leaves_out_steps  # then "links" are agents
-        self.holds, self.delay, self.burst = noise.holds, noise.delay, noise.burst
-        self.broadcast, self.link = noise.broadcast, noise.link
-        if experiment.protocol or experiment.time == "discrete":
-            self._dense(experiment)
-        else:
-            self._sparse(experiment, (links.mesh,) if links else experiment.graph_list)
-        if links:  # arcs in the order of the links
-            order = np.argsort(links.link_of, kind="stable")
-            self.targets, self.sources, self.weights = self.targets[order], self.sources[order], self.weights[order]
-            self.link_of, self.rates = links.link_of[order], np.stack([links.rise, links.fall])
-            self.first = np.searchsorted(self.link_of, np.arange(len(links.rise) + 1))
-        loss = experiment.loss[self.targets, self.sources]
-        self.lossy = np.flatnonzero(loss)  # arcs on which messages can be lost
-        ends = np.stack([self.targets, self.sources])[:, self.lossy]
-        pairs = np.sort(ends, axis=0) if noise.whole_link else ends
-        _, first, which = np.unique(pairs, axis=1, return_index=True, return_inverse=True)
-        self.drawn = first[which.reshape(-1)]  # (lossy,) the one with whose messages those of each arc are lost
-        # (3, lossy, 1) with which probability, after one that was not lost, and after one that was
-        p, burst = loss[self.lossy, None], noise.burst
-        self.losses = np.stack(
-            [p, p, p] if burst is None else [p, p / (burst * (1.0 - p)), 0.0 * p + 1.0 - 1.0 / burst]
-        )
-        # The chain of the graphs backwards in time: probability to leave each one, and where to, as sums.
-        chain = np.ones((1, 1)) if links else experiment.chain.transition(dt)
-        self.stationary = np.ones(1) if links else experiment.switching_law.stationary
-        jumps = chain.T * self.stationary / self.stationary[:, None]
-        np.fill_diagonal(jumps, 0.0)
-        self.leave = jumps.sum(axis=1)
-        self.jumps = np.cumsum(jumps, axis=1) / np.maximum(self.leave, NEVER)[:, None]
-        arcs = np.arange(len(self.targets))
-        own, into = (
-            sparse.csr_array((np.ones(len(arcs)), (ends, arcs)), (m, len(arcs)))
-            for ends in (self.targets, self.sources)
-        )
-        self.flow = sparse.csr_array(into - own)  # (m, l) what is used of a message goes from who used it to its sender
-        turn = turns(experiment)
-        self.plain = not (self.delay or self.holds or self.broadcast or self.link or turn is not None)
-        self.products: list[Any] = []  # W^T of every graph (m, m), where nothing else is random
-        if self.plain and not len(self.lossy) and not links and len(chain) <= FEW_GRAPHS:
-            for mode, weights in enumerate(self.weights.T):
-                same = sparse.diags_array(self.rows[:, mode % self.rows.shape[1]])
-                self.products.append(sparse.csr_array(same + self.flow @ sparse.diags_array(weights) @ own.T))
-        if self.plain:
-            return
-        # In real time agents step one after the other: backwards, the last one first.
-        self.ahead, groups = np.zeros(len(arcs), dtype=np.int64), [np.arange(m)]
-        if turn is not None:
-            ranks = np.argsort(turn)
-            self.ahead = (ranks[self.sources] < ranks[self.targets]).astype(np.int64)
-            groups = [np.array([i]) for i in turn[::-1].tolist()]
-        self.groups = []
-        for agents in groups:
-            heard, said = (np.flatnonzero(np.isin(ends, agents)) for ends in (self.targets, self.sources))
-            place = np.searchsorted(agents, self.targets[heard])
-            self.groups.append((agents, heard, said, place, own[agents][:, heard], into[agents][:, said]))
-
-    def _dense(self, experiment: Experiment) -> None:
-        """Of a protocol, or exp(-Z)."""
-        matrices = step_matrices(experiment)
-        arcs = (matrices.weights != 0.0).any(axis=0) & ~np.eye(self.agents, dtype=np.bool_)
-        self.targets, self.sources = np.nonzero(arcs)
-        self.weights = np.ascontiguousarray(matrices.weights[:, self.targets, self.sources].T)
-        self.rows = matrices.weights.sum(axis=2).T
-        self._feel([gain.T for gain in matrices.noise_gain])
-
-    def _sparse(self, experiment: Experiment, graphs: Sequence[Graph]) -> None:
-        """Of the built-in law, with these graphs."""
-        m, dt, gains = self.agents, experiment.step_length, experiment.leader_gains
-        keys, place = np.unique(np.concatenate([g.targets * m + g.sources for g in graphs]), return_inverse=True)
-        self.targets, self.sources = np.divmod(keys, m)
-        grounded = np.isinf(gains)
-        self.weights = np.zeros((len(keys), len(graphs)))
-        mode = np.repeat(np.arange(len(graphs)), [len(graph.weights) for graph in graphs])
-        self.weights[place, mode] = dt * np.concatenate([graph.weights for graph in graphs])
-        self.weights[grounded[self.targets]] = 0.0
-        self.rows = np.where(grounded, 0.0, 1.0 - dt * np.where(grounded, 0.0, gains))[:, None]
-        process, free = experiment.noise.process, np.where(grounded, 0.0, math.sqrt(dt))
-        given = list(experiment.noise_gain[: len(graphs)]) if isinstance(process, dict) else [process]
-        forms = [np.asarray(gain, dtype=float) for gain in given]
-        self._feel([(f * free[:, None]).T if f.ndim == 2 else sparse.diags_array(f * free) for f in forms])
-
-    def _feel(self, gains: Sequence[Any]) -> None:
-        """Take B^T (m, m) of every graph, or of all of them."""
-        self.gains = [sparse.csr_array(gain) for gain in gains]
-        self.squares: FloatArray | None = None  # (m, 1) or (m, n) of B, where it is diagonal
-        if all(gain.count_nonzero() == np.count_nonzero(gain.diagonal()) for gain in self.gains):
-            self.squares = np.stack([gain.diagonal() ** 2 for gain in self.gains], axis=1)
-        on_air = (self.broadcast**2 + self.link**2) * (self.weights**2).sum() / self.weights.shape[1]
-        process = np.mean([(gain.data**2).sum() for gain in self.gains])
-        self.noise = float(process + on_air) / self.agents  # of an agent in a step, in the mean
-
-
 def _batch(
-    law: _Law, units: Sequence[int], every: bool, rounds: int, rng: np.random.Generator, deadline: float
+    law: Law,
+    units: Sequence[int],
+    every: bool,
+    rounds: int,
+    seed: int,
+    until: float,  # of the clock that all hosts have
+    batch: int,
+    stopping: Callable[[], bool],
 ) -> FloatArray | None:
     """(rounds, 1 + units) independent samples of the system error and of those of agents; None: not done in time."""
+    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(batch,)))
     m, width = law.agents, len(units) + (not every)
     z: FloatArray = np.zeros((m, rounds, width))
     z[units, :, np.arange(width - len(units), width)] = 1.0
@@ -323,14 +221,15 @@ def _batch(
         z[:, :, 0] = 2.0 * rng.integers(0, 2, (m, rounds)) - 1.0
     if law.consensus:
         z -= z.mean(axis=0)
-    walk, first = _Walk(law, z.reshape(m, -1), rng), np.einsum("irw,irw->rw", z, z).ravel()
+    walk, first = Walk(law, z.reshape(m, -1), rng), np.einsum("irw,irw->rw", z, z).ravel()
     total, counts, number = np.zeros(rounds * width), np.ones(rounds * width), np.arange(rounds * width)
     with np.errstate(over="ignore", invalid="ignore"):
         while number.size:
             steps = max(BLOCK + 2 * law.delay, walk.steps // 4)
-            terms, size = walk.block(steps, deadline)
-            if time.monotonic() > deadline:
+            found = walk.block(steps, lambda: time.time() > until or stopping())
+            if found is None:
                 return None
+            terms, size = found
             if not (size <= GROWTH * m * first[number]).all():
                 raise InputError(
                     "second moments: a walk backwards through the steps has grown a million times: the steps are "
@@ -346,137 +245,3 @@ def _batch(
             walk.keep(lives)
     table = total.reshape(rounds, width)
     return np.concatenate([table.sum(axis=1, keepdims=True), table], axis=1) if every else table
-
-
-class _Walk:
-    """Vectors (m, C), each of which goes backwards through the steps of a path of its own."""
-
-    def __init__(self, law: _Law, z: FloatArray, rng: np.random.Generator) -> None:
-        self.law, self.steps, self._rng, self._z = law, 0, rng, z
-        count = z.shape[1]
-        self._modes: IntArray = np.asarray(rng.choice(len(law.stationary), count, p=law.stationary))
-        self._until = self._held(law.leave[self._modes])
-        self._up = self._flip = np.empty((0, count), dtype=np.int64)
-        self._shared = not law.links and (bool(law.products) or law.weights.shape[1] == 1)
-        self._weights = law.weights if self._shared else law.weights[:, self._modes]
-        if law.links:  # each link starts in its stationary law
-            up = rng.random((law.rates.shape[1], count)) * law.rates.sum(axis=0)[:, None] < law.rates[0, :, None]
-            self._up = up.astype(np.int64)
-            self._flip = self._held(law.rates[self._up, np.arange(len(up))[:, None]])
-            self._weights = law.weights * up[law.link_of]
-        self._lost = np.zeros((len(law.targets) if len(law.lossy) else 0, count), dtype=np.bool_)
-        if len(law.lossy):
-            self._lost[law.lossy] = (rng.random((len(law.lossy), count)) < law.losses[0])[law.drawn]
-        # What was used of the messages of d + 2 steps, and what passes on to an earlier message.
-        self._used = np.zeros((law.delay + 2, 0 if law.plain else len(law.targets), count))
-        self._passed = np.zeros((len(law.targets) if law.holds else 0, count))
-
-    def _held(self, leave: FloatArray) -> IntArray:
-        """After how many steps something happens that has these probabilities in a step."""
-        held = self._rng.geometric(np.maximum(leave, NEVER))
-        return np.minimum(held, LONGEST).astype(np.int64) + self.steps
-
-    def _switch(self) -> None:
-        """The graphs one step earlier: a stationary chain of two states is the same backwards."""
-        law = self.law
-        if (ends := np.flatnonzero(self._until == self.steps)).size:
-            jumps = law.jumps[self._modes[ends]]
-            self._modes[ends] = new = (self._rng.random((len(ends), 1)) > jumps).sum(axis=1)
-            self._until[ends] = self._held(law.leave[new])
-            if not self._shared:
-                self._weights[:, ends] = law.weights[:, new]
-        if (ends := np.flatnonzero(self._flip == self.steps)).size:
-            link, column = np.divmod(ends, self._flip.shape[1])
-            self._up[link, column] ^= 1
-            up = self._up[link, column]
-            self._flip[link, column] = self._held(law.rates[up, link])
-            arc, last = law.first[link], law.first[link + 1]
-            while (more := arc < last).any():
-                self._weights[arc[more], column[more]] = law.weights[arc[more], 0] * up[more]
-                arc = arc + 1
-
-    def _back(self) -> FloatArray:
-        """Go back by a step: (C,) the terms of its noise."""
-        law = self.law
-        if self.steps:
-            self._switch()
-        self.steps += 1
-        if len(law.lossy):
-            chance = (
-                law.losses[1] if law.burst is None else np.where(self._lost[law.lossy], law.losses[2], law.losses[1])
-            )
-            self._lost[law.lossy] = (self._rng.random((len(law.lossy), self._z.shape[1])) < chance)[law.drawn]
-        if not law.plain:
-            return self._messages()
-        terms = self._noise(self._z * self._up if law.leaves_out_steps else self._z)
-        for mode, product in enumerate(law.products):
-            there = self._modes == mode
-            if there.all():
-                self._z = product @ self._z
-                break
-            if there.any():
-                self._z[:, there] = product @ self._z[:, there]
-        if not law.products:
-            flow = self._weights * self._z[law.targets]
-            if len(law.lossy):
-                flow *= ~self._lost
-            self._z = self._rows() * self._z + law.flow @ flow
-        return terms
-
-    def _messages(self) -> FloatArray:
-        """The same with messages that are noisy, late or held, or agents that step one after the other."""
-        law, depth, terms = self.law, len(self._used), np.zeros(self._z.shape[1])
-        noisy, rows = np.empty_like(self._z), self._rows()
-        for agents, heard, said, place, own, into in law.groups:
-            # The message of the state after this step, which later steps have used.
-            message = self._used[(1 - self.steps) % depth, said]
-            if law.holds:
-                message += self._passed[said]
-                self._passed[said] = message * self._lost[said]
-                message *= ~self._lost[said]
-            published = into @ message
-            terms += law.link**2 * (message**2).sum(axis=0) + law.broadcast**2 * (published**2).sum(axis=0)
-            noisy[agents] = z = self._z[agents] + published
-            flow = self._weights[heard] * z[place]
-            if len(law.lossy) and not law.holds:
-                flow *= ~self._lost[heard]
-            self._z[agents] = rows[agents] * z - own @ flow
-            self._used[(law.ahead[heard] - self.steps - law.delay) % depth, heard] = flow
-        return terms + self._noise(noisy * self._up if law.leaves_out_steps else noisy)
-
-    def _rows(self) -> FloatArray:
-        """(m, 1) or (m, C) sums of the rows of W; 1 of an agent that leaves out the step, unless it is held."""
-        rows = self._of_graphs(self.law.rows)
-        return np.where((self._up == 0) & (rows != 0.0), 1.0, rows) if self.law.leaves_out_steps else rows
-
-    def _of_graphs(self, table: FloatArray) -> FloatArray:
-        """The columns of the present graphs, of a table (m, n); of one (m, 1), the only one."""
-        return table if table.shape[1] == 1 else table[:, self._modes]
-
-    def _noise(self, z: FloatArray) -> FloatArray:
-        """(C,) |B^T z|^2."""
-        if self.law.squares is not None:
-            return np.asarray(np.einsum("ic,ic->c", z * self._of_graphs(self.law.squares), z))
-        terms = np.zeros(z.shape[1])
-        for mode, gain in enumerate(self.law.gains):
-            there = self._modes == mode if len(self.law.gains) > 1 else slice(None)
-            terms[there] = ((gain @ z[:, there]) ** 2).sum(axis=0)
-        return terms
-
-    def block(self, steps: int, deadline: float) -> tuple[FloatArray, FloatArray]:
-        """(C,) terms of the sum over these steps, and |z|^2 after them, of what messages carry, too."""
-        terms = np.zeros(self._z.shape[1])
-        for _ in range(steps):
-            terms += self._back()
-            if time.monotonic() > deadline:
-                break
-        return terms, (self._z**2).sum(axis=0) + (self._used**2).sum(axis=(0, 1)) + (self._passed**2).sum(axis=0)
-
-    def keep(self, lives: BoolArray) -> None:
-        """Only these vectors go on."""
-        if lives.all():
-            return
-        for name in ("_z", "_modes", "_until", "_up", "_flip", "_lost", "_used", "_passed"):
-            setattr(self, name, getattr(self, name)[..., lives])
-        if not self._shared:
-            self._weights = self._weights[:, lives]

@@ -14,9 +14,10 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment, ExperimentError
+from msg_analysis.experiment.limits import prediction_method
 from msg_analysis.experiment.links import ActiveAgents, with_logged
 from msg_analysis.model.run import Run
-from msg_analysis.theory.sampling import prediction_method, sampled_prediction
+from msg_analysis.theory.sampling import sampled_prediction
 from msg_analysis.twin.simulate import simulate
 
 GOLDEN = {0.05: 1.053297, 0.2: 1.268261, 0.4: 1.861361}

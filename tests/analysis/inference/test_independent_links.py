@@ -13,9 +13,9 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.errors import NotAvailableError
 from msg_analysis.experiment.experiment import Experiment, ExperimentError
+from msg_analysis.experiment.limits import prediction_method
 from msg_analysis.experiment.links import with_logged
 from msg_analysis.model.run import Run
-from msg_analysis.theory.sampling import prediction_method
 from msg_analysis.twin.simulate import simulate
 
 TEN = [[1, 2], [2, 3], [3, 4], [4, 5], [5, 6], [1, 3], [2, 4], [1, 6], [2, 5], [3, 6]]

@@ -14,6 +14,7 @@ from msg_analysis.inference.online_errors import LiveEstimate, LiveReport, Runni
 from msg_analysis.inference.online_steps import WINDOW, Lateness, RecentSteps, StepCollector
 from msg_analysis.inference.time_means import time_means
 from msg_analysis.model.step_model import phases
+from msg_analysis.theory.sampling import sampled_prediction
 
 
 def four(agents: int = 4, **changes: Any) -> Run:
@@ -126,6 +127,19 @@ def test_who_comes_late_expects_what_is_left(start: str) -> None:
         all_errors = errors_from_zero(trajectory.record.experiment, 300)
         wanted = np.mean([all_errors[k] for k in steps])
     assert report.system.predicted == pytest.approx(wanted, rel=1e-9)
+
+
+def test_a_sampled_error_is_shown_with_its_interval() -> None:
+    """With bursts on ten links: that of every agent, too, and why there is no test."""
+    report = report_of(simulate(line_ring(5, noise={"loss": 0.2, "burst": 5}, run={"dt": 0.1, "duration": 30})))
+    sampled = sampled_prediction(line_ring(5, noise={"loss": 0.2, "burst": 5}, run={"dt": 0.1}), precision=0.02)
+    low, high = sampled.interval
+    assert report.system.predicted == sampled.system_error
+    assert [node.predicted for node in report.nodes] == sampled.node_errors.tolist()
+    assert (report.system.standard_error, report.system.z) == (None, None)
+    wanted = f"predicted: of the steady state, sampled, {low:.6g} to {high:.6g} (95 %), without a test: noise.burst: 5"
+    assert report.note is not None
+    assert report.note.startswith(wanted)
 
 
 @pytest.mark.parametrize("steps", [slice(100, 101), slice(100, None)], ids=["one step", "from a step on"])

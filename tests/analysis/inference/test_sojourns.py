@@ -9,7 +9,8 @@ from scipy import stats
 
 from experiments import compare, line_ring
 from msg_analysis.experiment.experiment import Experiment, ExperimentError
-from msg_analysis.theory.sampling import prediction_method, sampled_prediction
+from msg_analysis.experiment.limits import prediction_method
+from msg_analysis.theory.sampling import sampled_prediction
 from msg_analysis.twin.simulate import simulate
 
 SHAPES = {"line": {"shape": 4}, "ring": {"shape": 2}}

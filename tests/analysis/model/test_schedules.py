@@ -157,6 +157,13 @@ def test_more_links_or_agents_than_there_is_room_for(tmp_path: Path, monkeypatch
     recorded(tmp_path, CONTACTS, rows, hold=1)
     with pytest.raises(ExperimentError, match="12 links in 3 graphs: expected at most 10 in all graphs together"):
         recorded(tmp_path, CONTACTS, [*rows, (4, *RING[0]), (4, *RING[1]), (4, *RING[2])], hold=1)
+    crowd = [(0, f"r{k}", 0.0, 0.0) for k in range(6)]
+    with pytest.raises(ExperimentError, match="15 links in 1 graph: expected at most 10 in all graphs together"):
+        recorded(tmp_path, "time,agent,x,y", crowd, radius=1)
+    monkeypatch.setattr(traces, "MOST_ROWS", 16)
+    with pytest.raises(ExperimentError, match=r": 19 lines: expected at most 16: split it, or give intervals"):
+        recorded(tmp_path, CONTACTS, rows, hold=1)
+    monkeypatch.setattr(traces, "MOST_ROWS", 20)
     monkeypatch.setattr(traces, "MOST_AGENTS", 4)
     with pytest.raises(ExperimentError, match="more than 4 agents: expected fewer"):
         recorded(tmp_path, CONTACTS, rows, hold=1)

@@ -5,6 +5,7 @@ import dataclasses
 import os
 import signal
 import sys
+import time
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,8 @@ from msg_analysis.sweeps.results import (
     rows_of,
     write_tables,
 )
-from msg_analysis.sweeps.workers import LocalWorkers, Lost, WorkersLostError, run_jobs
+from msg_analysis.sweeps.workers import LocalWorkers, Lost, WorkersLostError, in_order, run_jobs
+from msg_analysis.theory.sampling import sampled_prediction
 
 
 def document(rate: float = 1.0, **run: Any) -> dict[str, Any]:
@@ -209,6 +211,28 @@ def test_workers_that_do_not_start(monkeypatch: pytest.MonkeyPatch) -> None:
         list(pool.outcomes(cubes, list(range(30))))
 
 
+def first_last(item: int, _: Any) -> int:
+    time.sleep(0.0 if item else 0.3)
+    return item**3
+
+
+def killed_by_the_third(item: int, _: Any) -> int:
+    if item == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item
+
+
+def test_results_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without end, whichever comes first, over the end of a sequence of batches too."""
+    monkeypatch.setattr(conducting, "MANY", 5)
+    with closing(in_order(first_last, 2, None)) as results:
+        assert [next(results) for _ in range(12)] == [k**3 for k in range(12)]
+    with closing(in_order(killed_by_the_third, 2, None)) as results:
+        assert [next(results), next(results)] == [0, 1]
+        with pytest.raises(InputError, match="batch 2: killed every worker that tried it"):
+            next(results)
+
+
 def test_a_scheduler_that_does_not_answer() -> None:
     with pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: no answer: expected the address"):
         ClusterWorkers("tcp://127.0.0.1:9", patience=0.2).__enter__()
@@ -219,6 +243,24 @@ def numbers(cell: str) -> str | float:
         return float(cell)
     except ValueError:
         return cell
+
+
+def test_sampled_predictions_are_drawn_with_their_intervals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    in_this_process(monkeypatch)
+    lossy = document() | {"noise": {"loss": 0.2, "burst": 5}}
+    file = {"experiment": lossy, "kind": "predict", "over": {"noise.process": [1.0, 2.0]}}
+    (tmp_path / "try.yaml").write_text(yaml.safe_dump(file, sort_keys=False))
+    sweep = load_sweep(tmp_path / "try.yaml")
+    with ResultStore.open(tmp_path) as store:
+        outcomes = run_jobs([point.job for point in sweep.points], store).outcomes
+    rows = rows_of(sweep, outcomes, evaluate_sweep(outcomes, 0.01))
+    wanted = sampled_prediction(experiments.Experiment.parse(lossy))
+    names = ("system_error", "system_error.low", "system_error.high")
+    assert [rows[0][f"emulated.{name}"] for name in names] == [wanted.system_error, *wanted.interval]
+    shown = picture(sweep, rows)
+    place = shown.series[0].places[0]
+    assert (shown.measured, shown.intervals) == (False, True)
+    assert (place.value, place.low, place.high) == pytest.approx((wanted.system_error, *wanted.interval))
 
 
 def test_columns_and_what_is_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -118,6 +118,26 @@ def test_the_same_for_the_same_seed_whatever_the_time():
     assert sampled_prediction(five(), precision=0.05, seed=5).system_error != first.system_error
 
 
+@pytest.mark.parametrize("name", ["held", "bursts"])
+def test_the_same_whatever_the_workers(name):
+    """To the last bit: the batches up to the first one that suffices, in the order of their numbers."""
+    here, one, two = (
+        sampled_prediction(LAWS[name], precision=0.01, seed=4, workers=workers) for workers in (None, 1, 2)
+    )
+    assert here.paths > 1000
+    for other in (one, two):
+        assert (other.interval, other.paths) == (here.interval, here.paths)
+        assert other.node_intervals.tobytes() == here.node_intervals.tobytes()
+
+
+def test_workers_say_what_is_wrong():
+    with pytest.raises(InputError, match=r"within: 0.01 s: expected time for two samples"):
+        sampled_prediction(five(), within=0.01, workers=1)
+    late = line_ring(agents=4, **TRACKING, graphs={"all": {"complete": True}}, switching={}, noise={"delay": 1})
+    with pytest.raises(InputError, match="steps are unstable"):
+        sampled_prediction(late.with_run(dt=0.4), workers=1)
+
+
 def test_walks_made_one_at_a_time(monkeypatch: pytest.MonkeyPatch):
     """As in large networks; fixed seed, |z| < 4 fails once in 16,000. Losses: arcs, not the matrices of the graphs."""
     monkeypatch.setattr(sampling, "MOST_TOGETHER", 1)
