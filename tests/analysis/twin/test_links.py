@@ -134,11 +134,12 @@ def test_agents_alone_equal_the_whole(law: str, air: str, resumed: int) -> None:
             assert agent.heard == (() if set(used) <= {newest} else expected)
 
 
-@pytest.mark.parametrize("air", AIRS)
-@pytest.mark.parametrize("law", ["consensus", "integral_action"])
+@pytest.mark.parametrize(
+    ("law", "air"), [("consensus", air) for air in AIRS] + [("integral_action", air) for air in ("plain", "own", "all")]
+)
 @pytest.mark.parametrize("pace", PACES)
 def test_bags_keep_all_of_it(pace: str, law: str, air: str, tmp_path: Path) -> None:
-    """Written, read and checked."""
+    """Written, read and checked; with states of one number, and of two."""
     made = twin(law, air, pace)
     read = stored(made, tmp_path)
     outcome = check(read)
