@@ -33,7 +33,7 @@ WORDS = {  # what each of the others is given
     ("msg-analysis", "diff"): ["BAG", "BAG"],
     ("msg-analysis", "runs"): ["FOLDER"],
     ("msg-analysis", "leaders"): ["EXPERIMENT", "--count", "1"],
-    ("msg-analysis", "figures"): ["1", "--out", NEW, "--format", "svg"],
+    ("msg-analysis", "figures"): ["2", "--out", NEW, "--format", "svg"],
     ("msg-analysis", "info"): ["EXPERIMENT"],
     ("msg-analysis", "salvage"): ["BAG", NEW],
     ("msg-analysis", "export"): ["BAG", "--csv", "--parquet", "--npz", "--out", NEW],

@@ -157,17 +157,14 @@ def test_gallery(script: Path, workplace: Path, capsys: pytest.CaptureFixture[st
     matplotlib.pyplot.close("all")
 
 
-PICTURES = {"python": {"run.png", "comparison.png", "rates.png"}}
-
-
-@pytest.mark.parametrize("name", ["quickstart", "leaders", "messages", "commands", "python", "flaky_tests"])
+@pytest.mark.parametrize("name", ["quickstart", "leaders", "messages", "commands", "flaky_tests"])
 def test_python_runs(name: str, workplace: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With a short bag of the name that the page gives to it, one to salvage, and tables of it."""
+    # Those of python.md are run by tests/integration/test_docs.py.
     printed("msg-analysis simulate line_ring.yaml --duration 10 --out line_ring_twin")
     shutil.copytree("line_ring_twin", "torn_bag")
     printed("msg-analysis export line_ring_twin --parquet --out line_ring_export")
     for block in blocks(ROOT / f"docs/{name}.md", "python"):
-        if "import run_network" not in block:  # tests/integration/test_python.py runs that
-            exec(compile(block, name, "exec"), {})
+        exec(compile(block, name, "exec"), {})
     assert ("agrees" in capsys.readouterr().out) == (name not in {"leaders", "commands", "flaky_tests"})
-    assert {file.name for file in workplace.glob("*.png")} == PICTURES.get(name, set())
+    assert not list(workplace.glob("*.png"))

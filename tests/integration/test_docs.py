@@ -103,13 +103,6 @@ def test_python_blocks(name: str, network, domain: int) -> None:
     assert [file for file in made if (place / file).stat().st_size < 1000] == []
 
 
-@pytest.mark.parametrize("name", ["discrete", "tracking"])
-def test_example(name: str, network) -> None:
-    (shown,) = [shown for shown in console(DOCS / "examples.md") if shown.command == f"msg-agents run {name}"]
-    printed = ended(started(f"{shown.command} --write-report never", network.directory))
-    assert missing(shown.lines, printed) == []
-
-
 SHORT = ("--duration", "2", "--processes", "1", "--no-analyse", "--json", "--out")
 
 

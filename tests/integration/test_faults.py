@@ -27,6 +27,7 @@ from msg_analysis.twin.check import check
 
 # 20,000 steps: no test waits for them; of states that are soon seen in the bag
 LONG = {"duration": 1000, "replicas": 16, "processes": 2}
+MIDDLE = 100  # steps of all agents, of which the recorder has some
 NAMES = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 THIRTY = [*range(1, 31)]
 LARGE = {
@@ -38,7 +39,7 @@ LARGE = {
 @pytest.mark.parametrize("kind", ["agent", "switcher"])
 def test_killed_child_that_may_not_come_back(network: Any, kind: str, rng: random.Random) -> None:
     run = network.record(network.file(run=LONG), "--restarts", "0")
-    network.wait_until_moving()
+    network.wait_for_steps(MIDDLE)
     kill_and_see(network, run, rng.choice(network.processes(kind)))
 
 
@@ -82,7 +83,7 @@ def kill_and_see(network: Any, run: subprocess.Popen[str], victim: Any, *, early
 def test_in_the_middle(network: Any, repetition: int, rng: random.Random) -> None:
     number = signal.SIGTERM if repetition % 2 else signal.SIGINT
     run = network.start("run", network.file(run=LONG), "--out", network.directory / "runs", "--json")
-    network.wait_until_moving()
+    network.wait_for_steps(MIDDLE)
     time.sleep(rng.uniform(0.0, 1.0) if repetition else 0.0)
     assert network.shared_memory() == set()
     run.send_signal(number)
@@ -149,7 +150,7 @@ def test_agents_that_are_interrupted_say_nothing(network: Any) -> None:
     """A signal shuts rclpy down between two calls of a callback, and what is then published is no error of ours."""
     fast = LONG | {"pace": "realtime", "speed": 60.0}
     run = network.record(network.file(run=fast), "--restarts", "0")
-    network.wait_until_moving()
+    network.wait_for_steps(MIDDLE)
     agents = network.processes("agent")
     for process in agents:
         os.kill(process.pid, signal.SIGINT)
@@ -161,7 +162,7 @@ def test_agents_that_are_interrupted_say_nothing(network: Any) -> None:
 
 def test_a_killed_runner_takes_everybody_along(network: Any) -> None:
     run = network.record(network.file(run=LONG))
-    network.wait_until_moving()
+    network.wait_for_steps(MIDDLE)
     assert {process.kind for process in network.nodes()} == {"agent", "switcher", "recorder"}
     run.kill()
     run.communicate(timeout=60)

@@ -29,7 +29,6 @@ CASES: dict[str, dict[str, Any]] = {
             "process": {"line": [1, 2, 0, 0.5, 1], "ring": [[0.1 * (1 + i + j) for j in range(5)] for i in range(5)]}
         }
     },
-    "grounded": {"problem": "tracking", "leaders": {**LEADERS, "gain": "inf"}},
     "discrete": {
         "time": "discrete",
         "switching": {"transition": [[0.9, 0.1], [0.4, 0.6]]},
@@ -46,12 +45,13 @@ CASES: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize(
     ("case", "processes"),
-    [("tracking", 2), ("noise by graph", "one_per_agent"), ("grounded", 1), ("disconnected", "one_per_agent")],
+    [("tracking", 2), ("noise by graph", "one_per_agent"), ("disconnected", "one_per_agent")],
 )
 def test_equals_the_twin(network: Any, case: str, processes: Any) -> None:
     """Every law, and every number of processes: what one agent computes does not depend on the other."""
     # Discrete time: on another processor, below. Consensus with equal noise: below, with one and two processes, and in
-    # test_discovery with one per agent.
+    # test_discovery with one per agent. Leaders held at the reference: below, with one and two processes, and in
+    # test_links.
     changes = CASES[case]
     what = network.experiment(**{**changes, "run": {**changes.get("run", {}), "processes": processes}})
     result = network.run(what)

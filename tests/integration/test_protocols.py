@@ -60,11 +60,11 @@ def test_examples(network: Any, name: str, processes: int | str) -> None:
     The verdict of a linear one is a test at level 0.01; the seeds of the examples are among the 99 %.
     """
     what = Experiment.load(EXPERIMENTS / f"{name}.yaml")
-    result = network.run(what.with_run(duration=600 * what.step_length, processes=processes))
+    result = network.run(what.with_run(duration=300 * what.step_length, processes=processes))
     trajectory = result.trajectory
     twin = simulate(trajectory.record.experiment)
     assert trajectory.completeness == twin.completeness
-    assert trajectory.completeness.expected == 5 * 601 * (2 if name == "integral_action" else 1)
+    assert trajectory.completeness.expected == 5 * 301 * (2 if name == "integral_action" else 1)
     assert np.array_equal(trajectory.states, twin.states)
     assert (trajectory.published is None) == (name != "integral_action")
     assert check(trajectory).difference is None

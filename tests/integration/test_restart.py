@@ -108,7 +108,7 @@ def test_budget(network: Any) -> None:
     """One kill more than allowed: a clear end that names who and how often."""
     file = network.file(run={"duration": 10_000, "processes": 2})
     run = network.record(file, "--restarts", "1")
-    network.wait_until_moving()
+    network.wait_for_steps()
     first = network.processes("agent")
     first[0].kill()
     network.wait_for(lambda: {p.pid for p in network.processes("agent")} - {p.pid for p in first}, 30, "the next one")

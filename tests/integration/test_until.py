@@ -174,10 +174,10 @@ def test_observer_fails(network: Any, monkeypatch: pytest.MonkeyPatch, error: Ex
         raise error
 
     monkeypatch.setattr(online_errors.LiveEstimate, "report", fail)
-    four_seconds = {"pace": "realtime", "duration": 40, "speed": 10.0}  # the errors are looked at once a second
+    four_seconds = {"pace": "realtime", "duration": 20, "speed": 5.0}  # the errors are looked at once a second
     result = network.run(network.experiment(run=four_seconds | {"processes": 2}), until=Until(0.5))
     assert_equal_to_twin(result.trajectory)
-    assert len(result.trajectory.modes) == 800
+    assert len(result.trajectory.modes) == 400
     assert not result.until["ended_early"]
     assert result.until["reason"].startswith(
         f"not known: the errors cannot be followed any more ({type(error).__name__}"

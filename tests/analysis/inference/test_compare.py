@@ -41,8 +41,8 @@ def short_run():
 @pytest.mark.parametrize(
     ("name", "run"),
     [
-        ("line_ring", {"duration": 60}),
-        ("tracking", {"duration": 60}),
+        ("line_ring", {"duration": 40}),
+        ("tracking", {"duration": 40}),
         ("discrete", {"duration": 400}),
         ("line_ring", {"duration": 30, "start": "zero"}),
         ("line_ring", {"duration": 20, "start": [3.0, 0.0, 0.0, 1.0, -2.0]}),

@@ -123,7 +123,7 @@ def test_how_errors_are_known() -> None:
 @pytest.mark.parametrize("messages", MESSAGES)
 def test_correct_runs(messages: str) -> None:
     """At level 0.01, more than 2 of 12 with probability 0.0002, as more than 4 errors outside intervals of 95 %."""
-    law = linked(**MESSAGES[messages])
+    law = linked(9 if messages == "plain" else 6, **MESSAGES[messages])
     found = [compare(simulate(law.with_run(seed=seed))) for seed in range(12)]
     assert sum(one.verdict != "agrees" for one in found) <= 2
     assert all("links" in [test.name for test in one.tests] for one in found)
@@ -133,8 +133,8 @@ def test_correct_runs(messages: str) -> None:
 
 def test_a_wrong_rate_and_a_link_that_is_not_there(tmp_path: Path) -> None:
     """Both are read from the log of a bag: its graphs are not those that the record would draw."""
-    law = linked(run={"duration": 1500, "replicas": 1})
-    slow = linked(up={"default": 0.5, "edges": [[3, 4, 0.25]]}, run={"duration": 1500, "replicas": 1})
+    law = linked(5, run={"duration": 1500, "replicas": 1})
+    slow = linked(5, up={"default": 0.5, "edges": [[3, 4, 0.25]]}, run={"duration": 1500, "replicas": 1})
     write_trajectory(logged(simulate(slow), law), tmp_path / "slow")
     run = read_bag(tmp_path / "slow")
     assert run.completeness.complete

@@ -74,7 +74,7 @@ def test_exact_prediction_and_a_sampled_one(changes: dict[str, Any]) -> None:
 
 def test_correct_runs() -> None:
     """At level 0.01, more than 2 of 12 with probability 0.0002, as more than 4 errors outside intervals of 95 %."""
-    found = [compare(simulate(held(run={"seed": seed, "duration": 300, "replicas": 1}))) for seed in range(12)]
+    found = [compare(simulate(held(run={"seed": seed, "duration": 200, "replicas": 1}))) for seed in range(12)]
     assert sum(one.verdict != "agrees" for one in found) <= 2
     assert all("sojourns" in [test.name for test in one.tests] for one in found)
     errors = [one.system_error for one in found]
@@ -82,8 +82,8 @@ def test_correct_runs() -> None:
 
 
 def test_another_shape_is_named() -> None:
-    run = simulate(held({"line": {"shape": 1}}, run={"duration": 1500, "replicas": 1}))
-    law = held(run={"duration": 1500, "replicas": 1})
+    run = simulate(held({"line": {"shape": 1}}, run={"duration": 800, "replicas": 1}))
+    law = held(run={"duration": 800, "replicas": 1})
     found = compare(dataclasses.replace(run, record=dataclasses.replace(run.record, experiment=law)))
     assert (found.verdict, found.causes[0].kind) == ("disagrees", "sojourn")
     assert "was left" in found.causes[0].words
