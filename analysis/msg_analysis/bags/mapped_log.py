@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from msg_analysis.bags.files import bag_files, stored_file
-from msg_analysis.bags.log_map import GraphSource, LogMap, Source
+from msg_analysis.bags.log_map import EVERY, GraphSource, LogMap, Source
 from msg_analysis.bags.message_fields import FieldError, FieldReader, leaves
 from msg_analysis.common.arrays import AnyArray, FloatArray, IntArray
 from msg_analysis.common.resources import require_pyarrow, tell
@@ -258,6 +258,28 @@ def read_log(path: Path, mapped: LogMap, law: Experiment, directory: Path | None
         sampled_law=mapped.law,
         notes=notes,
     )
+
+
+def positions(bag: Path, mapped: LogMap) -> tuple[float, list[tuple[float, str, list[float]]]]:
+    """The first time [s], and of each sample its time after it, the agent and the place, in the order of time.
+
+    InputError: the map does not fit the bag, or has not two or three coordinates.
+    """
+    names, several = [str(key) for key in mapped.agents], list(mapped.agents.values())
+    if EVERY in mapped.agents:
+        raise InputError(f"agents.{EVERY}: how many are there? expected agents by number or name: list them")
+    if len(several[0].all_fields) not in (2, 3):
+        raise InputError("agents: expected `fields`, two or three coordinates of every agent")
+    contents = read_contents(bag, mapped, several)
+    cleaned = [_cleaned(series, k, mapped.period, []) for k, series in enumerate(contents.agents, start=1)]
+    first = min(int(times[0]) for times, _ in cleaned)
+    unit, scale = SECOND * mapped.units.time, mapped.units.state
+    rows = [
+        ((time - first) / unit, name, place)
+        for name, (times, values) in zip(names, cleaned, strict=True)
+        for time, place in zip(times.tolist(), (values / scale).tolist(), strict=True)
+    ]
+    return first / SECOND, sorted(rows, key=lambda row: row[0])
 
 
 def _cleaned(series: Series, number: int, period: float | None, notes: list[str]) -> tuple[IntArray, FloatArray]:

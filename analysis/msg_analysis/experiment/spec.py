@@ -192,8 +192,14 @@ class SwitchingSpec(Section):
     trace: str | None = Field(
         None,
         min_length=1,
-        description="a CSV file of contacts, intervals, positions or times of graphs",
+        description="a CSV file of contacts, intervals, positions or times of graphs; or a bag with positions",
         examples=["c.csv"],
+    )
+    map: str | None = Field(
+        None,
+        min_length=1,
+        description="of a trace that is a bag: file that says where in it the positions are",
+        examples=["map.yaml"],
     )
     hold: Positive | None = Field(None, description="how long a contact, position or last graph is valid", examples=[1])
     radius: Positive | None = Field(None, description="distance up to which agents are linked", examples=[2.5])

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from msg_analysis.common.text import counted, listed
+from msg_analysis.errors import InputError
 from msg_analysis.experiment.graph_files import ForeignGraph, GraphError, file_content, node_name
 from msg_analysis.experiment.problems import show
 from msg_analysis.experiment.spec import SwitchingSpec
@@ -46,6 +47,9 @@ Link = tuple[int, int, float]
 _Interval = tuple[float, float, Link]
 _Row = tuple[str, Sequence[float], Sequence[str]]
 """Where it stands, its time, or start and end, after the first one, and its other cells in the order of the columns."""
+
+Rows = tuple[str, float, Iterator[_Row]]
+"""The kind of trace, its first time, and its rows in the order of time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +84,13 @@ class Trace:
 
 
 def read_trace(
-    key: str, file: Path, *, hold: float | None = None, radius: float | None = None, directed: bool = True
+    key: str,
+    file: Path,
+    *,
+    hold: float | None = None,
+    radius: float | None = None,
+    directed: bool = True,
+    given: Rows | None = None,
 ) -> Trace:
     """The trace in a CSV file. GraphError: its mistake.
 
@@ -94,8 +104,10 @@ def read_trace(
         distance up to which agents with positions are linked
     directed
         whether only the target of a contact or interval hears the other
+    given
+        what is in it, if it is no CSV file
     """
-    kind, first, rows = _rows(key, file)
+    kind, first, rows = given or _rows(key, file)
     if kind == "contacts" and hold is None:
         raise GraphError("switching.hold", "missing", "expected with contacts", "add how long one is valid")
     if kind == "intervals" and hold is not None:
@@ -125,7 +137,11 @@ def resolved(
     """
     key, directed = "switching.trace", not switching.undirected
     file = directory / (switching.trace or "")
-    trace = read_trace(key, file, hold=switching.hold, radius=switching.radius, directed=directed)
+    if switching.map is None and (file.suffix in (".mcap", ".db3") or (file / "metadata.yaml").exists()):
+        wanted = "expected with a bag: the file that says where its positions are"
+        raise GraphError("switching.map", "missing", wanted, "add it: `msg-analysis map` makes one")
+    bag = _bag_rows(file, directory / switching.map) if switching.map else None
+    trace = read_trace(key, file, hold=switching.hold, radius=switching.radius, directed=directed, given=bag)
     if switching.schedule is not None or bool(graphs) == bool(trace.graphs):
         wanted = "none with a trace of links" if trace.graphs else "the graphs that the trace names"
         raise GraphError("graphs", listed(list(graphs)) or "missing", f"expected {wanted}", "correct one of the two")
@@ -139,7 +155,7 @@ def resolved(
         for name, links in zip(names, trace.graphs, strict=True):
             arcs = [(nodes[a], nodes[b], weight * each) for a, b, each in links]
             found[name] = ForeignGraph(() if found else nodes, arcs, trace.directed)  # all nodes are known by the first
-    changes = dict.fromkeys(("trace", "hold", "radius", "undirected", "weight")) | {
+    changes = dict.fromkeys(("trace", "map", "hold", "radius", "undirected", "weight")) | {
         "schedule": [(start, names[graph]) for start, graph in zip(trace.starts, trace.which, strict=True)],
         "end": None if math.isinf(trace.end) else trace.end,
     }
@@ -154,7 +170,19 @@ def _unit_of(first: float) -> str | None:
     return next((unit for unit, size in sizes.items() if 1.0 <= first / size < 4.0), None)
 
 
-def _rows(key: str, file: Path) -> tuple[str, float, Iterator[_Row]]:
+def _bag_rows(bag: Path, mapped: Path) -> Rows:
+    """The positions in a bag, by a map. GraphError: there are none, or the map does not fit."""
+    from msg_analysis.bags.log_map import load_map  # here, since bags are read by another chapter
+    from msg_analysis.bags.mapped_log import positions
+
+    try:
+        first, found = positions(bag, load_map(mapped))
+    except InputError as error:
+        raise GraphError("switching.map", str(error), "expected a map that fits the bag", "correct it") from error
+    return "positions", first, ((str(bag), [time], (agent, *map(repr, place))) for time, agent, place in found)
+
+
+def _rows(key: str, file: Path) -> Rows:
     """The kind of trace, its first time, and its rows in the order of time."""
     try:
         content = file_content(key, file)

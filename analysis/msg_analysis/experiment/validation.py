@@ -29,7 +29,7 @@ LONGEST_DURATION = 2**31 - 1
 """A message's stamp has 32 bits for the seconds of simulated time."""
 
 
-SCHEDULE_KEYS = ("end", "repeat", "hold", "radius", "undirected", "weight")
+SCHEDULE_KEYS = ("end", "repeat", "map", "hold", "radius", "undirected", "weight")
 """Of ``switching``, that belong to a schedule or a trace."""
 
 
@@ -53,7 +53,7 @@ def switching_of(
         if chain and switching.sojourn:
             lines += _shape_problems(switching.sojourn, chain, names)
         return (None if lines else chain), lines + found
-    found = _alone(switching, "a schedule", "links", "hold", "radius", "undirected", "weight")
+    found = _alone(switching, "a schedule", "links", "map", "hold", "radius", "undirected", "weight")
     before = -1.0
     for place, (start, name) in enumerate(switching.schedule, start=1):
         key = f"switching.schedule[{place}]"

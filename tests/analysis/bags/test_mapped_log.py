@@ -18,6 +18,8 @@ from msg_analysis.bags.log_map import json_schema, load_map, parse_map
 from msg_analysis.bags.mapped_log import read_log
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.errors import BagError, InputError
+from msg_analysis.experiment.examples import FOLDER as EXAMPLES
+from msg_analysis.experiment.experiment import Experiment, ExperimentError
 
 START = 1_760_000_000_000_000_000  # ns
 LAW = line_ring(3)
@@ -372,3 +374,38 @@ def test_the_schema_of_the_map_fits_its_examples() -> None:
     examples = {key: each["examples"][0] for key, each in properties.items()}
     assert parse_map(yaml.safe_load(yaml.safe_dump(examples)), "examples").law == "continuous"
     assert all(each["description"] for each in properties.values())
+
+
+def test_positions_of_a_bag_are_a_recorded_topology(tmp_path: Path, typestore: Any) -> None:
+    """The example's CSV file as messages with stamps since 1970: the same graphs at the same times."""
+    example = Experiment.load("recorded_robots")
+    document = yaml.safe_load((EXAMPLES / "recorded_robots.yaml").read_text())
+    types, kind = typestore.types, "geometry_msgs/msg/PointStamped"
+    with (EXAMPLES / "recorded_robots.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    names = list(dict.fromkeys(row["agent"] for row in rows))
+    with Writer(tmp_path / "robots", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = {name: writer.add_connection(f"/{name}/place", kind, typestore=typestore) for name in names}
+        for row in rows:
+            time = START + round(10**9 * float(row["time"]))
+            stamp = types["builtin_interfaces/msg/Time"](time // 10**9, time % 10**9)
+            point = types["geometry_msgs/msg/Point"](float(row["x"]), float(row["y"]), 0.0)
+            message = types[kind](types["std_msgs/msg/Header"](stamp, "map"), point)
+            writer.write(topics[row["agent"]], time, typestore.serialize_cdr(message, kind))
+    places = {name: {"topic": f"/{name}/place", "fields": ["point.x", "point.y"]} for name in names}
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump({"agents": places}))
+    document["switching"] |= {"trace": "robots", "map": "map.yaml"}
+    found = Experiment.parse(document, directory=tmp_path)
+    assert found == example
+    for changes, message in (
+        ({"map": None}, "switching.map: missing: expected with a bag"),
+        ({"trace": "none"}, "none: not found: expected the directory of a bag"),
+        ({"radius": None}, "switching.radius: missing"),
+    ):
+        wrong = {key: value for key, value in (document["switching"] | changes).items() if value is not None}
+        with pytest.raises(ExperimentError) as error:
+            Experiment.parse(document | {"switching": wrong}, directory=tmp_path)
+        assert message in str(error.value), str(error.value)
+    (tmp_path / "map.yaml").write_text('agents: {"*": {topic: "/r{i}/place", fields: [point.x, point.y]}}')
+    with pytest.raises(ExperimentError, match=r"switching\.map: .*list them"):
+        Experiment.parse(document, directory=tmp_path)
