@@ -91,8 +91,12 @@ def prediction_method(experiment: Experiment) -> tuple[Literal["exact", "sampled
     if not (lines := why_sampled(experiment)):
         return "exact", None
     given = experiment.schedule and not isinstance(experiment.schedule, DrawnSchedule)
-    apart = experiment.links and (experiment.time == "discrete" or experiment.protocol)  # no steps of single links
-    return "measured" if given or apart else "sampled", lines[0]
+    return "measured" if given or (dense_links(experiment) and experiment.noise.on_messages) else "sampled", lines[0]
+
+
+def dense_links(experiment: Experiment) -> bool:
+    """Whether there are no sparse steps of single links, or of agents that leave out steps."""
+    return experiment.links is not None and (experiment.time == "discrete" or experiment.protocol is not None)
 
 
 def why_sampled(experiment: Experiment) -> list[str]:

@@ -29,9 +29,11 @@ import scipy.special
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.resources import tell
 from msg_analysis.common.text import agent_text, finite, markdown_table, number_text
-from msg_analysis.errors import InputError
+from msg_analysis.errors import InputError, NotAvailableError
+from msg_analysis.experiment.limits import dense_links
 from msg_analysis.experiment.links import expanded
-from msg_analysis.model.step_model import step_law
+from msg_analysis.experiment.markov_chain import Schedule
+from msg_analysis.model.step_model import build_run_model, step_law
 from msg_analysis.theory.sparse_walks import Law, Walk
 
 if TYPE_CHECKING:
@@ -45,7 +47,12 @@ LEAST_TOGETHER, MOST_TOGETHER = 4, 512
 BLOCK = 16  # steps of a walk before it may end, and twice the delay; later a quarter of those that it has made
 SMALL = 0.03  # of the sum so far, terms of a block: then the walk may end
 NOTHING = 1e-30  # of |z|^2, is rounding
+SHORTEST, SETTLED = 128, 1e-12  # steps that are drawn at first; of |z|^2, with matrices, is the end
 GROWTH = 1e6  # of |z|^2, beyond what weights that are not negative can do: the steps are unstable
+UNSTABLE = (
+    "second moments: a walk backwards through the steps has grown a million times: the steps are unstable, there is no "
+    "steady state: lower run.dt"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -160,12 +167,20 @@ def sampled_prediction(
             wanted = "expected a number above 0" + ", below 1" * (most < math.inf)
             raise InputError(f"{key}: {value:g}: {wanted}: for example 0.01")
     seed = experiment.run.seed if seed is None else seed
-    law, m = Law(experiment if experiment.links else expanded(experiment)), experiment.agents
+    dense, m = dense_links(experiment), experiment.agents
     every = not agents and m <= ALL_AGENTS
     units = list(range(m)) if every else experiment.indices(agents)
     width = len(units) + (not every)
-    rounds = max(1, min(MOST_TOGETHER, max(LEAST_TOGETHER, NUMBERS // max(1, len(law.targets)))) // width)
-    make = partial(_batch, law, units, every, rounds, seed, time.time() + within)
+    make: Callable[[int, Callable[[], bool]], FloatArray | None]
+    if dense:
+        if experiment.noise.on_messages:
+            wanted = "expected the built-in law in continuous time, or messages as they are: no sampling here"
+            raise NotAvailableError(f"switching.links, noise.activation: {wanted}")
+        make, width = partial(_of_path, experiment, units, seed, time.time() + within), 1
+    else:
+        law = Law(experiment if experiment.links else expanded(experiment))
+        rounds = max(1, min(MOST_TOGETHER, max(LEAST_TOGETHER, NUMBERS // max(1, len(law.targets)))) // width)
+        make = partial(_batch, law, units, every, rounds, seed, time.time() + within)
     count, sums, squares = 0, np.zeros(1 + len(units)), np.zeros(1 + len(units))
     mean = half = sums
     batches = (make(number, lambda: False) for number in numbers_from())
@@ -202,6 +217,30 @@ def sampled_prediction(
     )
 
 
+def _of_path(
+    experiment: Experiment, units: Sequence[int], seed: int, until: float, batch: int, stopping: Callable[[], bool]
+) -> FloatArray | None:
+    """(1, 1 + units): the same given one path, by matrices of its graphs, from all agents at once."""
+    # The chains of the links are reversible: a path has the same law backwards.
+    of_path = int(np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(batch,))).integers(2**53))
+    m, done, steps = experiment.agents, 0, SHORTEST
+    z: FloatArray = np.eye(m) - (1.0 / m if experiment.problem == "consensus" else 0.0)
+    total, first = np.zeros(m), float((z**2).sum())
+    while (size := float((z**2).sum())) > SETTLED * first:
+        if not size <= GROWTH * m * first:
+            raise InputError(UNSTABLE)
+        if time.time() > until or stopping():
+            return None
+        drawn = experiment.with_run(seed=of_path, duration=steps * experiment.step_length)  # a longer one begins alike
+        model, path = build_run_model(drawn), drawn.switching_law
+        assert isinstance(path, Schedule)
+        for graph in path.sampled(steps, drawn.step_length)[done:].tolist():
+            total += ((model.noise_gain[graph].T @ z) ** 2).sum(axis=0)
+            z = model.nominal[graph].T @ z
+        done, steps = steps, 2 * steps
+    return np.concatenate([[total.sum()], total[list(units)]])[None]
+
+
 def _batch(
     law: Law,
     units: Sequence[int],
@@ -231,10 +270,7 @@ def _batch(
                 return None
             terms, size = found
             if not (size <= GROWTH * m * first[number]).all():
-                raise InputError(
-                    "second moments: a walk backwards through the steps has grown a million times: the steps are "
-                    "unstable, there is no steady state: lower run.dt"
-                )
+                raise InputError(UNSTABLE)
             total[number] += counts * terms
             # Where this graph has no noise, or not where z is, terms that are zero are not the last ones.
             ahead = counts * np.maximum(terms, law.noise * size * steps)

@@ -37,9 +37,6 @@ class Law:
         m, dt, noise = experiment.agents, experiment.step_length, experiment.noise
         if links is None and experiment.schedule:
             raise NotAvailableError("switching: the sequence of the graphs is given: expected a Markov chain for this")
-        if links is not None and (experiment.time == "discrete" or experiment.protocol):
-            key = "noise.activation" if noise.leaves_out_steps else "switching.links"
-            raise NotAvailableError(f"{key}: expected the built-in law in continuous time: no sampling here")
         if experiment.protocol and (lines := experiment.protocol.unavailable("predict")):
             raise NotAvailableError(lines[0])
         self.agents, self.consensus, self.links = m, experiment.problem == "consensus", links

@@ -108,6 +108,19 @@ def test_many_agents_are_sampled() -> None:
         law.predict()
 
 
+@pytest.mark.parametrize("leader", [False, True])
+def test_sampled_by_matrices(leader: bool) -> None:
+    """In discrete time, where there are no sparse steps: a 99.9 % interval of the sampled errors."""
+    tracking = {"problem": "tracking", "leaders": {"agents": [2], "gain": "inf"}} if leader else {}
+    law = lazy(0.6, 1.0, agents=3, graphs=DIRECTED, time="discrete", **tracking)
+    exact, found = law.predict().emulated, sampled_prediction(law, precision=0.04)
+    for error, sampled, (low, high) in (
+        (exact.system_error, found.system_error, found.interval),
+        *zip(exact.node_errors, found.node_errors, found.node_intervals, strict=True),
+    ):
+        assert abs(sampled - error) <= 3.3 / 1.96 * (high - low) / 2.0 + 1e-6
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_correct_runs(kind: str) -> None:
     """At level 0.01, more than 2 of 12 with probability 0.0002, as more than 4 errors outside intervals of 95 %."""

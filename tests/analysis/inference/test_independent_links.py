@@ -16,6 +16,7 @@ from msg_analysis.experiment.experiment import Experiment, ExperimentError
 from msg_analysis.experiment.limits import prediction_method
 from msg_analysis.experiment.links import with_logged
 from msg_analysis.model.run import Run
+from msg_analysis.theory.sampling import sampled_prediction
 from msg_analysis.twin.simulate import simulate
 
 TEN = [[1, 2], [2, 3], [3, 4], [4, 5], [5, 6], [1, 3], [2, 4], [1, 6], [2, 5], [3, 6]]
@@ -114,10 +115,14 @@ def test_exact_predictions() -> None:
 
 
 def test_how_errors_are_known() -> None:
-    """What is sampled is the built-in law in continuous time; else many links are measured in runs."""
+    """Many links are sampled; with noise on the air only in the built-in law in continuous time."""
     assert [prediction_method(linked(links))[0] for links in (9, 10)] == ["exact", "sampled"]
     for changes in ({"time": "discrete", "run": {"dt": 1.0}}, {"protocol": {"name": "metropolis", "laziness": 0.3}}):
-        assert prediction_method(linked(10, **changes))[0] == "measured"
+        assert prediction_method(linked(10, **changes))[0] == "sampled"
+        lossy = linked(10, **changes, noise={"loss": 0.2})
+        assert prediction_method(lossy)[0] == "measured"
+        with pytest.raises(NotAvailableError, match="messages as they are: no sampling here"):
+            sampled_prediction(lossy)
 
 
 @pytest.mark.parametrize("messages", MESSAGES)
