@@ -21,7 +21,7 @@ from msg_analysis.experiment.experiment import Experiment
 
 ROOT = Path(__file__).parents[2]
 LINE_RING = ROOT / "tests/data/golden/line_ring.yaml"
-NETWORK = {"run", "demo", "doctor", "play", "live", "markers", "agent", "switcher", "recorder"}
+NETWORK = {"run", "demo", "doctor", "play", "live", "markers", "agent", "external", "switcher", "recorder"}
 OVERVIEWS = [(program, option) for program in ("msg-analysis", "msg-agents") for option in ("--help", "--version")]
 NEW = "NEW"  # a name that is not there yet
 SWEEP = ["sweep.yaml", "--workers", "1", "--out", "swept"]  # its results are kept for the next time
@@ -38,6 +38,7 @@ WORDS = {  # what each of the others is given
     ("msg-analysis", "salvage"): ["BAG", NEW],
     ("msg-analysis", "export"): ["BAG", "--csv", "--parquet", "--npz", "--out", NEW],
     ("msg-analysis", "compare"): ["BAG", "--verbose"],
+    ("msg-analysis", "map"): ["TABLE", "--map", "MAP", "--check"],
     ("msg-analysis", "tabulate"): ["RESULT"],
     ("msg-analysis", "transient"): ["EXPERIMENT", "--times", "0,1"],
     ("msg-analysis", "facts"): ["EXPERIMENT"],
@@ -64,6 +65,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "result.json").write_text(json.dumps(made.compare().to_json()))
     (folder / "run.json").write_text(made.record.to_json())
     (folder / "hosts.yaml").write_text("hosts: {a: {address: 10.0.0.1, agents: [1, 2, 3, 4, 5]}}\nrecorder: a\n")
+    (folder / "robots.csv").write_text("time,1,2,graph\n0,1,2,a\n1,2,1,a\n2,1,1,b\n")
+    (folder / "map.yaml").write_text('agents: {1: {field: "1"}, 2: {field: "2"}}')
     (folder / "sweep.yaml").write_text(f"experiment: {LINE_RING}\nkind: predict\nover: {{run.dt: [0.05, 0.1]}}\n")
     return folder
 
@@ -71,7 +74,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def outcomes(folder: Path, *jobs: tuple[tuple[str, str], str]) -> Iterator[tuple[tuple[str, str], str, int, str, str]]:
     """Command, kind, exit code, stdout, stderr; a kind is "plain", "json", or what stdout is (many_commands)."""
     places = {"EXPERIMENT": LINE_RING, "BAG": "bag", "RESULT": "result.json", "RECORD": "run.json"}
-    places |= {"HOSTS": "hosts.yaml", "FOLDER": "."}
+    places |= {"TABLE": "robots.csv", "MAP": "map.yaml", "HOSTS": "hosts.yaml", "FOLDER": "."}
     lines = []
     for (program, name), kind in jobs:
         words = [str(places.get(word, word)) for word in WORDS.get((program, name), [])]

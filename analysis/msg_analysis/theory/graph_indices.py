@@ -107,7 +107,7 @@ def error_bounds(prediction: Prediction) -> Bounds:
     if experiment.protocol:
         return Bounds.none("they belong to the built-in law, not to a protocol")
     if experiment.time == "continuous" and prediction.continuous_moments is None:
-        return Bounds.none("they belong to the law without noise on the air, loss or delay")
+        return Bounds.none("they belong to the law without noise on the air, loss, delay or activation")
     system = systems.continuous(experiment) if experiment.time == "continuous" else prediction.system
     if not all(graph.symmetric for graph in experiment.graph_list):
         return Bounds.none("a graph is directed")

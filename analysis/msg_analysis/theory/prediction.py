@@ -145,7 +145,7 @@ class Prediction:
         exact moments of the run's steps ("discrete" in the document of a discrete-time experiment); in real time if no
         agent is late
     continuous_moments
-        ``continuous``; None in discrete time, with a protocol, or with noise on the air, loss or delay
+        ``continuous``; None in discrete time, with a protocol, or with noise on the air, loss, delay or activation
     paper
         the system of the paper: in continuous time where there is ``continuous``, else the steps; None with noise on
         the air, loss or delay, or with a schedule

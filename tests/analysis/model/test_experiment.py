@@ -155,7 +155,7 @@ def test_everything_runs_and_what_is_too_large_has_no_prediction() -> None:
     large.require_available()
     (line,) = unavailable(large, "predict")
     assert line.startswith("noise.burst: 5.0: has no exact prediction: 2^20 states of 20 links")
-    assert unpredictable(large) == line
+    assert f"{unpredictable(large)}; `predict` samples the steady errors" == line
     with pytest.raises(NotAvailableError, match=r"noise\.burst: 5"):
         large.require_available("predict")
 

@@ -83,8 +83,16 @@ def test_start_factor_is_the_symmetric_root_of_the_conditional_covariance():
 @pytest.mark.parametrize(
     ("changes", "law", "reason"),
     [
-        ({"noise": {"process": 1, "loss": 0.1}}, "continuous", "with noise on the air, loss or delay: use emulated"),
-        ({"noise": {"process": 1, "delay": 1}}, "static", "with noise on the air, loss or delay: use emulated"),
+        (
+            {"noise": {"process": 1, "loss": 0.1}},
+            "continuous",
+            "with noise on the air, loss, delay or activation: use emulated",
+        ),
+        (
+            {"noise": {"process": 1, "delay": 1}},
+            "static",
+            "with noise on the air, loss, delay or activation: use emulated",
+        ),
         (DISCRETE, "continuous", "in discrete time: use emulated"),
         ({"graphs": {"a": {"edges": [[1, 2]]}, "b": {"edges": [[2, 3]]}}}, "static", "keep the agents together"),
     ],
