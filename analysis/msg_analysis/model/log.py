@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.common.text import markdown_table, number_text
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 
@@ -63,6 +64,17 @@ class Log:
             f"<Log of {self.law.agents} agents: {len(self.times)} samples in {self.times[-1] - self.times[0]:g} units "
             f"of time, {len(self.starts) - 1} switches; law {self.law.name!r}>"
         )
+
+    def _repr_markdown_(self) -> str:
+        rows = [
+            ("agents", str(self.law.agents)),
+            ("coordinates", str(self.states.shape[2])),
+            ("samples", str(len(self.times))),
+            ("span", number_text(float(self.times[-1] - self.times[0]))),
+            ("switches", str(len(self.starts) - 1)),
+            ("values missing", str(int(np.isnan(self.states).any(axis=2).sum()))),
+        ]
+        return f"**Log**, law {self.law.name}, {self.sampled_law}\n\n" + markdown_table(("", ""), rows)
 
     @classmethod
     def from_arrays(
