@@ -167,9 +167,9 @@ class Log:
         agents = [agent_column(columns, law, number) for number in range(1, law.agents + 1)]
         if "time" not in columns:
             raise InputError(f"columns {', '.join(columns)}: expected one called time")
-        times = _floats("time", columns["time"])
+        times = _floats("column time", columns["time"])
         order = np.argsort(times, kind="stable")
-        states = np.column_stack([_floats(name, columns[name]) for name in agents])[order]
+        states = np.column_stack([_floats(f"column {name}", columns[name]) for name in agents])[order]
         if "graph" in columns and "graph" not in options:
             names = np.asarray(columns["graph"]).astype(str)[order]
             changes = np.flatnonzero(np.concatenate([[True], names[1:] != names[:-1]]))
