@@ -11,7 +11,7 @@ import pytest
 
 import msg_analysis
 from experiments import GOLDEN, golden
-from msg_analysis import BagError, Experiment, ExperimentError, InputError, Run, compare, read_bag, write_report
+from msg_analysis import BagError, Experiment, ExperimentError, InputError, Log, Run, compare, read_bag, write_report
 
 NUMBERS = json.loads((GOLDEN / "line_ring.predict.json").read_text())
 LINE_RING = golden("line_ring", duration=50, seed=3)
@@ -125,7 +125,11 @@ def test_compare_refuses(runs: list[str], options: dict[str, float], words: str)
 def test_everything_says_what_it_is(twin: Run) -> None:
     """In a line; and in a notebook as a table, whose rows have equally many cells: every class that is exported."""
     prediction, comparison = LINE_RING.predict(), twin.compare()
+    graphs = twin.times[:-1], [LINE_RING.graph_list[mode].name for mode in twin.modes]
+    log = Log.from_arrays(twin.times, twin.values, law=LINE_RING, graph=graphs, sampled_law="steps")
     results = [
+        (log, ["5 agents", "1001 samples", "line_ring"]),
+        (log.compare(), ["line_ring", "agrees", "predicted"]),
         (LINE_RING, ["line_ring", "consensus of 5 agents", "1000 steps"]),
         (twin, ["line_ring", "x(0..1000)", "seed 3", "complete"]),
         (twin.completeness, []),

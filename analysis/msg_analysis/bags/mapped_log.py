@@ -182,6 +182,8 @@ def read_table(path: Path) -> dict[str, AnyArray]:
         return {name: np.array([row[place].strip() for row in cells]) for place, name in enumerate(names)}
     except InputError:
         raise
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file: expected a table with a row for each time") from None
     except Exception as error:  # the readers raise many kinds of errors on damage
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(f"{path}: cannot be read as {path.suffix[1:].upper()} ({reason})") from None

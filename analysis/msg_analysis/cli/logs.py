@@ -73,7 +73,11 @@ def compare_mapped(
     experiment = load_experiment(law)
     with WorkProgress() as progress, watched(progress):
         if mapped is None:
-            found = Log.from_columns(read_table(log), law=experiment)
+            columns = read_table(log)
+            try:
+                found = Log.from_columns(columns, law=experiment)
+            except InputError as error:
+                raise InputError(f"{log}: {error}") from error
         else:
             found = read_log(log, load_map(mapped), experiment, mapped.parent)
         comparison = found.compare(level=level)

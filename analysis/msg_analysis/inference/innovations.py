@@ -25,7 +25,7 @@ from msg_analysis.errors import InputError
 from msg_analysis.inference.intervals import TINY, IntervalLaw, block_size
 from msg_analysis.inference.regression import Term
 
-DIFFUSE = 1e6  # standard deviation of an agent that was not measured yet, in units of the spread of the log
+DIFFUSE = 3e3  # standard deviation of an agent that was not measured yet, in units of the largest deviation in the log
 MOST_EACH = 8  # agents, up to which each has a parameter of its measurement noise
 WORK = 6e10  # floating-point operations for the derivatives by the variances; samples beyond have none
 MOST_STEPS, CONVERGED = 40, 1e-5  # of Fisher's scoring: their number, and the relative change that ends it
@@ -47,7 +47,7 @@ class Innovations:
 
     white: FloatArray  # (N, m, R) normalised innovations, independent N(0, 1); NaN: not measured, or the first value
     marginal: FloatArray  # (N, m, R) innovations over their own standard deviation: of one agent independent over time
-    filtered: FloatArray  # (N, m, R) E[x(k) | y(0), ..., y(k)], deviations from the reference
+    filtered: FloatArray  # (N, m, R) E[x(k) | y(0), ..., y(k)], deviations as ``Filter.values``
     uncertainty: FloatArray  # (N, m) diagonal of their covariance, less its mean over agents in consensus
     terms: list[Term]  # the first K parameters
     variances: list[Variance]  # the others
@@ -73,7 +73,9 @@ class Filter:
         graphs: IntArray,
     ) -> None:
         self.law, self.times = law, times
-        self.values = states - law.reference  # (N, m, R)
+        # (N, m, R) deviations; a consensus has no place, and a large common number would cost digits.
+        consensus = law.experiment.problem == "consensus"
+        self.values = states - (float(np.nanmedian(states)) if consensus else law.reference)
         self.present: BoolArray = np.asarray(~np.isnan(self.values).any(axis=2))
         self.stretches = law.stretches(times, starts, graphs)
         self.spread = float(np.nanmax(np.abs(self.values), initial=0.0)) or 1.0

@@ -14,7 +14,7 @@ import numpy as np
 
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.common.resources import blas_threads
-from msg_analysis.common.text import HALF_WIDTH_95, counted, number_text
+from msg_analysis.common.text import HALF_WIDTH_95, counted, markdown_table, number_text, with_names
 from msg_analysis.errors import ExitCode, InputError
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.estimates import Estimate
@@ -117,6 +117,11 @@ class LogComparison:
         numbers = "" if error is None else f"; system error {number_text(error.measured)}, predicted "
         numbers += "" if error is None else number_text(error.predicted)
         return f"<LogComparison with {self.log.law.name!r}: {self.verdict}{numbers}>"
+
+    def _repr_markdown_(self) -> str:
+        rows = [(test.name, number_text(test.p, 3), number_text(test.p_adjusted, 3)) for test in self.tests]
+        causes = "".join(f"- {with_names(cause.words, self.log.law.names)}\n" for cause in self.causes)
+        return f"**{self.verdict}**\n\n{causes}\n" + markdown_table(("test", "p", "adjusted"), rows)
 
     def to_json(self) -> dict[str, Any]:
         """The document of ``--json``."""

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from msg_analysis.common.arrays import FloatArray, IntArray
+from msg_analysis.common.text import markdown_table, number_text
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.experiment import Experiment
 
@@ -63,6 +64,17 @@ class Log:
             f"<Log of {self.law.agents} agents: {len(self.times)} samples in {self.times[-1] - self.times[0]:g} units "
             f"of time, {len(self.starts) - 1} switches; law {self.law.name!r}>"
         )
+
+    def _repr_markdown_(self) -> str:
+        rows = [
+            ("agents", str(self.law.agents)),
+            ("coordinates", str(self.states.shape[2])),
+            ("samples", str(len(self.times))),
+            ("span", number_text(float(self.times[-1] - self.times[0]))),
+            ("switches", str(len(self.starts) - 1)),
+            ("values missing", str(int(np.isnan(self.states).any(axis=2).sum()))),
+        ]
+        return f"**Log**, law {self.law.name}, {self.sampled_law}\n\n" + markdown_table(("", ""), rows)
 
     @classmethod
     def from_arrays(
@@ -155,9 +167,9 @@ class Log:
         agents = [agent_column(columns, law, number) for number in range(1, law.agents + 1)]
         if "time" not in columns:
             raise InputError(f"columns {', '.join(columns)}: expected one called time")
-        times = _floats("time", columns["time"])
+        times = _floats("column time", columns["time"])
         order = np.argsort(times, kind="stable")
-        states = np.column_stack([_floats(name, columns[name]) for name in agents])[order]
+        states = np.column_stack([_floats(f"column {name}", columns[name]) for name in agents])[order]
         if "graph" in columns and "graph" not in options:
             names = np.asarray(columns["graph"]).astype(str)[order]
             changes = np.flatnonzero(np.concatenate([[True], names[1:] != names[:-1]]))

@@ -76,10 +76,13 @@ def test_a_table_needs_no_map(robots: Path, tmp_path: Path) -> None:
         (["compare", "good", "--law", "law.yaml", "--map", "map.yaml", "--report", "a.html"], "--report: expected"),
         (["map", "good", "--json"], "--json: expected with --check"),
         (["map", "absent"], "absent: not found"),
+        (["compare", "absent.csv", "--law", "law.yaml"], "absent.csv: no such file"),
+        (["compare", "words.csv", "--law", "law.yaml"], "words.csv: column 3: expected numbers"),
     ],
 )
 def test_mistakes(words: list[str], message: str, robots: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(robots)
+    Path("words.csv").write_text("time,1,2,3,4,5,graph\n0,1,2,3,4,5,line\n1,1,2,x,4,5,line\n")
     result = call(*words)
     assert result.exit_code == 2
     assert message in " ".join(result.stderr.split())

@@ -184,6 +184,8 @@ def test_a_late_agent_and_one_coordinate_more() -> None:
     late = of(states)
     assert np.isnan(late.white[:51, 1]).all()
     assert np.abs(late.white[51:, 1]).max() < 5
+    far = of(states + 4e6)
+    np.testing.assert_allclose(far.white, late.white, atol=1e-5)
 
 
 def test_measurement_noise_is_estimated() -> None:
