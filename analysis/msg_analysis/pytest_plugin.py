@@ -16,6 +16,7 @@ import pytest
 if TYPE_CHECKING:
     from msg_analysis.inference.acceptance import Acceptance
     from msg_analysis.inference.comparison import Comparison
+    from msg_analysis.inference.log_verdict import LogComparison
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -27,7 +28,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 @pytest.fixture
-def assert_agrees(request: pytest.FixtureRequest) -> Callable[..., Comparison]:
+def assert_agrees(request: pytest.FixtureRequest) -> Callable[..., Comparison | LogComparison]:
     """``msg_analysis.testing.assert_agrees``; with ``--msg-report DIR``, a page DIR/TEST.html is written before."""
     from msg_analysis.testing import assert_agrees as check
 

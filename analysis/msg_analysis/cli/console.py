@@ -114,6 +114,8 @@ def _exit_codes() -> Iterator[None]:
     except (Exit, click.Abort):
         raise
     except Exception as error:
+        if isinstance(error.__cause__, KeyboardInterrupt):  # Python 3.11, while a class is being made
+            raise Exit(INTERRUPTED) from error
         raise _fault(error) from error
 
 

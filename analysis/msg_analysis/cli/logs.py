@@ -55,7 +55,14 @@ def map_(log: Path, *, mapped: Path | None, check: bool, as_json: bool) -> None:
 
 
 def compare_mapped(
-    logs: tuple[Path, ...], law: Path | None, mapped: Path | None, level: float, *, verbose: bool, as_json: bool
+    logs: tuple[Path, ...],
+    law: Path | None,
+    mapped: Path | None,
+    level: float,
+    report: Path | None,
+    *,
+    verbose: bool,
+    as_json: bool,
 ) -> int:
     """Compare a log of others, and print the result; the exit code."""
     from msg_analysis.bags.log_map import load_map
@@ -81,6 +88,10 @@ def compare_mapped(
         else:
             found = read_log(log, load_map(mapped), experiment, mapped.parent)
         comparison = found.compare(level=level)
+        if report:
+            from msg_analysis.report.log_page import write_log_report
+
+            write_log_report(comparison, report)
     document = comparison.to_json()
     if as_json:
         print_json(document)

@@ -204,15 +204,12 @@ def compare(
     """
     from msg_analysis.cli.console import WorkProgress
     from msg_analysis.common.files import require_place
-    from msg_analysis.errors import InputError
     from msg_analysis.inference.pool import compare as compare_runs
     from msg_analysis.runs import keep_result
 
     require_place(report)
     if law or mapped or any(bag.suffix.lower() in (".csv", ".parquet", ".npz") for bag in bags):
-        if report:
-            raise InputError("--report: expected without --law: the report of a log of others is its --json")
-        context.exit(compare_mapped(bags, law, mapped, level, verbose=verbose, as_json=as_json))
+        context.exit(compare_mapped(bags, law, mapped, level, report, verbose=verbose, as_json=as_json))
     with WorkProgress() as progress, watched(progress):
         comparison = compare_runs(*bags, level=level, max_missed=max_missed)
         if report:

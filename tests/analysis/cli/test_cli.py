@@ -211,13 +211,19 @@ def test_schema_is_the_committed_file() -> None:
     assert call("schema").stdout == (ROOT / "docs/experiment.schema.json").read_text(encoding="utf-8")
 
 
+def caused_by(error: Exception, cause: BaseException) -> Exception:
+    error.__cause__ = cause
+    return error
+
+
 @pytest.mark.parametrize(
     ("error", "code", "words"),
     [
         (KeyboardInterrupt(), 130, ""),
+        (caused_by(RuntimeError("Error calling __set_name__"), KeyboardInterrupt()), 130, ""),
         (OSError(28, "No space left on device", "some/file"), 2, "error: some/file: No space left on device\n"),
     ],
-    ids=["interrupt", "error of the user"],  # a fault of the program: test_shells.py
+    ids=["interrupt", "interrupt while a class is made", "error of the user"],  # a fault of the program: test_shells.py
 )
 def test_errors_inside(error: BaseException, code: int, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(path: Path) -> None:

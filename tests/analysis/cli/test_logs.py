@@ -1,6 +1,8 @@
 """The commands on logs of other robots: a first map, what is in a bag, the verdict and its exit codes."""
 
+import html
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +10,10 @@ import numpy as np
 import pytest
 from programs import run
 from robots import LAW, write_robots
+
+from msg_analysis.errors import InputError
+from msg_analysis.inference.log_verdict import LogComparison
+from msg_analysis.testing import assert_agrees
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +51,31 @@ def test_a_missing_link_is_named(robots: Path) -> None:
     assert "rejected" in shown
 
 
+def test_the_report(robots: Path, tmp_path: Path) -> None:
+    """One file that loads nothing: the text of the terminal, and a picture with every agent."""
+    words = robots / "bad", "--law", robots / "law.yaml", "--map", robots / "map.yaml"
+    shown = call("compare", *words, "--report", tmp_path / "page.html").stdout
+    page = (tmp_path / "page.html").read_text()
+    text = html.unescape(re.sub(r"<[^>]*>", "", page[page.index("<pre>") : page.index("</pre>")]))
+    assert " ".join(shown.splitlines()[1].split()) in " ".join(text.split())
+    assert page.count("<svg") == 1
+    assert not re.search(r"(src|href)=.(?!#)", page)
+
+
+def test_assert_agrees_with_a_law(robots: Path, tmp_path: Path) -> None:
+    given: dict[str, Any] = {"law": robots / "law.yaml", "map": robots / "map.yaml"}
+    found = assert_agrees(robots / "good", **given)
+    assert isinstance(found, LogComparison)
+    assert assert_agrees(found.log).verdict == "agrees"
+    with pytest.raises(AssertionError, match=r"disagrees.*gain of edge 2-3 in both directions.*seems to be missing"):
+        assert_agrees(robots / "bad", **given, report=tmp_path / "pages/bad.html")
+    assert (tmp_path / "pages/bad.html").exists()
+    with pytest.raises(InputError, match="map: missing: expected the file that says where the states in the log are"):
+        assert_agrees(robots / "good", law=robots / "law.yaml")
+    with pytest.raises(InputError, match="2 logs: expected one log"):
+        assert_agrees(robots / "good", robots / "bad", **given)
+
+
 def test_what_is_in_a_bag(robots: Path) -> None:
     result = call("map", robots / "good", "--check")
     assert result.exit_code == 0, result.output
@@ -73,7 +104,6 @@ def test_a_table_needs_no_map(robots: Path, tmp_path: Path) -> None:
         (["compare", "good", "--map", "map.yaml"], "--law: missing: expected the experiment file"),
         (["compare", "good", "bad", "--law", "law.yaml", "--map", "map.yaml"], "bad: expected one bag or table"),
         (["compare", "good", "--law", "law.yaml", "--map", "law.yaml"], "name: unknown key"),
-        (["compare", "good", "--law", "law.yaml", "--map", "map.yaml", "--report", "a.html"], "--report: expected"),
         (["map", "good", "--json"], "--json: expected with --check"),
         (["map", "absent"], "absent: not found"),
         (["compare", "absent.csv", "--law", "law.yaml"], "absent.csv: no such file"),
