@@ -8,7 +8,7 @@ import shlex
 import shutil
 from pathlib import Path
 
-import matplotlib
+import matplotlib.pyplot
 import pytest
 import yaml
 from pages import EXPERIMENTS, PAGES, PRINTING, ROOT, Shown, blocks, console, experiments, missing, typed
