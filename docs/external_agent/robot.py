@@ -33,9 +33,9 @@ class Robot(Node):
         self.heard[j] = message.data, time.monotonic()
 
     def move(self):
-        """Go on by the time that has passed."""
+        """Go on by the time that has passed; before anything is heard, the run has not begun."""
         now = time.monotonic()
-        dt, self.last = now - self.last, now
+        dt, self.last = (now - self.last if self.heard else 0.0), now
         pull = sum(value - self.x for value, at in self.heard.values() if now - at < FRESH)
         self.x += self.gain * pull * dt + math.sqrt(dt) * self.random.gauss(0.0, 1.0)
         self.publisher.publish(Float64(data=self.x))

@@ -54,8 +54,8 @@ def test_in_real_time(network: Any, domain: int) -> None:
 
 @pytest.mark.parametrize("gain", ["1.0", "20.0"])
 def test_a_robot_with_a_topic(network: Any, domain: int, gain: str) -> None:
-    """A program of plain rclpy: with twenty times the gain it is named. On a busy machine a right one can be late."""
-    run = {"duration": 10, "pace": "realtime", "speed": 1, "replicas": 1, "start": "zero"}
+    """A program of plain rclpy: with twenty times the gain it is named. Level 0.001: its times are not ours to fix."""
+    run = {"duration": 10, "pace": "realtime", "speed": 1, "replicas": 1, "start": "zero", "seed": 0}
     record = run_file(network.directory, 5, run=run)
     mapped, bag = network.directory / "robots.yaml", network.directory / "runs/mine"
     mapped.write_text('agents: {"*": {topic: "/robot_{i}/x", field: data}}')
@@ -74,8 +74,10 @@ def test_a_robot_with_a_topic(network: Any, domain: int, gain: str) -> None:
     found = read_bag(bag)
     assert found.completeness.complete
     assert (np.diff(found.states[10:, 4, 0]) != 0.0).mean() > 0.9
-    if gain == "20.0":
-        comparison = compare(found, level=0.001, max_missed=1.0)
+    comparison = compare(found, level=0.001, max_missed=1.0)
+    if gain == "1.0":  # on a busy machine the program may stand still for a while, and nothing else
+        assert comparison.verdict == "agrees" or comparison.causes[0].kind == "frozen", comparison.causes
+    else:
         assert (comparison.verdict, comparison.causes[0].agent) == ("disagrees", 5)
 
 

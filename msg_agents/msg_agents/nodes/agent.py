@@ -67,6 +67,16 @@ class StepLaw(Protocol):
         """See AgentLaw."""
 
 
+class Program(Protocol):
+    """A program of a user around an agent."""
+
+    def missing(self) -> list[str]:
+        """What must be there before the run starts, beside its nodes."""
+
+    def started(self, first: int) -> None:
+        """In real time: the first step is due when the clock of the node says ``first`` [ns]."""
+
+
 class Agent(NetworkNode):
     """Connects topics and law; the subclass for the pace decides when to step and with which inputs."""
 
@@ -87,7 +97,7 @@ class Agent(NetworkNode):
         readers: Sequence[str],  # other nodes that must read the states before the run starts
         checkpoints: Path | None,  # directory of the published states, from which it resumes after a restart
         group: AgentGroup,
-        missing: Callable[[], list[str]] = list,  # what else must be there before the run starts
+        program: Program | None = None,
     ) -> None:
         agent = law.agent
         super().__init__(agent_node_name(agent), record=record)
@@ -103,7 +113,7 @@ class Agent(NetworkNode):
         )
         self._resumed = self._take_over()
         self._group = group
-        self._missing = missing
+        self._program = program
         self._inputs = [self._law.neighbours(mode) for mode in range(model.modes)]
         self._peers = list(peers)
         self._options: dict[str, Any] = {
@@ -158,15 +168,12 @@ class Agent(NetworkNode):
             return False
         expected = self._awaited() + self._others
         there = self.has_readers(self._states, expected) and not self._group.missing_recorder()
-        return there and not self._missing()
+        return there and not (self._program and self._program.missing())
 
     def missing_nodes(self) -> list[str]:
         """See NetworkNode."""
-        return (
-            self.missing_readers(self._states, self._awaited() + self._others)
-            + self._group.missing_recorder()
-            + self._missing()
-        )
+        missing = self.missing_readers(self._states, self._awaited() + self._others) + self._group.missing_recorder()
+        return missing + (self._program.missing() if self._program else [])
 
     def _awaited(self) -> list[str]:
         """Names of the peers that must read its topic: not those that its batches reach."""

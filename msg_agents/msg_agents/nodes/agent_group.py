@@ -15,7 +15,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from msg_agents.discovery.rtps import PREFIX_SIZE, has_profile_for
-from msg_agents.nodes.agent import Agent, StepLaw
+from msg_agents.nodes.agent import Agent, Program, StepLaw
 from msg_agents.nodes.base import NOT_AN_AGENT, NetworkNode
 from msg_agents.nodes.paced_agents import LockstepAgent, RealtimeAgent
 from msg_agents.nodes.ros import every
@@ -197,7 +197,7 @@ class AgentGroup:
         readers: Sequence[str],  # other nodes that must read the states before the run starts
         checkpoints: Path | None = None,  # directory of the published states, from which agents resume
         law: Callable[[RunRecord, Wiring, int], StepLaw] = agent_law,  # of an agent (index from 0)
-        missing: Callable[[], list[str]] = list,  # what else must be there before the run starts
+        program: Program | None = None,  # of a user
     ) -> None:
         self.turns = TurnQueue(len(agents), self._defer, self._end_turns)
         self.progress_period = max(PROGRESS_PERIOD, model.agents / MOST_REPORTS)
@@ -215,7 +215,7 @@ class AgentGroup:
                 readers=readers,
                 checkpoints=checkpoints,
                 group=self,
-                missing=missing,
+                program=program,
             )
         self.nodes = list(self._agents.values())  # in the order of ``agents``
         self._host = self.nodes[0]

@@ -96,6 +96,9 @@ class ExternalAgent:
         """What must be there before the run starts, beside its nodes; asked again and again until it is empty."""
         return []
 
+    def started(self, first: int) -> None:
+        """In real time: called once, when it is known that the first step is due at this time of the clock [ns]."""
+
     def run(self, *, discovery_timeout: float = DISCOVERY_TIMEOUT) -> bool:
         """Take part in the run, to its end; False if it was stopped before, by a signal.
 
@@ -114,7 +117,7 @@ class ExternalAgent:
                 agents=[self.number - 1],
                 readers=list(self._readers),
                 law=lambda _record, _model, _agent: law,
-                missing=self.missing,
+                program=self,
             )
             self.connected(group.nodes[0])
             return group.nodes

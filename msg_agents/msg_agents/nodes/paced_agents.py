@@ -186,6 +186,8 @@ class RealtimeAgent(Agent):
         self._common = Schedule(epoch=epoch, speed=self._speed, step_length=self._dt)
         self._bound_clock(epoch - EPOCH_DELAY)
         self.values.review()
+        if self._program:
+            self._program.started(self._schedule.clock_time(0))
         # After a takeover steps are overdue; by the time of the next step all others have published their state.
         self._set_timer(self._timer.now())
 

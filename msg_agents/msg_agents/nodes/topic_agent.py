@@ -17,12 +17,14 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import Float64
 
 from msg_agents.nodes.external_agent import ExternalAgent
-from msg_agents.nodes.ros import foreign_message_class
+from msg_agents.nodes.ros import DueTimer, foreign_message_class
+from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.bags.log_map import LogMap
 from msg_analysis.bags.message_fields import parse_path
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.graphs import Graph
+from msg_analysis.model.graph_path import holding_periods
 
 HEARD = "agent_{}/heard/agent_{}"  # topic on which a robot is told what it hears of another agent
 
@@ -31,7 +33,8 @@ class TopicAgent(ExternalAgent):
     """Takes the state of a robot from a topic that the map names, and tells the robot what it hears of its neighbours.
 
     A robot needs no package of ours, no key and no start: it publishes a number in messages of any type, and may read
-    ``std_msgs/Float64`` on ``agent_<i>/heard/agent_<j>``, in each step in which the graph has that link.
+    ``std_msgs/Float64`` on ``agent_<i>/heard/agent_<j>``, in each step in which the graph has that link. What it hears
+    first says that the run begins: until then it stays at x(0).
     """
 
     def __init__(self, record: str | Path, agent: int, mapped: LogMap, *, readers: Sequence[str]) -> None:
@@ -68,6 +71,20 @@ class TopicAgent(ExternalAgent):
                 foreign_message_class(types[0]), self._topic, self._take, qos_profile_sensor_data
             )
         return []
+
+    def started(self, first: int) -> None:
+        """The robot hears of the states x(0) one period before the first step, which is when its own step begins."""
+        run, experiment = self.experiment.run, self.experiment
+        assert self._node is not None
+        mode = next(holding_periods(experiment, self._record.model.initial)).mode
+        start = self._record.start[:, 0]
+
+        def begin() -> None:
+            for j in self._record.model.neighbours(mode, self.number - 1).tolist():
+                self._publishers[j + 1].publish(Float64(data=float(start[j]) * self._unit))
+
+        self._timer = DueTimer(self._node, begin)
+        self._timer.set(first - round(experiment.step_length / run.speed * SECOND))
 
     def _take(self, message: Any) -> None:
         try:
