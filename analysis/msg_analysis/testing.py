@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TypeVar
 
 from msg_analysis.bags.log_map import load_map
 from msg_analysis.bags.mapped_log import read_log
@@ -17,6 +18,8 @@ from msg_analysis.inference.log_verdict import LogComparison
 from msg_analysis.inference.pool import compare
 from msg_analysis.model.log import Log
 from msg_analysis.model.run import Run
+
+Compared = TypeVar("Compared", Comparison, LogComparison)
 
 __all__ = ["Acceptance", "Claim", "accept", "assert_agrees"]
 
@@ -63,13 +66,17 @@ def assert_agrees(
 
         Path(report).parent.mkdir(parents=True, exist_ok=True)
         write_report(comparison, Path(report))
-    if comparison.verdict != "agrees":
-        rejected = [f"{test.name} (adjusted p {test.p_adjusted:.3g})" for test in comparison.tests if test.rejected]
-        missing = f"{comparison.trajectory.completeness.missing} states are missing"
-        causes = [cause.words for cause in comparison.causes]
-        reasons = [comparison.unpredicted or ", ".join(rejected) or missing, *causes]
-        raise AssertionError(f"{comparison!r}: {'; '.join(reasons)}")
-    return comparison
+    missing = f"{comparison.trajectory.completeness.missing} states are missing"
+    return _agreed(comparison, comparison.unpredicted, missing)
+
+
+def _agreed(comparison: Compared, reason: str | None = None, otherwise: str = "") -> Compared:
+    """The comparison; AssertionError: it does not agree, for this ``reason``, rejected tests, or ``otherwise``."""
+    if comparison.verdict == "agrees":
+        return comparison
+    rejected = [f"{test.name} (adjusted p {test.p_adjusted:.3g})" for test in comparison.tests if test.rejected]
+    causes: list[str] = [cause.words for cause in comparison.causes]
+    raise AssertionError(f"{comparison!r}: {'; '.join([reason or ', '.join(rejected) or otherwise, *causes])}")
 
 
 def _assert_law(
@@ -93,8 +100,4 @@ def _assert_law(
 
         Path(report).parent.mkdir(parents=True, exist_ok=True)
         write_log_report(comparison, report)
-    if comparison.verdict != "agrees":
-        rejected = [f"{test.name} (adjusted p {test.p_adjusted:.3g})" for test in comparison.tests if test.rejected]
-        causes = [cause.words for cause in comparison.causes]
-        raise AssertionError(f"{comparison!r}: {'; '.join([', '.join(rejected), *causes])}")
-    return comparison
+    return _agreed(comparison)

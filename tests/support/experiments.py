@@ -15,6 +15,7 @@ from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.common.arrays import FloatArray
 from msg_analysis.experiment.experiment import Experiment
+from msg_analysis.experiment.links import with_logged
 from msg_analysis.inference.observation import Observation
 from msg_analysis.inference.pool import compare as compare
 from msg_analysis.model.run import Completeness, Run
@@ -133,3 +134,9 @@ def flipped(states: FloatArray, *where: int) -> FloatArray:
     copy = states.copy()
     copy.view(np.uint64)[where] ^= np.uint64(1)
     return copy
+
+
+def logged(run: Run, experiment: Experiment) -> Run:
+    """The same log, recorded as that of another experiment whose links switch, or whose agents leave out steps."""
+    claims = with_logged(experiment, run.record.experiment.graph_list, run.modes)
+    return dataclasses.replace(run, record=dataclasses.replace(run.record, experiment=claims))

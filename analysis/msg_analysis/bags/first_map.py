@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from msg_analysis.bags.files import bag_files, stored_file
+from msg_analysis.arithmetic.reproducible import SECOND
+from msg_analysis.bags.files import FileInventory, bag_files, stored_file, total_channels
 from msg_analysis.bags.log_map import EVERY, NUMBER, LogMap, parse_map
-from msg_analysis.bags.mapped_log import SECOND, STAMP, Contents, Series, is_table, read_contents, read_table
+from msg_analysis.bags.mapped_log import STAMP, Contents, Series, is_table, read_contents, read_table
 from msg_analysis.bags.message_fields import definitions, leaves
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.common.text import listed
@@ -55,16 +56,13 @@ class Topic:
 
 def topics_of(bag: Path) -> list[Topic]:
     """All topics of a bag, by name; those whose definition cannot be read have no fields."""
-    counts: Counter[str] = Counter()
+    inventories = [FileInventory(stored_file(path)) for path in bag_files(bag)]
     found: dict[str, Any] = {}
-    for path in bag_files(bag):
-        file = stored_file(path)
-        for batch in file.batches():
-            for number, messages in zip(*np.unique(batch.channel, return_counts=True), strict=True):
-                if channel := file.channels.get(int(number)):
-                    counts[channel.topic] += int(messages)
-        for channel in file.channels.values():
-            found.setdefault(channel.topic, file.schemas.get(channel.schema_id))
+    for inventory in inventories:
+        deque(inventory.watch(), maxlen=0)
+        for channel in inventory.file.channels.values():
+            found.setdefault(channel.topic, inventory.file.schemas.get(channel.schema_id))
+    counts = total_channels([inventory.count for inventory in inventories])
     topics = []
     for name, schema in sorted(found.items()):
         several: list[tuple[str, str]] = []
@@ -76,7 +74,7 @@ def topics_of(bag: Path) -> list[Topic]:
             pass
         fields = tuple(each for each, kind in several if kind.startswith("float"))
         stamped = set(STAMP) <= {each for each, _ in several}
-        topics.append(Topic(name, schema.name if schema else "", counts[name], stamped, fields))
+        topics.append(Topic(name, schema.name if schema else "", counts[name].messages, stamped, fields))
     return topics
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.bags.files import bag_files, stored_file
 from msg_analysis.bags.log_map import EVERY, GraphSource, LogMap, Source
 from msg_analysis.bags.message_fields import FieldError, FieldReader, leaves
@@ -27,7 +28,6 @@ from msg_analysis.model.log import Log
 
 TABLES = (".csv", ".parquet", ".npz")
 STAMP = ("header.stamp.sec", "header.stamp.nanosec")
-SECOND = 10**9
 MOST_BACK = 5.0  # median intervals that a stamp may lie before an earlier one; more is a jump of the clock
 LONGEST_CELL = 2**20
 

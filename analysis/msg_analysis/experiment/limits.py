@@ -24,6 +24,7 @@ MOST_STATES = 512
 MOST_VALUES = 1500
 """That agents keep from step to step, in a prediction: the last ones heard, and those that a delay makes older."""
 
+_PER_ARC = 24  # bytes: two ends and a weight
 _MATRICES_PER_GRAPH = 8  # adjacency, W, its coupling, F, B, N, the variance of loss, and the product that makes N
 
 
@@ -51,6 +52,17 @@ def memory_problems(agents: int, modes: int, steps: int, replicas: int, delay: i
         return [problem("graphs", text, room, "lower the number of agents or graphs")]
     text = f"{steps} steps of {agents} agents with {replicas} replicas need {amount(states)}"
     return [problem("run", text, room, "lower run.duration or run.replicas, or raise run.dt")]
+
+
+def path_problems(arcs: int, switches: int, steps: int) -> list[str]:
+    """Problems if the path of a run with drawn graphs does not fit; ``switches``: links, or agents, there or not."""
+    graphs = min(steps, 2 ** min(switches, 62))
+    needed, available = steps * switches + graphs * arcs * _PER_ARC, available_memory()
+    if needed <= available:
+        return []
+    text = f"{steps} steps with up to {graphs} graphs of {arcs} arcs need {amount(needed)}"
+    wanted = f"expected at most {amount(available)}, the memory available"
+    return [problem("run", text, wanted, "lower run.duration, or the number of agents or links")]
 
 
 def matrix_problems(experiment: Experiment) -> list[str]:

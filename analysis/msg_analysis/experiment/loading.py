@@ -223,6 +223,8 @@ class Sections:
         given = switching, self.values["noise"], self.graphs, time, run.dt, self.values["names"]
         law, self.problems = law_of(*given, protocol=self.protocol is not None)
         if law:
+            self.problems += limits.path_problems(len(law.link_of), len(law), run.steps)
+        if law and not self.problems:
             graphs, self.switching = law.drawn(run.seed, run.steps)
             self.graphs = tuple(graphs)
             self.noise_gain = np.broadcast_to(self.noise_gain[0], (len(graphs), *self.noise_gain.shape[1:]))

@@ -239,8 +239,10 @@ def describe_experiment(experiment: Experiment) -> dict[str, Any]:
     shares, holding_times = switching.stationary.tolist(), experiment.holding_times
     law: dict[str, Any] = {}
     chain = None if schedule else experiment.chain
-    if links:
-        law = {"activation": experiment.noise.activation} if links.noun == "agent" else {"links": links.to_json()}
+    if experiment.noise.leaves_out_steps:
+        law = {"activation": experiment.noise.activation}
+    elif links:
+        law = {"links": links.to_json()}
     elif isinstance(switching, SojournSchedule):
         law = {"sojourn": document["switching"]["sojourn"]}
         chain, unit = switching.law.chain, experiment.step_length if experiment.time == "discrete" else 1.0

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from msg_analysis.common.arrays import FloatArray, release
+from msg_analysis.common.arrays import FloatArray, IntArray, release
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import HALF_WIDTH_95, agent_name
 from msg_analysis.errors import InputError
@@ -162,20 +162,20 @@ def run_figure(trajectory: Run, agents: Sequence[int] | None, replica: int) -> N
         axes.set_title(plain(experiment.name), loc="left")
         axes.tick_params(labelbottom=False)
         legend_beside(figure, "right upper", fontsize=8)
-        _draw_graphs(band, trajectory)
+        modes, dt = trajectory.modes, experiment.step_length
+        starts = np.concatenate(([0], np.flatnonzero(np.diff(modes)) + 1)) if len(modes) else np.empty(0, dtype=int)
+        draw_path(band, experiment, starts * dt, np.append(starts[1:], len(modes)) * dt, modes[starts])
         band.set_xlim(axes.get_xlim())
     return figure
 
 
-def _draw_graphs(axes: Axes, trajectory: Run) -> None:
-    """A stripe for each graph, filled while it is active."""
-    experiment, modes = trajectory.record.experiment, trajectory.modes
+def draw_path(axes: Axes, experiment: Experiment, starts: FloatArray, ends: FloatArray, graphs: IntArray) -> None:
+    """A stripe for each graph, filled while it is active: in stretches (p,) of the path [units of simulated time]."""
     names = [graph.name for graph in experiment.graph_list]
-    starts = np.concatenate(([0], np.flatnonzero(np.diff(modes)) + 1)) if len(modes) else np.empty(0, dtype=int)
-    ends = np.append(starts[1:], len(modes))
+    ends = ends[: len(starts)]
     for mode in range(len(names)):
-        own = modes[starts] == mode
-        stretches = np.stack([starts[own], ends[own] - starts[own]], axis=1) * experiment.step_length
+        own = graphs == mode
+        stretches = np.stack([starts[own], ends[own] - starts[own]], axis=1)
         axes.broken_barh(stretches.tolist(), (mode - 0.4, 0.8), color=MODE_COLOURS[mode % len(MODE_COLOURS)])
     axes.set(xlabel="simulated time", ylim=(len(names) - 0.4, -0.6))
     few = len(names) <= 6

@@ -19,11 +19,19 @@ from scipy.stats import chi2
 
 from msg_analysis.common.files import write_whole
 from msg_analysis.common.text import agent_name
-from msg_analysis.report.figures import MOST_LINES, MOST_POINTS, STYLE, legend_beside, plain, rendered
-from msg_analysis.report.figures import stacked_panels as panels
+from msg_analysis.report.figures import (
+    MOST_LINES,
+    MOST_POINTS,
+    STYLE,
+    draw_path,
+    legend_beside,
+    plain,
+    rendered,
+    stacked_panels,
+)
 from msg_analysis.report.log_text import print_log_comparison
 from msg_analysis.report.look import shorten
-from msg_analysis.report.plot_style import BLUE, GRAPHS, GREY, LINES, VERMILLION
+from msg_analysis.report.plot_style import BLUE, GREY, LINES, VERMILLION
 
 if TYPE_CHECKING:
     from msg_analysis.inference.log_verdict import LogComparison
@@ -58,7 +66,7 @@ def log_figure(comparison: LogComparison) -> Figure:
     law, few = log.law, min(log.law.agents, MOST_LINES)
     every = max(1, -(-len(log.times) // MOST_POINTS))
     with mpl.rc_context(STYLE):
-        figure, (states, band, ratios) = panels(3.0, 0.7, 2.0)
+        figure, (states, band, ratios) = stacked_panels(3.0, 0.7, 2.0)
         for agent in range(few):
             label = plain(shorten(f"agent {agent_name(agent + 1, law.names)}"))
             there = np.flatnonzero(~np.isnan(log.states[:, agent, 0]))[::every]
@@ -67,14 +75,8 @@ def log_figure(comparison: LogComparison) -> Figure:
         states.tick_params(labelbottom=False)
         legend_beside(figure, "right upper", fontsize=8)
         ends = np.append(log.starts[1:], max(float(log.times[-1]), float(log.starts[-1])))
-        for mode, graph in enumerate(law.graph_list[: len(GRAPHS)]):
-            own = log.graphs == mode
-            bars = np.stack([log.starts[own], (ends - log.starts)[own]], axis=1).tolist()
-            band.broken_barh(bars, (mode - 0.4, 0.8), color=GRAPHS[mode], label=graph.name)
-        band.set(xlabel="simulated time", xlim=states.get_xlim(), ylim=(min(len(law.graph_list), 8) - 0.4, -0.6))
-        names = [plain(shorten(graph.name)) for graph in law.graph_list[: len(GRAPHS)]]
-        band.set_yticks(range(len(names)), names)
-        band.grid(visible=False)
+        draw_path(band, law, log.starts, ends, log.graphs)
+        band.set_xlim(states.get_xlim())
         numbers = np.arange(1, law.agents + 1)
         counts = np.maximum(1, (~np.isnan(log.states)).sum(axis=(0, 2)))
         low, high = chi2.ppf(0.025, counts) / counts, chi2.ppf(0.975, counts) / counts

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from experiments import TRACKING, compare, line_ring
+from experiments import TRACKING, compare, line_ring, logged
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.errors import InputError
+from msg_analysis.experiment import limits
 from msg_analysis.experiment.experiment import Experiment, ExperimentError
 from msg_analysis.experiment.limits import prediction_method
-from msg_analysis.experiment.links import ActiveAgents, with_logged
-from msg_analysis.model.run import Run
+from msg_analysis.experiment.links import ActiveAgents
 from msg_analysis.theory.sampling import sampled_prediction
 from msg_analysis.twin.simulate import simulate
 
@@ -43,12 +43,6 @@ def lazy(activation: float = 0.7, dt: float = 0.05, **changes: Any) -> Experimen
     run = {"dt": dt, "duration": 30, "replicas": 4} | changes.pop("run", {})
     noise = {"activation": activation} | changes.pop("noise", {})
     return line_ring(changes.pop("agents", 5), **{"graphs": RING, "switching": {}} | changes, noise=noise, run=run)
-
-
-def logged(run: Run, experiment: Experiment) -> Run:
-    """The same log, recorded as that of another experiment."""
-    claims = with_logged(experiment, run.record.experiment.graph_list, run.modes)
-    return dataclasses.replace(run, record=dataclasses.replace(run.record, experiment=claims))
 
 
 def enumerated(w: np.ndarray, noise: np.ndarray, activation: float, centre: np.ndarray) -> np.ndarray:
@@ -159,6 +153,21 @@ def test_an_agent_that_moves_in_steps_that_it_leaves_out() -> None:
     states[rests[5] + 1 :, 2] += 1e-3
     found = compare(dataclasses.replace(run, states=states))
     assert (found.verdict, found.causes[0].agent) == ("disagrees", 3)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"noise": {"activation": 0.5}, "switching": {}},
+        {"switching": {"links": {"up": 1, "down": 1}}},
+    ],
+)
+def test_a_path_that_does_not_fit(changes: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """One error, and nothing is drawn, on a machine with 1 GB, in which the states fit."""
+    monkeypatch.setattr(limits, "available_memory", lambda: 10**9)
+    graphs = {"ring": {"cycle": list(range(1, 1001)), "weight": 0.1}}
+    with pytest.raises(ExperimentError, match=r"run: 50000 steps with up to 50000 graphs of 2000 arcs need 2\.4"):
+        line_ring(1000, graphs=graphs, **changes, run={"duration": 2500, "replicas": 1})
 
 
 @pytest.mark.parametrize(

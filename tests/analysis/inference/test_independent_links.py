@@ -1,6 +1,5 @@
 """Links that switch by themselves: their path, the exact prediction of few of them, and verdicts link by link."""
 
-import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -8,14 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments import TRACKING, compare
+from experiments import TRACKING, compare, logged
 from msg_analysis.bags.reading import read_bag
 from msg_analysis.bags.writing import write_trajectory
 from msg_analysis.errors import NotAvailableError
 from msg_analysis.experiment.experiment import Experiment, ExperimentError
 from msg_analysis.experiment.limits import prediction_method
-from msg_analysis.experiment.links import with_logged
-from msg_analysis.model.run import Run
 from msg_analysis.theory.sampling import sampled_prediction
 from msg_analysis.twin.simulate import simulate
 
@@ -44,12 +41,6 @@ def linked(links: int = 9, up: Any = 0.5, down: Any = 0.5, **changes: Any) -> Ex
             **changes,
         }
     )
-
-
-def logged(run: Run, experiment: Experiment) -> Run:
-    """The same log, recorded as that of another experiment."""
-    claims = with_logged(experiment, run.record.experiment.graph_list, run.modes)
-    return dataclasses.replace(run, record=dataclasses.replace(run.record, experiment=claims))
 
 
 def test_path_of_a_run() -> None:
