@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 MOST_STATES = 512
 """Of graph and links together, in a prediction with losses in bursts."""
+MOST_GIVEN = 4096
+"""The same where the sequence of the graphs is given."""
 MOST_VALUES = 1500
 """That agents keep from step to step, in a prediction: the last ones heard, and those that a delay makes older."""
 
@@ -103,7 +105,8 @@ def prediction_method(experiment: Experiment) -> tuple[Literal["exact", "sampled
     if not (lines := why_sampled(experiment)):
         return "exact", None
     given = experiment.schedule and not isinstance(experiment.schedule, DrawnSchedule)
-    return "measured" if given or (dense_links(experiment) and experiment.noise.on_messages) else "sampled", lines[0]
+    in_bursts = dense_links(experiment) and experiment.noise.burst is not None
+    return "measured" if given or in_bursts else "sampled", lines[0]
 
 
 def dense_links(experiment: Experiment) -> bool:
@@ -136,9 +139,10 @@ def too_large_to_predict(experiment: Experiment) -> list[str]:
     noise, graphs, gains = experiment.noise, experiment.graph_list, experiment.leader_gains
     links = heard_links(graphs, experiment.time) & np.isfinite(gains)[:, None]
     lossy = int((links & (experiment.loss > 0.0)).sum())
-    if noise.burst is not None and (1 if experiment.schedule else len(graphs)) * 2**lossy > MOST_STATES:
+    most = MOST_GIVEN if experiment.schedule else MOST_STATES
+    if noise.burst is not None and len(graphs) * 2**lossy > most:
         wanted = f"has no exact prediction: 2^{lossy} states of {lossy} links that lose messages, expected at most "
-        wanted += f"{MOST_STATES} with those of the graph"
+        wanted += f"{most} with those of the graph"
         lines.append(problem("noise.burst", noise.burst, wanted, "remove it, or give fewer links a loss"))
     others = [key for key in ("broadcast", "link", "delay", "burst") if getattr(noise, key)]
     others += ["on_loss: hold"] * noise.holds + ["run.pace: realtime"] * (experiment.run.pace == "realtime")

@@ -21,7 +21,8 @@ import scipy.linalg
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.errors import InputError
-from msg_analysis.experiment.limits import MOST_STATES, MOST_VALUES
+from msg_analysis.experiment.limits import MOST_GIVEN, MOST_STATES, MOST_VALUES
+from msg_analysis.experiment.markov_chain import MarkovChain
 from msg_analysis.model.step_model import StepModel
 
 
@@ -378,10 +379,11 @@ def loss_modes(step: StepModel) -> list[tuple[int, FloatArray]]:
 def _channel_states(step: StepModel) -> FloatArray:
     """(2^c, c): 1.0 where a channel loses, for every combination of states, in the order of Kronecker products."""
     channels = len(burst_channels(step))
-    if step.modes * 2**channels > MOST_STATES:
+    most = MOST_STATES if isinstance(step.switching, MarkovChain) else MOST_GIVEN
+    if step.modes * 2**channels > most:
         raise InputError(
             f"noise.burst: {step.modes} graphs and {channels} links that lose messages make {step.modes} * "
-            f"2^{channels} states of the network; at most {MOST_STATES} are predicted: give a loss to fewer links "
+            f"2^{channels} states of the network; at most {most} are predicted: give a loss to fewer links "
             "(noise.loss: arcs), or leave noise.burst out"
         )
     return np.array(list(product([0.0, 1.0], repeat=channels)))

@@ -34,6 +34,7 @@ from msg_analysis.experiment.limits import dense_links
 from msg_analysis.experiment.links import expanded
 from msg_analysis.experiment.markov_chain import Schedule
 from msg_analysis.model.step_model import build_run_model, step_law
+from msg_analysis.theory.jump_system import emulated, part
 from msg_analysis.theory.sparse_walks import Law, Walk
 
 if TYPE_CHECKING:
@@ -173,8 +174,8 @@ def sampled_prediction(
     width = len(units) + (not every)
     make: Callable[[int, Callable[[], bool]], FloatArray | None]
     if dense:
-        if experiment.noise.on_messages:
-            wanted = "expected the built-in law in continuous time, or messages as they are: no sampling here"
+        if experiment.noise.burst is not None:
+            wanted = "expected the built-in law in continuous time, or no noise.burst: no sampling here"
             raise NotAvailableError(f"switching.links, noise.activation: {wanted}")
         make, width = partial(_of_path, experiment, units, seed, time.time() + within), 1
     else:
@@ -220,25 +221,37 @@ def sampled_prediction(
 def _of_path(
     experiment: Experiment, units: Sequence[int], seed: int, until: float, batch: int, stopping: Callable[[], bool]
 ) -> FloatArray | None:
-    """(1, 1 + units): the same given one path, by matrices of its graphs, from all agents at once."""
+    """(1, 1 + units): the same given one path, by matrices of its graphs: forms Y go backwards, of all agents at once.
+
+    With a step y(k+1) = A y(k) + noise of covariance N, and losses: <N, Y> is a term of the sum, and Y becomes
+    A^T Y A and the adjoint of the losses.
+    """
     # The chains of the links are reversible: a path has the same law backwards.
     of_path = int(np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(batch,))).integers(2**53))
-    m, done, steps = experiment.agents, 0, SHORTEST
-    z: FloatArray = np.eye(m) - (1.0 / m if experiment.problem == "consensus" else 0.0)
-    total, first = np.zeros(m), float((z**2).sum())
-    while (size := float((z**2).sum())) > SETTLED * first:
-        if not size <= GROWTH * m * first:
+    done, steps, first = 0, SHORTEST, math.inf
+    total, forms = np.zeros(1 + len(units)), np.empty(0)
+    while not forms.size or forms[0].trace() > SETTLED * first:
+        if forms.size and not forms[0].trace() <= GROWTH * experiment.agents * first:
             raise InputError(UNSTABLE)
         if time.time() > until or stopping():
             return None
         drawn = experiment.with_run(seed=of_path, duration=steps * experiment.step_length)  # a longer one begins alike
-        model, path = build_run_model(drawn), drawn.switching_law
+        path = drawn.switching_law
         assert isinstance(path, Schedule)
-        for graph in path.sampled(steps, drawn.step_length)[done:].tolist():
-            total += ((model.noise_gain[graph].T @ z) ** 2).sum(axis=0)
-            z = model.nominal[graph].T @ z
+        system = emulated(build_run_model(drawn), drawn.problem)
+        if not forms.size:
+            rows = system.output[units]
+            forms = np.concatenate([[system.output.T @ system.output], rows[:, :, None] * rows[:, None]])
+            first = float(forms[0].trace())
+        one = np.ones((1, 1)), np.ones(1), np.zeros(1, np.int64)
+        alone = [part(system, np.array([mode]), *one) for mode in range(system.modes)]
+        for mode in path.sampled(steps, drawn.step_length)[done:].tolist():
+            step = alone[mode]
+            total += (forms * step.noise).sum(axis=(1, 2))
+            lost = step.lost_adjoint(forms[:, None])[:, 0] if step.lossy else 0.0
+            forms = step.matrices[0].T @ forms @ step.matrices[0] + lost
         done, steps = steps, 2 * steps
-    return np.concatenate([[total.sum()], total[list(units)]])[None]
+    return total[None]
 
 
 def _batch(

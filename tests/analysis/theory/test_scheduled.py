@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from experiments import line_ring
 from msg_analysis.cli.main import main
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.errors import NotAvailableError
@@ -191,3 +192,16 @@ def test_options_of_outages(tmp_path: Any) -> None:
     wrong = CliRunner().invoke(main, ["predict", "line_ring", "--outages", "1"])
     assert (wrong.exit_code, wrong.stdout) == (2, "")
     assert wrong.stderr.startswith("error: outages: expected a given sequence of graphs")
+
+
+def test_bursts_over_more_graphs_than_a_chain_may_have() -> None:
+    """Three hundred names of two graphs in turn: the prediction of the two graphs is the oracle."""
+    sides = [{"edges": [[1, 2], [2, 3]]}, {"edges": [[1, 3]]}]
+    noise = {"loss": {"arcs": [[1, 2, 0.4]]}, "burst": 4.0}
+    found = []
+    for count in (2, 300):
+        schedule = [[0.1 * k, f"g{k % count}"] for k in range(300)]
+        graphs = {f"g{k}": sides[k % 2] for k in range(count)}
+        law = line_ring(3, graphs=graphs, switching={"schedule": schedule, "end": 30.0}, noise=noise)
+        found.append(predict(law).emulated.system_error)
+    assert found[1] == pytest.approx(found[0], rel=1e-12)
