@@ -26,7 +26,7 @@ from msg_analysis.experiment.values import LARGEST_NUMBER
 
 MOST_AGENTS = 20_000  # one matrix of them takes 3 GB
 MOST_LINKS = 1_500_000  # in all graphs together, which take 0.6 GB
-MOST_ROWS = 1_500_000  # of contacts or intervals, which are read in 10 s
+MOST_ROWS = 1_300_000  # of contacts or intervals, which are read in 10 s
 ROUNDING = 1e-9  # of times: what differs by less, relative to its size, is the same time
 
 COLUMNS: Mapping[str, Sequence[str]] = {
