@@ -87,13 +87,15 @@ SKIPPED := build/skipped
 # With "=": without, pytest takes an existing FILE for a path to test, before tests/conftest.py has defined the option.
 TEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --skipped-to=$(SKIPPED) $(TEST_OPTIONS)
 
-test: setup $(VENV)/.compiled ## Run all tests
+BUT_THE_SITE := --ignore tests/docs/test_site.py
+
+test: setup $(VENV)/.compiled ## Run all tests, but those of the documentation's site
 	@rm -f $(SKIPPED)
-	$(TEST) $(SEVERAL_AT_ONCE)
+	$(TEST) $(SEVERAL_AT_ONCE) $(BUT_THE_SITE)
 	@test ! -s $(SKIPPED) || { echo "Not tested:"; cat $(SKIPPED); } >&2
 
 test-fast: setup $(VENV)/.compiled ## Run the tests that start no network
-	$(TEST) $(SEVERAL_AT_ONCE) --ignore tests/integration
+	$(TEST) $(SEVERAL_AT_ONCE) $(BUT_THE_SITE) --ignore tests/integration
 
 # What another distribution could break, as briefly as possible: equal to the twin in lockstep, kills and takeovers, real
 # time, rejected messages, the bag, discovery, watchers that print nothing else.
@@ -152,8 +154,9 @@ bench: setup ## Measure speed side by side with the bare middleware, other solve
 calibrate: setup ## Measure error rates and power of the verdict into docs/calibration.md: an hour on two CPUs
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --write
 
-docs: setup ## Build the documentation into site/
+docs: setup ## Build the documentation into site/, and check it: links, and in Chromium every page
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	SITE=site $(BIN)/python -m pytest $(TEST_OPTIONS) tests/docs/test_site.py
 
 # Build the workspace as a ROS 2 user does. With ROS 2 from wheels, the virtual environment is the underlay.
 WORKSPACE := build/colcon$(SUFFIX)
