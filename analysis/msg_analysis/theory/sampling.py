@@ -27,7 +27,7 @@ import numpy as np
 import scipy.special
 
 from msg_analysis.common.arrays import FloatArray
-from msg_analysis.common.resources import tell
+from msg_analysis.common.resources import few_blas_threads, tell
 from msg_analysis.common.text import agent_text, finite, markdown_table, number_text
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.experiment.limits import dense_links
@@ -218,6 +218,7 @@ def sampled_prediction(
     )
 
 
+@few_blas_threads
 def _of_path(
     experiment: Experiment, units: Sequence[int], seed: int, until: float, batch: int, stopping: Callable[[], bool]
 ) -> FloatArray | None:

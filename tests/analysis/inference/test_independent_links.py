@@ -106,14 +106,14 @@ def test_exact_predictions() -> None:
 
 
 def test_how_errors_are_known() -> None:
-    """Many links are sampled; with noise on the air only in the built-in law in continuous time."""
+    """Many links are sampled; losses in bursts only in the built-in law in continuous time."""
     assert [prediction_method(linked(links))[0] for links in (9, 10)] == ["exact", "sampled"]
     for changes in ({"time": "discrete", "run": {"dt": 1.0}}, {"protocol": {"name": "metropolis", "laziness": 0.3}}):
-        assert prediction_method(linked(10, **changes))[0] == "sampled"
-        lossy = linked(10, **changes, noise={"loss": 0.2})
-        assert prediction_method(lossy)[0] == "measured"
-        with pytest.raises(NotAvailableError, match="messages as they are: no sampling here"):
-            sampled_prediction(lossy)
+        assert prediction_method(linked(10, **changes, noise={"loss": 0.2}))[0] == "sampled"
+        bursts = linked(10, **changes, noise={"loss": 0.2, "burst": 5})
+        assert prediction_method(bursts)[0] == "measured"
+        with pytest.raises(NotAvailableError, match=r"or no noise\.burst: no sampling here"):
+            sampled_prediction(bursts)
 
 
 @pytest.mark.parametrize("messages", MESSAGES)

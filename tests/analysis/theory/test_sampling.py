@@ -94,7 +94,7 @@ def test_messages_over_links_given_the_path(changes):
     """Three links: the exact prediction from their eight graphs is the oracle. The seed is fixed; |z| < 4."""
     links = {"up": 0.4, "down": 0.2}
     free = line_ring(3, **changes, graphs={"ring": {"cycle": [1, 2, 3]}}, switching={"links": links})
-    exact, sampled = free.predict().emulated, sampled_prediction(free, precision=0.05, seed=2)
+    exact, sampled = free.predict().emulated, sampled_prediction(free, precision=0.2, seed=2)
     assert abs(z_of(sampled, exact.system_error)) < 4.0
     low, high = sampled.node_intervals.T
     assert (np.abs(sampled.node_errors - exact.node_errors) <= 2.5 * (high - low) / 2.0).all()
@@ -209,6 +209,3 @@ def test_what_cannot_be_sampled():
     given = five(switching={"schedule": [[0, "line"], [1, "ring"]]}, run={"start": "zero"})
     with pytest.raises(NotAvailableError, match="expected a Markov chain"):
         sampled_prediction(given)
-    bursts = {"graphs": {"ring": {"cycle": [1, 2, 3]}}, "switching": {"links": {"up": 0.4, "down": 0.2}}}
-    with pytest.raises(NotAvailableError, match=r"or no noise\.burst"):
-        sampled_prediction(line_ring(3, time="discrete", noise=BURSTS, **bursts))
