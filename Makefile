@@ -87,15 +87,15 @@ SKIPPED := build/skipped
 # With "=": without, pytest takes an existing FILE for a path to test, before tests/conftest.py has defined the option.
 TEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --skipped-to=$(SKIPPED) $(TEST_OPTIONS)
 
-BUT_THE_SITE := --ignore tests/docs/test_site.py
+DOCS_TESTS := tests/docs tests/integration/test_docs.py
 
-test: setup $(VENV)/.compiled ## Run all tests, but those of the documentation's site
+test: setup $(VENV)/.compiled ## Run all tests but those of the documentation, which make docs runs
 	@rm -f $(SKIPPED)
-	$(TEST) $(SEVERAL_AT_ONCE) $(BUT_THE_SITE)
+	$(TEST) $(SEVERAL_AT_ONCE) $(addprefix --ignore=,$(DOCS_TESTS))
 	@test ! -s $(SKIPPED) || { echo "Not tested:"; cat $(SKIPPED); } >&2
 
 test-fast: setup $(VENV)/.compiled ## Run the tests that start no network
-	$(TEST) $(SEVERAL_AT_ONCE) $(BUT_THE_SITE) --ignore tests/integration
+	$(TEST) $(SEVERAL_AT_ONCE) $(addprefix --ignore=,$(DOCS_TESTS)) --ignore tests/integration
 
 # What another distribution could break, as briefly as possible: equal to the twin in lockstep, kills and takeovers, real
 # time, rejected messages, the bag, discovery, watchers that print nothing else.
@@ -154,9 +154,9 @@ bench: setup ## Measure speed side by side with the bare middleware, other solve
 calibrate: setup ## Measure error rates and power of the verdict into docs/calibration.md: an hour on two CPUs
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/calibration.py --write
 
-docs: setup ## Build the documentation into site/, and check it: links, and in Chromium every page
+docs: setup ## Build the documentation into site/, and test it: links, every page in Chromium, its commands and examples
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
-	SITE=site $(BIN)/python -m pytest $(TEST_OPTIONS) tests/docs/test_site.py
+	SITE=site OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(TEST_OPTIONS) --numprocesses 3 --dist loadfile $(DOCS_TESTS)
 
 # Build the workspace as a ROS 2 user does. With ROS 2 from wheels, the virtual environment is the underlay.
 WORKSPACE := build/colcon$(SUFFIX)
