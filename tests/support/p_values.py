@@ -32,6 +32,11 @@ def assert_calibrated(results: Sequence[Comparison]) -> None:
     for name in [test.name for test in results[0].tests]:
         p = [test.p for result in results for test in result.tests if test.name == name]
         assert kolmogorov_smirnov(name, p) > 2e-4, name
+    assert_covered(results)
+
+
+def assert_covered(results: Sequence[Comparison]) -> None:
+    """At level 0.01, and by intervals of 95 % of the system error; with false-alarm rate 1e-4 each."""
     errors = [result.system_error for result in results]
     covered = sum(error.interval[0] <= error.predicted <= error.interval[1] for error in errors)
     assert covered >= stats.binom.ppf(1e-4, len(results), 0.95)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.linalg
+from p_values import assert_covered
 
 from experiments import TRACKING, compare, line_ring, logged
 from msg_analysis.bags.reading import read_bag
@@ -117,17 +118,14 @@ def test_sampled_by_matrices(leader: bool) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_correct_runs(kind: str) -> None:
-    """At level 0.01, more than 2 of 12 with probability 0.0002, as more than 4 errors outside intervals of 95 %."""
     law = lazy(**KINDS[kind])
-    runs = [simulate(law.with_run(seed=seed)) for seed in range(12)]
+    runs = [simulate(law.with_run(seed=seed)) for seed in range(8)]
     if kind in ("plain", "hears nobody"):
         rests = (runs[0].states[1:] == runs[0].states[:-1]).all(axis=2)
         assert 0.2 < rests.mean() < 0.4
     found = [compare(run) for run in runs]
-    assert sum(one.verdict != "agrees" for one in found) <= 2
+    assert_covered(found)
     assert all("links" in [test.name for test in one.tests] for one in found)
-    errors = [one.system_error for one in found]
-    assert sum(not error.interval[0] <= error.predicted <= error.interval[1] for error in errors) <= 4
 
 
 def test_an_agent_that_makes_fewer_steps(tmp_path: Path) -> None:
