@@ -17,7 +17,7 @@ from rclpy.subscription import Subscription
 from msg_agents.nodes.external_agent import ExternalAgent
 from msg_agents.nodes.poses import StateMessages
 from msg_agents.nodes.ros import DueTimer, foreign_message_class
-from msg_agents.run.external import robot_source
+from msg_agents.run.external import NOTHING_ON, robot_source
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.bags.log_map import LogMap
 from msg_analysis.bags.message_fields import parse_path
@@ -109,7 +109,7 @@ class TopicAgent(ExternalAgent):
     def waiting_for(self) -> str | None:
         """See ExternalAgent."""
         quiet = time.monotonic() - self._came
-        return f"nothing on {self._topic} for {quiet:.1f} s: its state stays" if quiet > QUIET else None
+        return f"{NOTHING_ON} {self._topic} for {quiet:.1f} s: its state stays" if quiet > QUIET else None
 
     def _take(self, message: Any) -> None:
         self._came = time.monotonic()

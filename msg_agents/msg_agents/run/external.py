@@ -18,6 +18,7 @@ from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.messages.topics import agent_node_name
 
 STATUS_PERIOD = 1.0  # s between two readings of the status files
+NOTHING_ON = "nothing on"  # how the words of a process begin whose robot publishes nothing
 BEHIND = 2  # steps by which an agent in real time may be behind without being slower than the others
 
 
@@ -89,7 +90,7 @@ class ExternalAgents:
             return []
         self._looked = self._clock()
         nodes = {agent_node_name(agent): agent for agent in self._agents}
-        quiet = {name: words for name, words in waiting().items() if name in nodes}
+        quiet = {name: words for name, words in waiting().items() if name in nodes and words.startswith(NOTHING_ON)}
         new, self._quiet = quiet.keys() - self._quiet, set(quiet)
         return [f"{self._are([nodes[name]])}: {quiet[name]}" for name in sorted(new)]
 
