@@ -23,6 +23,6 @@ class MyAgent(ExternalAgent):
 
 if __name__ == "__main__":
     agent = MyAgent(sys.argv[1], int(sys.argv[2]))
-    agent.random = np.random.default_rng(agent.number)  # the same numbers in every test
+    agent.random = np.random.default_rng([1, agent.number])  # the same numbers every time
     agent.gain = float(sys.argv[3]) if len(sys.argv) > 3 else 1.0
     agent.run()

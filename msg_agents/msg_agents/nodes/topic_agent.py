@@ -27,6 +27,7 @@ from msg_analysis.experiment.graphs import Graph
 from msg_analysis.model.graph_path import holding_periods
 from msg_analysis.model.run_record import RunRecord
 
+SETTLE = 1.0  # s that a robot has to discover what it may read, once its own topic is there: nothing tells that it has
 QUIET = 3.0  # s without a message of the robot, after which that is said
 HEARD = "agent_{}/heard/agent_{}"  # topic on which a robot is told what it hears of another agent
 
@@ -46,6 +47,7 @@ class TopicAgent(ExternalAgent):
         self._path = parse_path(self._field)
         self._hears = source.hears
         self._newest = math.nan
+        self._found = 0.0  # time at which its topic was there [s of the monotonic clock]
         self._came = math.inf  # time of the last message [s of the monotonic clock]
         self._node: Node | None = None
         self._subscription: Subscription | None = None
@@ -64,7 +66,7 @@ class TopicAgent(ExternalAgent):
         self._node = node
 
     def missing(self) -> list[str]:
-        """The topic, until it is there; its type is that of its publishers."""
+        """The topic, until it is there for long enough; its type is that of its publishers."""
         assert self._node is not None
         if self._subscription is None:
             types = dict(self._node.get_topic_names_and_types()).get(self._node.resolve_topic_name(self._topic))
@@ -73,7 +75,8 @@ class TopicAgent(ExternalAgent):
             kind = foreign_message_class(types[0])
             self._require_number(kind(), types[0])
             self._subscription = self._node.create_subscription(kind, self._topic, self._take, qos_profile_sensor_data)
-        return []
+            self._found = time.monotonic()
+        return [self._topic] if time.monotonic() < self._found + SETTLE else []
 
     def _require_number(self, message: Any, kind: str) -> None:
         """InputError if messages of this type cannot have a number in the field; entries of lists may come later."""

@@ -111,7 +111,11 @@ class ExternalAgents:
     def never_came(self, agents: Sequence[int]) -> str:
         """That these did not come."""
         missing = [self._topics[agent] for agent in agents if agent in self._topics]
-        what = f"nobody publishes {listed(missing)}" if missing else "nobody has started it"
+        what = (
+            f"nobody publishes {listed(missing)}"
+            if missing
+            else f"nobody has started {'them' if len(agents) > 1 else 'it'}"
+        )
         return f"{self._are(agents)}, and did not come within {self.timeout:g} s: {what}"
 
     def _is_waited_for(self, agent: int, steps: Sequence[int], last: int) -> bool:
