@@ -46,7 +46,7 @@ def test_its_step_is_judged(network: Any, domain: int) -> None:
 
 
 def test_a_wrong_gain_is_found(network: Any, domain: int) -> None:
-    record = run_file(network.directory, 5, run={"duration": 200}, noise={"loss": 0.2, "link": 0.1})
+    record = run_file(network.directory, 5, run={"duration": 200, "replicas": 8}, noise={"loss": 0.2, "link": 0.1})
     found = verdict(network, record, "0.7")
     assert (found.verdict, found.causes[0].kind, found.causes[0].agent) == ("disagrees", "gain", 5)
 
