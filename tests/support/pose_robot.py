@@ -55,6 +55,8 @@ if __name__ == "__main__":
     rclpy.init()
     file, gain, number, *others = sys.argv[1:]
     robot = PoseRobot(int(number), [int(j) for j in others], float(gain))
-    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-        rclpy.spin(robot)
-    Path(file).write_text(json.dumps(robot.poses))
+    try:
+        with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+            rclpy.spin(robot)
+    finally:  # rclpy may raise when a signal comes in the middle of a call
+        Path(file).write_text(json.dumps(robot.poses))
