@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import qos_profile_sensor_data
 from rclpy.subscription import Subscription
 
@@ -27,7 +28,7 @@ from msg_analysis.experiment.graphs import Graph
 from msg_analysis.model.graph_path import holding_periods
 from msg_analysis.model.run_record import RunRecord
 
-SETTLE = 1.0  # s that a robot has to discover what it may read, once its own topic is there: nothing tells that it has
+SETTLE = 1.0  # s that a robot has to discover our topics, once we have its own: nothing tells that it has
 QUIET = 3.0  # s without a message of the robot, after which that is said
 HEARD = "agent_{}/heard/agent_{}"  # topic on which a robot is told what it hears of another agent
 
@@ -47,7 +48,8 @@ class TopicAgent(ExternalAgent):
         self._path = parse_path(self._field)
         self._hears = source.hears
         self._newest = math.nan
-        self._found = 0.0  # time at which its topic was there [s of the monotonic clock]
+        self._publishers: list[Publisher] = []  # of what it may read
+        self._matched, self._found = -1, 0.0  # readers of these, and when the last one was found [s, monotonic]
         self._came = math.inf  # time of the last message [s of the monotonic clock]
         self._node: Node | None = None
         self._subscription: Subscription | None = None
@@ -59,6 +61,7 @@ class TopicAgent(ExternalAgent):
 
         def publishing(topic: str) -> Callable[[float], None]:
             publisher = node.create_publisher(made.type, topic, qos_profile_sensor_data)
+            self._publishers.append(publisher)
             return lambda x: publisher.publish(made.message(x * self._unit))
 
         for j in self._record.model.listens()[self.number - 1].nonzero()[0].tolist():
@@ -75,7 +78,9 @@ class TopicAgent(ExternalAgent):
             kind = foreign_message_class(types[0])
             self._require_number(kind(), types[0])
             self._subscription = self._node.create_subscription(kind, self._topic, self._take, qos_profile_sensor_data)
-            self._found = time.monotonic()
+        readers = sum(publisher.get_subscription_count() for publisher in self._publishers)
+        if readers != self._matched:
+            self._matched, self._found = readers, time.monotonic()
         return [self._topic] if time.monotonic() < self._found + SETTLE else []
 
     def _require_number(self, message: Any, kind: str) -> None:
