@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from networks import experiment
 
+from msg_agents.channel.channel_file import Channel
 from msg_agents.process_layout import HostAssignment, Hosts, lay_out_network, partners
 from msg_agents.run.external import ExternalAgents, robot_topics
+from msg_agents.run.runner import run_network
 from msg_analysis.errors import InputError
+from msg_analysis.model.run_record import Until
 
 TOPICS = {2: "/robot_3/x", 4: "/robot_5/x"}
 
@@ -132,6 +135,16 @@ def test_their_processes(robots: Path | None) -> None:
     assert timeouts == dict.fromkeys(timeouts, "75") | {"switcher": "60"}
     found = partners(processes, np.ones((5, 5), dtype=bool))["agent_1"]
     assert found == {"agent_2", "agent_4", "recorder", "switcher"} | ({"agent_3", "agent_5"} if robots else set())
+
+
+def test_what_they_cannot_take_part_in(tmp_path: Path) -> None:
+    """Nothing is started."""
+    what = experiment(5, run={"external": [3]})
+    with pytest.raises(InputError, match=r"--until 1%: not with external agents without --map"):
+        run_network(what, tmp_path / "runs", until=Until.parse("1%"))
+    with pytest.raises(InputError, match=r"--channel: not with external agents: other programs do not reach its hosts"):
+        run_network(what, tmp_path / "runs", channel=Channel.parse({}, what))
+    assert not (tmp_path / "runs").exists()
 
 
 def test_on_several_hosts() -> None:
