@@ -11,7 +11,7 @@ class MyAgent(ExternalAgent):
     """It obeys the built-in law: Euler steps, with noise of its own."""
 
     gain = 1.0
-    random = np.random.default_rng(1)
+    random = np.random.default_rng()
 
     def step(self, k, graph, own, heard):  # noqa: ARG002
         """Next state; this law is the same in every step."""
@@ -23,5 +23,6 @@ class MyAgent(ExternalAgent):
 
 if __name__ == "__main__":
     agent = MyAgent(sys.argv[1], int(sys.argv[2]))
+    agent.random = np.random.default_rng([1, agent.number])  # the same numbers every time
     agent.gain = float(sys.argv[3]) if len(sys.argv) > 3 else 1.0
     agent.run()

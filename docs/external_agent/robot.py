@@ -21,7 +21,7 @@ class Robot(Node):
     def __init__(self, number, neighbours, gain=1.0):
         super().__init__(f"robot_{number}")
         self.x, self.gain, self.heard, self.last = 0.0, gain, {}, time.monotonic()
-        self.random = random.Random(1)
+        self.random = random.Random(number)
         self.publisher = self.create_publisher(Float64, f"robot_{number}/x", qos_profile_sensor_data)
         for j in neighbours:
             topic = f"agent_{number}/heard/agent_{j}"

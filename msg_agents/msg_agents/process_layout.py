@@ -13,7 +13,7 @@ import math
 import os
 import re
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -37,6 +37,7 @@ RECORDER, SWITCHER, CHANNEL = "recorder", "switcher", "channel"
 SMALL = 8  # agents that each have a process by ``processes: auto``; of more, so many share one, or more on few cores
 MOST_PROCESSES = 200  # of agents, which the relay connects: with all others they fill the ports of two ROS domains
 MOST_UNAIDED = 90  # of agents, which look for each other: some of the ``MOST_PARTICIPANTS`` of Fast DDS are others
+GRACE = 15.0  # s that agents wait for external ones longer than the switcher does
 SPARE_PARTICIPANTS = 8  # participants on a host besides those of the run, such as tools that watch it
 Spec = TypeVar("Spec", bound=BaseModel)
 _RANGE = re.compile(r"([0-9]+)-([0-9]+)")
@@ -67,6 +68,7 @@ class ProcessSpec:
     arguments: tuple[str, ...]  # of the command ``msg-agents``
     agents: tuple[int, ...] = ()  # indices from 0
     resumes: bool = False  # whether the same command takes over after the process was killed
+    external: bool = False  # whether it stands in for a robot of the user
 
     @property
     def nodes(self) -> list[str]:
@@ -135,9 +137,13 @@ def lay_out_network(
     readers: Sequence[str] = (),  # nodes that the user starts, and that must read the topics before the run starts
     most: int = MOST_UNAIDED,
     hosts: Sequence[Sequence[int]] = (),  # agents of each host of a channel: a process is on one; empty: no channel
+    robots: Path | None = None,  # map of the external agents, for which processes stand in; None: the user starts them
+    external_timeout: float = USER_TIMEOUT,  # s that external agents have to come
 ) -> list[ProcessSpec]:
     """The processes of a run, or of this host, in the order of their starts; InputError: too many with agents."""
-    here = tuple(range(experiment.agents)) if assignment is None else assignment.agents
+    external = experiment.external
+    there = range(experiment.agents) if assignment is None else assignment.agents
+    here = [agent for agent in there if agent not in external]
     groups = [group for part in hosts or [here] for group in split_agents(experiment, part, most=most)]
     count = len(groups)
     if count > most:
@@ -150,6 +156,8 @@ def lay_out_network(
     timeout = needed if assignment is None else assignment.discovery_timeout
     if readers or hosts:  # what a channel loses is sent again
         timeout = max(timeout, USER_TIMEOUT)
+    if external and assignment is None:
+        timeout = max(timeout, external_timeout + GRACE)  # the switcher knows all that are missing, and says it first
     if timeout != DISCOVERY_TIMEOUT:
         common += ("--discovery-timeout", f"{timeout:g}")
     awaited = ([RECORDER] if bag is not None or assignment is not None else []) + list(readers)
@@ -170,7 +178,12 @@ def lay_out_network(
         numbers = [part for agent in agents for part in ("--agent", str(agent + 1))]
         arguments = ("agent", str(run_file), *numbers, *options)
         processes.append(ProcessSpec(process_name(agents), arguments, agents, resumes))
+    for agent in sorted(external) if robots else ():
+        arguments = ("external", str(run_file), "--agent", str(agent + 1), "--map", str(robots), *options)
+        processes.append(ProcessSpec(process_name([agent]), arguments, (agent,), external=True))
     if central:
+        if external and assignment is None:
+            options += ("--discovery-timeout", f"{external_timeout:g}")
         processes.append(ProcessSpec(SWITCHER, ("switcher", str(run_file), *options), resumes=resumes))
     return processes
 
@@ -183,7 +196,8 @@ def partners(processes: Sequence[ProcessSpec], listens: BoolArray) -> dict[str, 
     central = {process.nodes[0] for process in processes if not process.agents}  # exchange messages with all
     found = {}
     for process in processes:
-        peers = {of_agent[int(j)] for i in process.agents for j in exchanges[i].nonzero()[0]}
+        heard = {int(j) for i in process.agents for j in exchanges[i].nonzero()[0]}
+        peers = {of_agent[j] for j in heard if j in of_agent}  # the user may have started the others
         found[process.nodes[0]] = (peers | central if process.agents else names) - {process.nodes[0]}
     return found
 
@@ -283,7 +297,8 @@ class Hosts:
         """Check a document from a YAML reader; the ExperimentError lists the mistakes, with ``source`` as place."""
         keys = "expected the keys domain, recorder and hosts: see `msg-agents host --help`"
         spec = validated(HostsSpec, document, source, keys)
-        problems = assignment_problems({name: host.agents for name, host in spec.hosts.items()}, experiment.agents)
+        listed = {name: host.agents for name, host in spec.hosts.items()}
+        problems = assignment_problems(listed, experiment.agents, experiment.external)
         if spec.recorder not in spec.hosts:
             wanted = f"expected one of the hosts, {', '.join(spec.hosts)}"
             problems.insert(0, problem("recorder", spec.recorder, wanted, "name one of them"))
@@ -332,8 +347,8 @@ class Hosts:
         return node_environment(self.domain, profile) | {PEERS_VARIABLE: " ".join(others)}
 
 
-def assignment_problems(hosts: Mapping[str, Sequence[int]], agents: int) -> list[str]:
-    """Mistakes in the numbers of the agents on each host, of an experiment with so many agents."""
+def assignment_problems(hosts: Mapping[str, Sequence[int]], agents: int, external: Collection[int] = ()) -> list[str]:
+    """Mistakes in the numbers of the agents on each host, of so many agents; ``external`` (from 0) are on none."""
     problems = []
     where: dict[int, list[str]] = {}
     for name, numbers in hosts.items():
@@ -346,7 +361,9 @@ def assignment_problems(hosts: Mapping[str, Sequence[int]], agents: int) -> list
     if twice:
         both = f"{min(twice)} is on {' and '.join(twice[min(twice)])}"
         problems.append(problem("agents", show(sorted(twice)), "expected each agent once", both))
-    missing = [number for number in range(1, agents + 1) if number not in where]
+    if ours := sorted(number for number in where if number - 1 in external):
+        problems.append(problem("agents", show(ours), "expected no external agents", "remove them: you start these"))
+    missing = [number for number in range(1, agents + 1) if number not in where and number - 1 not in external]
     if missing:
         problems.append(problem("agents", show(missing), "on no host", "name each agent on one"))
     return problems

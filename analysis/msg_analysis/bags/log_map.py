@@ -36,6 +36,12 @@ class Source(Section):
         description="instead of `field`: coordinates that move by the same law, independently of each other",
         examples=[["pose.pose.position.x", "pose.pose.position.y"]],
     )
+    hears: Literal["number", "point", "pose"] = Field(
+        "number",
+        description="in a run: what it is told of others. number: std_msgs/Float64, point and pose: "
+        "geometry_msgs/PointStamped and PoseStamped, with x = the state",
+        examples=["pose"],
+    )
 
     @property
     def all_fields(self) -> list[str]:
@@ -111,13 +117,14 @@ class LogMap(Section):
 
     def sources(self, agents: int, names: Sequence[str] | None = None) -> list[Source]:
         """Of all agents; InputError: the map does not mention one."""
-        found = [self._source(number, names[number - 1] if names else str(number)) for number in range(1, agents + 1)]
+        found = [self.source(number, names[number - 1] if names else str(number)) for number in range(1, agents + 1)]
         missing = [number for number, each in enumerate(found, start=1) if each is None]
         if missing:
             raise InputError(f"agents: {listed(missing)}: not in the map: expected all {agents} agents of the law")
         return [each for each in found if each is not None]
 
-    def _source(self, number: int, name: str) -> Source | None:
+    def source(self, number: int, name: str) -> Source | None:
+        """Of the agent with this number, from 1, and name; None: the map does not mention it."""
         for key in (number, str(number), name):
             if key in self.agents:
                 return self.agents[key]
@@ -132,6 +139,7 @@ class LogMap(Section):
             topic=filled(pattern.topic),
             field=filled(pattern.field),
             fields=pattern.fields and [str(filled(each)) for each in pattern.fields],
+            hears=pattern.hears,
         )
 
 

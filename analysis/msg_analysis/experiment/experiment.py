@@ -448,6 +448,11 @@ class Experiment(Variants):
         return validation.leader_gains(self.spec.leaders, self.agents)
 
     @property
+    def external(self) -> frozenset[int]:
+        """Agents (indices from 0) that are programs or robots of the user: a run does not start them."""
+        return frozenset(agent - 1 for agent in self.run.external or ())
+
+    @property
     def known_start(self) -> FloatArray | None:
         """(m,) x(0); None where it is drawn from the steady state."""
         start = self.run.start

@@ -167,6 +167,7 @@ class Sections:
         self._count_agents(directory)
         self._name_leaders()
         self._name_start()
+        self._name_external()
         run = self.values["run"]
         leaders = self.values["leaders"]
         leaders_good = self.values["problem"] is not None and "leaders" in self.known
@@ -180,6 +181,7 @@ class Sections:
         whole_steps = False
         if run and time:
             found = validation.run_problems(run, time, self.agents)
+            found += validation.external_problems(run, self.agents, protocol=self.values["protocol"] is not None)
             whole_steps = not found
             self.problems += found
         if self.agents is None or not self._fits(run if whole_steps else None):
@@ -423,6 +425,13 @@ class Sections:
             elif number is not None:
                 values[number - 1] = value
         self.values["run"] = run.model_copy(update={"start": values})
+
+    def _name_external(self) -> None:
+        """Numbers instead of names in ``run.external``."""
+        run = self.values["run"]
+        if run is not None and run.external:
+            numbers = [self._number("run.external", agent) for agent in run.external]
+            self.values["run"] = run.model_copy(update={"external": [n for n in numbers if n is not None]})
 
     def _numbered(self, key: str, given: Values) -> Values:
         """Numbers instead of names of agents in values by link."""

@@ -400,6 +400,17 @@ class RunSpec(Section):
     processes: Annotated[
         str | int, PlainValidator(_processes, json_schema_input_type=Literal["auto", "one_per_agent"] | Count)
     ] = Field("auto", description="'auto', 'one_per_agent' or a number of processes", examples=["auto"])
+    external: list[Agent] | None = Field(
+        None, min_length=1, description="agents that are programs or robots of yours, by number or name", examples=[[3]]
+    )
+    publish: list[Literal["pose"]] | None = Field(
+        None,
+        min_length=1,
+        description="what agents publish for programs of yours, beside their states. pose: "
+        "geometry_msgs/msg/PoseStamped on agent_<i>/pose, with x = the state",
+        examples=[["pose"]],
+    )
+    frame: str | None = Field(None, min_length=1, description="frame of the poses, by default map", examples=["odom"])
 
     @property
     def steps(self) -> int:

@@ -399,6 +399,24 @@ def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
     return found
 
 
+def external_problems(run: RunSpec, agents: int | None, *, protocol: bool) -> list[str]:
+    """External agents that are not there, or twice, or of a protocol; a frame without poses."""
+    found, external = [], run.external or []
+    for agent in dict.fromkeys(external):
+        if agents is not None and agent > agents:
+            found.append(problem("run.external", f"agent {agent}", f"expected agents 1 to {agents}", "correct it"))
+        if external.count(agent) > 1:
+            found.append(problem("run.external", f"agent {agent} twice", "expected every agent once", "remove one"))
+    if external and protocol:
+        wanted = "expected none with a protocol: its agents are in its package"
+        found.append(problem("run.external", show(external), wanted, "remove run.external, or the protocol"))
+    if run.publish and run.publish.count("pose") > 1:
+        found.append(problem("run.publish", show(run.publish), "expected each once", "remove one"))
+    if run.frame is not None and not run.publish:
+        found.append(problem("run.frame", show(run.frame), "expected with run.publish only", "remove it"))
+    return found
+
+
 def leader_gains(leaders: LeadersSpec | None, agents: int) -> FloatArray:
     """(m,) kappa; 0 for followers, inf for grounded leaders."""
     gains = np.zeros(agents)

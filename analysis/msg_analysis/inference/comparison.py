@@ -51,6 +51,7 @@ if TYPE_CHECKING:
 
 # Keys of an experiment that do not change its law
 MAY_DIFFER = {"name", "names", "run.seed", "run.duration", "run.processes", "run.speed"}
+MAY_DIFFER |= {"run.external", "run.publish", "run.frame"}
 
 
 def law_keys(experiment: Experiment) -> dict[str, Any]:
@@ -402,6 +403,7 @@ class Comparison:
             "experiment_identity": law_identity(record.experiment),
             "names": record.experiment.names,
             "leaders": (np.flatnonzero(record.experiment.leader_gains) + 1).tolist(),
+            "external": sorted(agent + 1 for agent in record.experiment.external),
             "seed": None if self.pool else record.experiment.run.seed,
             "level": self.level,
             "until": until,

@@ -103,13 +103,14 @@ STOP = Topic("stop", messages.PROGRESS, LATCHED, "switcher", "agents, recorder",
 # By which nodes that were started one by one know that they have the same run record: its digest as stamp.
 RECORD = Topic("record", messages.PROGRESS, LATCHED, "switcher", "agents, recorder")
 LEAVE = Topic("leave", messages.PROGRESS, LATCHED, "agents, switcher, recorder", "agents, switcher, recorder")
+POSE = Topic(f"agent_{_NUMBER}/pose", MessageType("geometry_msgs", "PoseStamped"), RECENT, "agent", "")
 ESTIMATE = Topic("estimate", messages.ESTIMATE, NEWEST, "live", "")
 MARKERS = Topic("markers", MessageType("visualization_msgs", "MarkerArray"), NEWEST, "markers", "")
 DIAGNOSTICS = Topic("/diagnostics", MessageType("diagnostic_msgs", "DiagnosticArray"), RECENT, "every process", "")
 CLOCK = Topic("/clock", MessageType("rosgraph_msgs", "Clock"), RECENT, "player", "nodes with use_sim_time")
 TOPICS = (
     *(EXPERIMENT, GRAPH, STATE, TRUTH, STATES, TRUTHS, PROGRESS, RESEND, EPOCH, END, STOP, RECORD, LEAVE),
-    *(ESTIMATE, MARKERS, DIAGNOSTICS, CLOCK),
+    *(POSE, ESTIMATE, MARKERS, DIAGNOSTICS, CLOCK),
 )
 
 

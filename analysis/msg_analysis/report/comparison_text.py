@@ -90,6 +90,12 @@ def print_comparison(document: dict[str, Any], console: Console, *, verbose: boo
         say(*_details(document))
 
 
+def external_words(agents: Sequence[int]) -> str:
+    """Which agents (from 1) are external."""
+    one = len(agents) == 1
+    return f"{'Agent' if one else 'Agents'} {', '.join(map(str, agents))} {'is' if one else 'are'} external."
+
+
 def _facts(document: dict[str, Any]) -> list[str]:
     """How many states there are, how the run ended, and what its errors leave out."""
     count = document["completeness"]
@@ -108,6 +114,8 @@ def _facts(document: dict[str, Any]) -> list[str]:
         nodes = Counter(line.partition(":")[0].replace("agent_", "agent ") for line in restarts)
         each = listed([node + (f" {times} times" if times > 1 else "") for node, times in nodes.items()])
         lines.append(with_names(f"{counted(len(restarts), 'restart')} ({each})", document.get("names")))
+    if external := document.get("external"):
+        lines.append(with_names(external_words(external), document.get("names")))
     lines += gaps(count)
     if document.get("unpredicted"):
         lines.append(f"No prediction: {document['unpredicted']}.")

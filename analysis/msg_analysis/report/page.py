@@ -26,7 +26,7 @@ from bokeh.resources import Resources
 from markupsafe import Markup
 
 from msg_analysis.common.files import write_whole
-from msg_analysis.common.text import counted, measured_text, p_text, percent, with_names
+from msg_analysis.common.text import agent_text, counted, listed, measured_text, p_text, percent, with_names
 from msg_analysis.errors import InputError, NotAvailableError
 from msg_analysis.inference.comparison import Comparison
 from msg_analysis.inference.observation import bounded
@@ -127,11 +127,13 @@ def run_facts(comparison: Comparison, wall_time: float | None) -> list[tuple[str
     time = " to ".join(f"{each:g}" for each in dict.fromkeys((durations[0], durations[-1])))
     steps = f", {counted(experiment.steps, 'step')} of {experiment.step_length:g}" if len(durations) == 1 else ""
     each = " each" if len(records) > 1 else ""
+    external = [agent_text(i + 1, experiment.names) for i in sorted(experiment.external)]
     return [
         (seeds, numbers),
         ("date", " to ".join(dict.fromkeys((dates[0], dates[-1]))) + " UTC"),
         ("duration", f"{time} units of time{steps}{each}" + (f", in {wall_time:.3g} s" if wall_time else "")),
         ("pace", "lockstep" if run.pace == "lockstep" else f"real time, {run.speed:g} units of time per second"),
+        *([("external", listed(external))] if external else []),
     ]
 
 

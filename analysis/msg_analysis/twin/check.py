@@ -13,6 +13,7 @@ import numpy as np
 from msg_analysis.arithmetic.reproducible import SECOND, StepClock
 from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.common.resources import tell
+from msg_analysis.errors import NotAvailableError
 from msg_analysis.model.graph_path import mode_path
 from msg_analysis.model.reception import Air, by_sender_and_block, neighbour_tables
 from msg_analysis.model.run import Run
@@ -35,7 +36,7 @@ def check(trajectory: Run) -> Check:
 
     In lockstep the twin needs only the run record, and every state has the stamp of its step. In real time it also
     takes from the log which values every agent used in every step, and no value may be used before it was made, by the
-    stamps.
+    stamps. States of external agents are not compared.
 
     Parameters
     ----------
@@ -45,14 +46,21 @@ def check(trajectory: Run) -> Check:
     Raises
     ------
     NotAvailableError
-        the twin cannot repeat a run of this kind
+        the twin cannot repeat a run of this kind, such as one in lockstep with external agents
     """
     record, count = trajectory.record, trajectory.completeness
     path = mode_path(record.experiment, record.model.initial)
     if record.experiment.run.pace == "realtime":
         difference, compared = _in_real_time(trajectory, path)
-        return Check(compared, count.expected - compared + count.missing_modes, difference)
+        agents = record.experiment.agents
+        expected = count.expected * (agents - len(record.experiment.external)) // agents
+        return Check(compared, expected - compared + count.missing_modes, difference)
     record.experiment.require_available()
+    if record.experiment.external:
+        raise NotAvailableError(
+            "run.external: the states of a run in lockstep follow from those of its external agents, which the twin "
+            "cannot compute"
+        )
     return Check(count.received, count.missing + count.missing_modes, _in_lockstep(trajectory, path))
 
 
@@ -95,7 +103,14 @@ def _in_real_time(trajectory: Run, path: IntArray) -> tuple[str | None, int]:
 def _states(trajectory: Run, block: RunBlock) -> list[tuple[str, FloatArray, FloatArray]]:
     """What is compared of states: a word for it, the logged ones of the block's steps, and those of the law."""
     arrays = ("logged", trajectory.states, block.states), ("published", trajectory.published, block.published)
-    return [(word, log[block.steps], law) for word, log, law in arrays if log is not None and law is not None]
+    external = sorted(trajectory.record.experiment.external)
+    found = []
+    for word, log, law in arrays:
+        if log is not None and law is not None:
+            known = law.copy() if external else law
+            known[:, external] = np.nan
+            found.append((word, log[block.steps], known))
+    return found
 
 
 def _with_progress(trajectory: Run, blocks: Iterable[RunBlock]) -> Iterable[RunBlock]:

@@ -127,6 +127,22 @@ def _interruption() -> Interruption:
 )
 @_override("delivery", "HOW", "best_effort or reliable (realtime)", "best_effort", "reliable")
 @_override("processes", "P", "auto, one_per_agent or a number", "auto", "one_per_agent")
+@click.option(
+    "--external", metavar="AGENTS", help="Overrides run.external: agents that are programs or robots of yours, 3,5."
+)
+@click.option(
+    "--map",
+    "robots",
+    type=YAML,
+    metavar="MAP",
+    help="Where the external agents publish their states: they are robots, and need nothing else (realtime).",
+)
+@positive_option(
+    "--external-timeout",
+    "SECONDS",
+    "How long to wait for an external agent, to come and for each step [s].",
+    default=USER_TIMEOUT,
+)
 @_restarts("agents or the switcher")
 @click.option(
     "--domain", type=click.IntRange(0, LAST_DOMAIN), metavar="D", show_default="a free one", help="ROS_DOMAIN_ID."
@@ -165,6 +181,7 @@ def run(
     until_text: str | None,
     readers: tuple[str, ...],
     use_sim_time: bool,
+    external: str | None,
     channel_file: Path | None,
     no_fork: bool,
     storage: Storage,
@@ -187,6 +204,9 @@ def run(
     interruption = _interruption()
     until = Until.parse(until_text) if until_text is not None else None
     values = {key: given.pop(key) for key in ("seed", "duration", "pace", "speed", "delivery", "processes")}
+    if external is not None:
+        words = [word.strip() for word in external.split(",") if word.strip()]
+        values["external"] = [int(word) if word.isdecimal() else word for word in words]
     what = load_with_overrides(
         experiment,
         values,

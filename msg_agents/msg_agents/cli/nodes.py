@@ -168,21 +168,27 @@ def agent(
     _run_nodes(nodes, record, **options)
 
 
-@click.command(epilog=examples("msg-agents external run.json --agent 5 --map map.yaml --await recorder"))
-@click.argument("run_record", type=RUN_RECORD)
-@_agent
-@click.option("--map", "mapped", type=YAML, metavar="MAP", required=True, help="Where its state is: topic and field.")
-@_await
-@positive_option(
-    "--discovery-timeout", "SECONDS", "How long to wait for the other nodes [s].", default=DISCOVERY_TIMEOUT
+@click.command(
+    cls=RosCommand, epilog=examples("msg-agents external run.json --agent 5 --map map.yaml --await recorder")
 )
+@_node_options
+@_agent
+@click.option("--map", "map_file", type=YAML, metavar="MAP", required=True, help="Where its state is: topic and field.")
+@_await
+@click.option("--checkpoint", type=PATH, hidden=True)
 def external(
-    run_record: Path, *, agents: tuple[int, ...], mapped: Path, readers: tuple[str, ...], discovery_timeout: float
+    run_record: Path,
+    *,
+    agents: tuple[int, ...],
+    map_file: Path,
+    readers: tuple[str, ...],
+    checkpoint: Path | None,
+    **options: Any,
 ) -> None:
     """Stand in a run for a robot of one's own.
 
     The robot publishes its state on the topic that the map names, in real time, and may read what it hears of agent J
-    on agent_I/heard/agent_J (std_msgs/Float64). `msg-analysis compare BAG --law --map` judges the bag.
+    on agent_I/heard/agent_J (std_msgs/Float64). `msg-agents run --external --map` starts this by itself.
     """
     from msg_agents.nodes.topic_agent import TopicAgent
     from msg_analysis.bags.log_map import load_map
@@ -190,9 +196,9 @@ def external(
 
     if len(agents) > 1:
         raise InputError(f"--agent: {list(agents)}: expected one agent: start a process for each robot")
-    robot = TopicAgent(run_record, agents[0], load_map(mapped), readers=readers)
-    if not robot.run(discovery_timeout=discovery_timeout):
-        sys.exit(ExitCode.INCOMPLETE)
+    record = load_record(run_record)
+    robot = TopicAgent(record, agents[0], load_map(map_file), readers=readers)
+    _run_nodes(lambda: list(robot.make_nodes(checkpoint)), record, **options)
 
 
 @click.command(cls=RosCommand, epilog=examples("msg-agents switcher run.json --await recorder"))

@@ -23,6 +23,7 @@ from msg_agents.process_layout import RECORDER
 from msg_agents.recovery import Checkpoint, entry_size, published_size
 from msg_agents.stepping.monitoring import StallDetector
 from msg_agents.stepping.synchronizer import AgentInputs
+from msg_analysis.arithmetic.update_law import from_payload
 from msg_analysis.errors import InputError
 from msg_analysis.experiment.protocols import ProtocolError
 from msg_analysis.messages import topics
@@ -75,6 +76,9 @@ class Program(Protocol):
 
     def started(self, first: int) -> None:
         """In real time: the first step is due when the clock of the node says ``first`` [ns]."""
+
+    def waiting_for(self) -> str | None:
+        """What it lacks in the middle of the run, in words."""
 
 
 class Agent(NetworkNode):
@@ -139,6 +143,12 @@ class Agent(NetworkNode):
         self._answered = -ANSWER_PERIOD  # time at which they were repeated last [s of the monotonic clock]
         self._states = self.publisher_of(topics.STATE, agent)
         self._exact: Publisher | None = self.publisher_of(topics.TRUTH, agent) if experiment.truth else None
+        self._pose: Callable[[float], None] | None = None
+        if experiment.run.publish:
+            from msg_agents.nodes.poses import StateMessages  # few runs need these messages
+
+            poses, make = self.publisher_of(topics.POSE, agent), StateMessages(self, record, "pose").message
+            self._pose = lambda x: poses.publish(make(x))
 
     @property
     def number(self) -> int:
@@ -236,6 +246,8 @@ class Agent(NetworkNode):
         value = law.published(law.step, law.state) if self._exact is not None else b""
         self._published.write(law.step, message + value)
         self._send(law.step, mode, law.state, message, value)
+        if self._pose is not None:
+            self._pose(float(from_payload(value or law.state)[0]))
 
     def _parts(self, entry: bytes) -> tuple[bytes, bytes]:
         """An entry of the checkpoint: the message, and what is published of its state if that is not the state."""

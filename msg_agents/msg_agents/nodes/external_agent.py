@@ -29,13 +29,20 @@ from msg_analysis.model.run_record import RunRecord
 from msg_analysis.model.step_model import Wiring
 
 
+def _read(file: str | Path) -> RunRecord:
+    try:
+        return RunRecord.from_json(read_text(Path(file)), str(file))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file}: cannot be read ({error}): expected what `msg-agents prepare` prints") from error
+
+
 class ExternalAgent:
     """The base class. Subclass it, write ``step``, and call ``run``; the other nodes are started as usual.
 
     Parameters
     ----------
     record
-        file of the run record, of ``msg-agents prepare``
+        the run record, or its file, of ``msg-agents prepare`` or as ``msg-agents run`` says
     agent
         number of this agent, from 1; the agents of other programs run beside it
     readers
@@ -54,13 +61,8 @@ class ExternalAgent:
         a record that cannot be read, an agent that it does not have, or a protocol
     """
 
-    def __init__(self, record: str | Path, agent: int, *, readers: Sequence[str] = (RECORDER,)) -> None:
-        try:
-            self._record = RunRecord.from_json(read_text(Path(record)), str(record))
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(
-                f"{record}: cannot be read ({error}): expected what `msg-agents prepare` prints"
-            ) from error
+    def __init__(self, record: str | Path | RunRecord, agent: int, *, readers: Sequence[str] = (RECORDER,)) -> None:
+        self._record = record if isinstance(record, RunRecord) else _read(record)
         self.experiment, self.number, self._readers = self._record.experiment, agent, readers
         if not 1 <= agent <= self.experiment.agents:
             raise InputError(f"agent: {agent}: expected a number from 1 to {self.experiment.agents}")
@@ -99,6 +101,24 @@ class ExternalAgent:
     def started(self, first: int) -> None:
         """In real time: called once, when it is known that the first step is due at this time of the clock [ns]."""
 
+    def waiting_for(self) -> str | None:
+        """In real time: called about once a second; what it lacks, in words, for who watches the run."""
+
+    def make_nodes(self, checkpoints: Path | None = None) -> Sequence[Agent]:
+        """Its node, once ROS is there; ``checkpoints``: where its states are kept for who watches the run."""
+        law = ExternalLaw(self._record, self._record.model, self)
+        group = AgentGroup(
+            record=self._record,
+            model=self._record.model,
+            agents=[self.number - 1],
+            readers=list(self._readers),
+            checkpoints=checkpoints,
+            law=lambda _record, _model, _agent: law,
+            program=self,
+        )
+        self.connected(group.nodes[0])
+        return group.nodes
+
     def run(self, *, discovery_timeout: float = DISCOVERY_TIMEOUT) -> bool:
         """Take part in the run, to its end; False if it was stopped before, by a signal.
 
@@ -107,25 +127,10 @@ class ExternalAgent:
         InputError
             the other nodes were not found within ``discovery_timeout`` [s], or ``step`` has failed: ``__cause__``
         """
-        record = self._record
-
-        def nodes() -> Sequence[Agent]:
-            law = ExternalLaw(record, record.model, self)
-            group = AgentGroup(
-                record=record,
-                model=record.model,
-                agents=[self.number - 1],
-                readers=list(self._readers),
-                law=lambda _record, _model, _agent: law,
-                program=self,
-            )
-            self.connected(group.nodes[0])
-            return group.nodes
-
         executor = os.environ.get("MSG_AGENTS_EXECUTOR") or "events"
         throughput = self.experiment.run.pace == "lockstep"
         return run_nodes(
-            nodes,
+            self.make_nodes,
             executor=executor,
             throughput=throughput,
             discovery_timeout=discovery_timeout,

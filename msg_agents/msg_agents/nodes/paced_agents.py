@@ -275,6 +275,8 @@ class RealtimeAgent(Agent):
         if self.values.finished:
             return Health("has made all steps", values=values)
         waiting = self._waiting_for()
+        if self._schedule and self._program and (words := self._program.waiting_for()):
+            return Health(words, waiting=True, values=values)
         if overdue and waiting:
             self.get_logger().warning(f"no step for {stall.stalled:.0f} s at step {step}: waiting for {waiting}")
         if stall.stalled and waiting:

@@ -130,6 +130,8 @@ def load_experiment(arguments: Mapping[str, str]) -> Experiment:
     experiment = load_with_overrides(file, changes, name=lambda key: f"{key}:={arguments[key].strip()}")
     print_notes(experiment)
     experiment.require_available()
+    if experiment.external:
+        raise InputError("run.external: a launch file starts all agents: use `msg-agents run`, or remove it")
     if "speed" in changes and experiment.run.pace == "lockstep":
         raise InputError(f"speed:={arguments['speed']}: a run in lockstep has no speed: add pace:=realtime")
     return experiment

@@ -15,7 +15,14 @@ from pathlib import Path
 
 from msg_agents.channel.channel_file import Channel
 from msg_agents.channel.process import open_hosts
-from msg_agents.environment import RESTARTS, ROS_LOGS, require_middleware, run_environment, uses_relay
+from msg_agents.environment import (
+    RESTARTS,
+    ROS_LOGS,
+    USER_TIMEOUT,
+    require_middleware,
+    run_environment,
+    uses_relay,
+)
 from msg_agents.process_layout import (
     MOST_PROCESSES,
     MOST_UNAIDED,
@@ -27,6 +34,7 @@ from msg_agents.process_layout import (
     partners,
 )
 from msg_agents.recovery import entry_size, room_for
+from msg_agents.run.external import ExternalAgents, robot_topics
 from msg_agents.run.folder import make_bag_directory, temporary_directory
 from msg_agents.run.fork_server import ForkServer
 from msg_agents.run.result import EventLog, RunResult
@@ -50,7 +58,7 @@ from msg_analysis.bags.stored_file import DEFAULT_STORAGE, Storage
 from msg_analysis.bags.writing import RECORDING_MARKER
 from msg_analysis.common.resources import available_cores
 from msg_analysis.common.text import agent_text
-from msg_analysis.errors import BagError
+from msg_analysis.errors import BagError, InputError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.model.run_record import RunRecord, Until
 from msg_analysis.twin.simulate import new_record
@@ -84,6 +92,8 @@ def run_network(
     until: Until | None = None,
     hung_timeout: float = HUNG,
     stuck_timeout: float = STUCK,
+    robots: Path | None = None,
+    external_timeout: float = USER_TIMEOUT,
 ) -> RunResult:
     """Run an experiment as a network of ROS 2 processes.
 
@@ -136,6 +146,10 @@ def run_network(
         s without running after which a process whose main thread waits is ended and started again
     stuck_timeout
         s without a step after which the run ends, on one machine, although all of its processes run
+    robots
+        map file of the external agents, which are then robots with topics; None: the user starts them as nodes
+    external_timeout
+        s that external agents have to come, and to make a step
 
     Returns
     -------
@@ -150,6 +164,12 @@ def run_network(
     """
     view = view or View(on_progress, on_note)
     experiment.require_available()
+    external = ExternalAgents(experiment, robot_topics(experiment, robots) if robots else {}, external_timeout)
+    own_observer = assignment is None and not (experiment.external and robots is None)  # whether all states are here
+    if until and not own_observer:
+        raise InputError(f"--until {until}: not with external agents without --map: their states are not known here")
+    if channel and experiment.external:
+        raise InputError("--channel: not with external agents: other programs do not reach its hosts")
     most = MOST_PROCESSES if channel is None and uses_relay(environment or {}) else MOST_UNAIDED
     count = count_processes(experiment, None if assignment is None else len(assignment.agents), most=most)
     directory = make_bag_directory(experiment, out.absolute()) if out is not None else None
@@ -198,6 +218,8 @@ def run_network(
                         readers=readers,
                         most=MOST_PROCESSES if relay else MOST_UNAIDED,
                         hosts=linked.agents if linked else (),
+                        robots=robots and robots.absolute(),
+                        external_timeout=external_timeout,
                     )
                     lockstep = experiment.run.pace == "lockstep"
                     if linked:
@@ -209,10 +231,11 @@ def run_network(
                     supervisor.start(processes)
                     ending = EarlyEnd(record, checkpoints) if until and checkpoints else None
                     with ending or nullcontext():
-                        kept_here = checkpoints if assignment is None else None
-                        view.begin(record, kept_here, ending.observer if ending else None)
+                        view.begin(record, checkpoints if own_observer else None, ending.observer if ending else None)
                         view.started(supervisor.by_node)
-                        parts = supervisor, result, restarts, signals, view, ending, linked
+                        if SWITCHER in supervisor.by_node and (words := external.how_to_start(run_file, domain)):
+                            view.note(words)
+                        parts = supervisor, result, restarts, signals, view, ending, linked, external
                         # Across hosts, and over links that are cut, others know better whether somebody is waited for.
                         alone = assignment is None and linked is None
                         stuck = StuckDetector(stuck_timeout) if alone else None
@@ -221,7 +244,7 @@ def run_network(
                         view.end()
                     result.until = ending.to_json() if ending else None
                     # Before the supervisor ends the rest: what ends because we end it has not failed.
-                    _collect_failures(supervisor, result, signals, restarts)
+                    _collect_failures(supervisor, result, signals, restarts, external)
                     if result.failures and not result.interrupted:
                         supervisor.drain()
             result.rejected_messages = supervisor.status().rejected_messages()
@@ -255,6 +278,7 @@ def _watch(
     view: View,
     ending: EarlyEnd | None,
     linked: RunChannel | None,
+    external: ExternalAgents,
     *,
     follow_clock: bool,  # whether the nodes' clock is that of this machine
     stuck: StuckDetector | None,
@@ -287,7 +311,13 @@ def _watch(
             lag = LagDetector(due)
         if stall.update(sum(supervisor.steps)) and reached >= 0:
             view.note(f"{_still(reached < steps, stall.stalled)}: {supervisor.stall_causes(result.experiment.names)}")
+        for line in external.notes(lambda: supervisor.status().waiting):
+            view.note(line)
+        if words := external.failure(supervisor.steps, steps):
+            result.failures.append(words)
+            return
         excused = run.pace == "realtime" and 0 <= reached < steps  # its clock may stand still
+        excused |= external.holds_up(supervisor.steps, steps)
         excused |= stall.stalled > 1.0 and bool(supervisor.silent)
         if stuck and stuck.update(sum(supervisor.steps), excused=excused):
             causes = supervisor.stall_causes(result.experiment.names)
@@ -337,16 +367,22 @@ def _revive(supervisor: Supervisor, result: RunResult, restarts: int, view: View
     return True
 
 
-def _collect_failures(supervisor: Supervisor, result: RunResult, interruption: Interruption, restarts: int) -> None:
+def _collect_failures(
+    supervisor: Supervisor, result: RunResult, interruption: Interruption, restarts: int, external: ExternalAgents
+) -> None:
     result.reached = min(supervisor.steps, default=-1)
     if (number := interruption.take()) is not None:
         reached, steps = result.reached, result.experiment.steps
         unknown = all(child.spec.name != SWITCHER for child in supervisor.children)  # it is on another host
         where = "" if unknown else f"at step {reached} of {steps}" if reached >= 0 else "before step 0"
         result.interrupt(number, where)
+    if words := external.not_discovered(child.last_line() for child in supervisor.failures):
+        result.failures.append(words)  # the others have failed for that
+        return
     for child in supervisor.failures:
         words = child.last_line()
-        line = f"{child.spec.name}: {child.failure}" + (f": {words}" if words else "")
+        whose = " (external)" if child.spec.external else ""
+        line = f"{child.spec.name}{whose}: {child.failure}" + (f": {words}" if words else "")
         if result.bag and child.has_traceback():
             line += f"; traceback in log/{child.log.name}"
         if child.resumes and result.restarts:

@@ -203,7 +203,7 @@ def _agents(snapshot: Snapshot, experiment: Experiment, room: int) -> list[Rende
         which = "agents with the largest |z|" if judged else "slowest agents" if steps_known else "first agents"
         tail = [_summary(snapshot, experiment), Text(f"above: the {which}", style="dim")]
     for i in order:
-        cells = [shorten(agent_name(i + 1, experiment.names))]
+        cells = [shorten(agent_name(i + 1, experiment.names)) + (" (external)" if i in experiment.external else "")]
         if steps_known:
             cells += [str(snapshot.steps[i]), f"{snapshot.rates[i]:.0f}" if snapshot.rates else "-"]
         node = nodes[i] if nodes else None

@@ -189,6 +189,7 @@ def run_description(experiment: Experiment) -> dict[str, Any]:
         "pace": experiment.run.pace,
         "silent": silent_after(due_rate(experiment)) if experiment.run.pace == "realtime" else SILENT,
         "leaders": list(experiment.spec.leaders.agents) if experiment.spec.leaders else [],
+        "external": sorted(experiment.external),
         "reference": experiment.reference if experiment.spec.leaders else None,
         "graphs": [
             {

@@ -61,6 +61,13 @@ def test_of_a_network(tmp_path: Path, changes: dict[str, str], words: str) -> No
     assert not (tmp_path / "runs").exists()
 
 
+def test_of_a_network_with_robots(tmp_path: Path) -> None:
+    file = tmp_path / "net.yaml"
+    file.write_text("{name: net, graphs: {line: {path: [1, 2]}}, run: {external: [2]}}")
+    with pytest.raises(InputError, match=r"run.external: a launch file starts all agents: use `msg-agents run`"):
+        LaunchedNetwork(NETWORK | {"out": str(tmp_path / "runs"), "experiment": str(file)})
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

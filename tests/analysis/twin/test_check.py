@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from experiments import Run, check, flipped, line_ring, simulate, stored
+from msg_analysis.errors import NotAvailableError
 from msg_analysis.twin.check import Check
 
 
@@ -31,6 +32,11 @@ def test_equal(kind: str, request: pytest.FixtureRequest, tmp_path: Path) -> Non
     outcome = checked(request.getfixturevalue(kind), tmp_path)
     assert (outcome.difference, outcome.missing) == (None, 0)
     assert outcome.compared == 401 * 3 * (2 if kind == "noisy" else 1)
+
+
+def test_external_agents(tmp_path: Path) -> None:
+    with pytest.raises(NotAvailableError, match=r"run.external: the states of a run in lockstep follow from those of"):
+        checked(simulate(line_ring(run={"external": [2]})), tmp_path)
 
 
 @pytest.mark.parametrize("where", [(0, 0, 0), (17, 2, 1), (400, 1, 0)])

@@ -45,6 +45,16 @@ def test_the_last_bit(late: Run, tmp_path: Path, step: int) -> None:
     )
 
 
+@pytest.mark.parametrize(("agent", "found"), [(2, None), (1, "agent 2 at step 400, replica 2: logged")])
+def test_external_agents(late: Run, tmp_path: Path, agent: int, found: str | None) -> None:
+    """What they do is theirs, what the others do is not. Nobody has heard of the last step."""
+    record = dataclasses.replace(late.record, experiment=LAW.with_run(external=[3]))
+    states = flipped(late.states, 400, agent, 1)
+    outcome = check(stored(dataclasses.replace(late, record=record, states=states), tmp_path))
+    assert (outcome.missing, outcome.compared) == (0, 3 * 401)
+    assert outcome.difference is found if found is None else str(outcome.difference).startswith(found)
+
+
 def test_something_else_used(late: Run, tmp_path: Path) -> None:
     used = late.used.copy()
     used[200, 1, 0] -= 1

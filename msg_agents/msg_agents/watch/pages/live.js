@@ -71,7 +71,7 @@ function begin(data) {
   rows = balls.map((_, agent) => {
     const row = document.createElement("tr");
     for (let place = 0; place < columns().length; place += 1) row.append(document.createElement("td"));
-    row.cells[0].textContent = called(agent);
+    row.cells[0].textContent = called(agent) + (setting.external.includes(agent) ? " (external)" : "");
     row.cells[1].className = "step";
     row.cells[2].className = "fresh";
     body.append(row);
