@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +17,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from msg_analysis.common.files import read_text, write_whole
+from msg_analysis.common.files import lock, read_text, write_whole
 from msg_analysis.common.text import json_text, percent
 from msg_analysis.errors import InputError
 from msg_analysis.inference.e_values import share_evidence
@@ -158,7 +160,7 @@ def accept(
         of the metric, in words and tables
     state
         a file (JSON) in which the runs are kept from call to call; one for each claim. Each run is in it before the
-        next begins
+        next begins, and calls at the same time add up
     revision
         of what is tested, such as a commit: runs of another one in the file do not count and are replaced
     junit
@@ -188,10 +190,11 @@ def accept(
         value = next(numbers, None)
         if value is None:
             break
-        found = Acceptance(claim, (*found.values, _number(value, name)))
+        number = _number(value, name)
         if file:
-            document = {"claim": _document(claim), "revision": revision, "values": list(map(_written, found.values))}
-            write_whole(file, json_text(document, 1).encode() + b"\n")
+            found = Acceptance(claim, _kept(file, claim, revision, number))
+        else:
+            found = Acceptance(claim, (*found.values, number))
     if junit is not None:
         write_whole(Path(junit), found.to_junit())
     if found.decision == "rejected":
@@ -220,6 +223,19 @@ def _document(claim: Claim) -> dict[str, Any]:
 def _written(value: float) -> float | str:
     """JSON has no numbers that are not finite."""
     return value if math.isfinite(value) else str(value)
+
+
+def _kept(file: Path, claim: Claim, revision: str | None, number: float) -> tuple[float, ...]:
+    """Add a run to the file, after those that other calls have added meanwhile; all of them."""
+    folder = os.open(file.parent, os.O_RDONLY)
+    try:
+        lock(folder, fcntl.LOCK_EX, file)  # of the folder, since the file is replaced
+        values = (*_earlier(file, claim, revision), number)
+        document = {"claim": _document(claim), "revision": revision, "values": list(map(_written, values))}
+        write_whole(file, json_text(document, 1).encode() + b"\n")
+    finally:
+        os.close(folder)
+    return values
 
 
 def _earlier(file: Path, claim: Claim, revision: str | None) -> tuple[float, ...]:

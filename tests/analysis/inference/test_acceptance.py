@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -89,6 +91,18 @@ def test_state_and_junit(tmp_path: Path) -> None:
     failure = ElementTree.parse(junit).getroot().find("testcase/failure")
     assert failure is not None
     assert failure.get("message", "").startswith("rejected: metric at most 30")
+
+
+def test_two_jobs_at_once(tmp_path: Path) -> None:
+    """Two processes with one file: no run of either is lost, and their numbers tell which."""
+    script = "import sys; from msg_analysis.testing import accept; n = float(sys.argv[1])\n"
+    script += "accept(iter([n] * 20), at_most=1.0, in_share=0.99, margin=0.01, most=20, state=sys.argv[2])"
+    state = tmp_path / "state.json"
+    jobs = [subprocess.Popen([sys.executable, "-c", script, str(n), str(state)]) for n in (0.25, 0.75)]
+    assert [job.wait(timeout=60) for job in jobs] == [0, 0]
+    values = json.loads(state.read_text())["values"]
+    assert sorted(values) == [0.25] * 20 + [0.75] * 20
+    assert [path.name for path in tmp_path.iterdir()] == ["state.json"]
 
 
 def test_a_run_that_raises_loses_nothing(tmp_path: Path) -> None:
