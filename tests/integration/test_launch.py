@@ -1,5 +1,6 @@
 """The launch files under the real ``ros2 launch``, with the workspace as colcon has installed it."""
 
+import json
 import os
 import re
 import shutil
@@ -279,3 +280,13 @@ def test_a_replay(network: Any, launch: Launch, twin_bag: Path) -> None:
     output, _ = process.communicate(timeout=100)
     assert (process.returncode, errors(output)) == (0, []), output
     assert "messages played" in output
+
+
+def test_a_launch_test_with_a_claim(tmp_path: Path) -> None:
+    """The example of the documentation: its record agrees, and the claim, of one run, is open."""
+    pytest.importorskip("launch_testing")
+    example = Path(__file__).parents[2] / "docs/external_agent/robot_launch_test.py"
+    command = [sys.executable, "-m", "launch_testing.launch_test", str(example)]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert len(json.loads((tmp_path / "launched/error.json").read_text())["values"]) == 1
