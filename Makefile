@@ -119,7 +119,7 @@ STRESS ?= 20
 stress: setup ## Repeat every random fault 20 times (STRESS=N: N times), run every combination of laws and messages: five minutes
 	STRESS=$(STRESS) $(BIN)/python -m pytest $(SEVERAL_AT_ONCE) --verbose -k "repetition_ or (test_links and (lockstep or real_time))" $(addprefix tests/integration/test_,restart.py faults.py rejected_messages.py realtime.py hosts.py links.py random_networks.py)
 
-fuzz: setup ## Damage 20,000 bags and 20,000 experiment files: only clean errors
+fuzz: setup ## Damage 20,000 bags, 20,000 experiment files, 10,000 logs of others: only clean errors
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python benchmarks/fuzz.py
 
 # In a folder of its own, so that what the software needs stays as it is pinned.

@@ -1,4 +1,4 @@
-"""Thousands of damaged bags and experiment files: only clean errors, in bounded memory and time.
+"""Thousands of damaged bags, experiment files, and logs of others: only clean errors, in bounded memory and time.
 
 Every case is made from a seed, so that it can be made again. What is not an error for the user (InputError), what
 takes longer than a minute of CPU time, or needs more memory than a network of the size allowed, is a finding: its
@@ -26,6 +26,7 @@ import fuzz_bombs
 import yaml
 from fuzz_bags import make_bags, mutate_bag
 from fuzz_documents import BOMB, mutate_document, mutate_text
+from fuzz_logs import fuzz_log, write_sources
 from mcap.reader import make_reader
 
 from msg_analysis.bags.reading import read_bag
@@ -125,6 +126,9 @@ def _check_words(error: InputError) -> None:
     assert 10 < len(str(error)) < 20_000, f"message of {len(str(error))} characters: {str(error)[:300]}"
 
 
+KINDS = {"bags": fuzz_bag, "experiments": fuzz_experiment, "logs": fuzz_log}
+
+
 def work(task: tuple[str, int, int, list[Path], Path]) -> tuple[Counter[str], list[str], float, int]:
     """A stretch of seeds in a process of its own: outcomes, findings, the longest case [s], most memory [kB]."""
     kind, first, last, sources, findings = task
@@ -140,7 +144,7 @@ def work(task: tuple[str, int, int, list[Path], Path]) -> tuple[Counter[str], li
             begun = time.process_time()
             signal.setitimer(signal.ITIMER_PROF, SECONDS)  # CPU time: the machine may have other things to do
             try:
-                outcomes[(fuzz_bag if kind == "bags" else fuzz_experiment)(seed, sources, folder)] += 1
+                outcomes[KINDS[kind](seed, sources, folder)] += 1
             except BaseException as error:  # whatever it is, it is what is looked for
                 signal.setitimer(signal.ITIMER_PROF, 0)
                 if isinstance(error, KeyboardInterrupt):
@@ -178,10 +182,11 @@ def run(kind: str, count: int, seed: int, sources: list[Path], findings: Path, j
 
 
 def main() -> None:
-    """Fuzz both kinds."""
+    """Fuzz all kinds."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--bags", type=int, default=20_000)
     parser.add_argument("--experiments", type=int, default=20_000)
+    parser.add_argument("--logs", type=int, default=10_000, help="of others, with maps")
     parser.add_argument("--bombs", action=argparse.BooleanOptionalAction, default=True, help="also fuzz_bombs.py")
     parser.add_argument("--seed", type=int, default=0, help="of the first case of each kind")
     parser.add_argument("--jobs", type=int, default=2)
@@ -194,6 +199,10 @@ def main() -> None:
         total = run("bags", arguments.bags, arguments.seed, bags, *common) if bags else 0
         if arguments.experiments:
             total += run("experiments", arguments.experiments, arguments.seed, files, *common)
+        if arguments.logs:
+            folder = Path(place) / "logs"
+            folder.mkdir()
+            total += run("logs", arguments.logs, arguments.seed, write_sources(folder), *common)
         if arguments.bombs:
             total += fuzz_bombs.run(Path(place))
     sys.exit(1 if total else 0)

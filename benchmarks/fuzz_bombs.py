@@ -132,6 +132,22 @@ def bags() -> Iterator[tuple[str, bytes]]:
     yield "times_beyond_all_clocks", START + chunk(channel(1, "/agent_1/state") + message(1, time=2**64 - 1) * 1000)
 
 
+def definitions() -> Iterator[tuple[str, bytes, bytes]]:
+    """Names, definitions and encodings of types that take long to understand."""
+
+    def fields(inner: str) -> str:
+        return "\n".join(f"{inner} f{k}" for k in range(2000))
+
+    wide = fields("A") + "".join(
+        f"\n{'=' * 80}\nMSG: a/{one}\n{fields(other)}" for one, other in ("AB", "BC", ("C", "bool"))
+    )
+    yield "wide_type", wide.encode(), b"ros2msg"
+    begin, end = "module a { module msg { ", "struct B { double x; }; }; };"
+    yield "expression", (begin + "const long A = " + "(" * 9 + "1" + ")" * 9 + "; " + end).encode(), b"ros2idl"
+    constants = "".join(f"const long A{k} = 1; " for k in range(12_000))
+    yield "constants", (begin + constants + end).encode(), b"ros2idl"
+
+
 def documents() -> Iterator[tuple[str, bytes]]:
     """Names and contents of experiment files, a GraphML file among them."""
     start = "name: x\nproblem: consensus\nchain: {type: uniform, rate: 1}\n"
@@ -168,16 +184,25 @@ def cases(folder: Path) -> Iterator[tuple[str, list[str]]]:
             yield f"{command} {name}", [command, str(file)]
         yield f"salvage {name}", ["salvage", str(file), str(folder / f"{name}.salvaged")]
         file.unlink()
+    for name, definition, encoding in definitions():
+        content = struct.pack("<H", 2) + text("a/msg/B") + struct.pack("<I", len(encoding)) + encoding
+        content += struct.pack("<I", len(definition)) + definition
+        topics = b"".join(channel(i, f"/tank_{i}", of=2) for i in range(1, 201))
+        (folder / f"{name}.mcap").write_bytes(
+            START + chunk(record(SCHEMA, content) + topics + message(1, CDR + bytes(8)))
+        )
+        yield f"map {name}", ["map", str(folder / f"{name}.mcap")]
+        yield f"map --check {name}", ["map", str(folder / f"{name}.mcap"), "--check"]
     for name, data in documents():
         assert len(data) <= LARGEST, f"{name}: {len(data)} bytes"
         file = folder / name
         file.write_bytes(data)
         if file.suffix == ".graphml":
-            content = (
+            written = (
                 f"name: x\nproblem: consensus\nchain: {{type: uniform, rate: 1}}\ngraphs: {{a: {{graphml: {name}}}}}\n"
             )
             file = folder / "experiment.yaml"
-            file.write_text(content, encoding="utf-8")
+            file.write_text(written, encoding="utf-8")
         for command in ("info", "predict"):
             yield f"{command} {name}", [command, str(file)]
     for file in (endless(folder), Path("/dev/zero")):

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections import Counter, deque
 from collections.abc import Sequence
@@ -18,11 +19,12 @@ import numpy as np
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.bags.files import FileInventory, bag_files, stored_file, total_channels
 from msg_analysis.bags.log_map import EVERY, NUMBER, LogMap, parse_map
-from msg_analysis.bags.mapped_log import STAMP, Contents, Series, is_table, read_contents, read_table
-from msg_analysis.bags.message_fields import definitions, leaves
+from msg_analysis.bags.mapped_log import Contents, Series, is_table, read_contents, read_table, usable
+from msg_analysis.bags.message_fields import Definitions, is_stamped, leaves
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.common.text import listed
 from msg_analysis.errors import InputError, NotAvailableError
+from msg_analysis.experiment.values import is_count
 
 FIELDS = {  # of types that tell where something is, the likeliest first
     "nav_msgs/msg/Odometry": "pose.pose.position.x",
@@ -63,17 +65,19 @@ def topics_of(bag: Path) -> list[Topic]:
         for channel in inventory.file.channels.values():
             found.setdefault(channel.topic, inventory.file.schemas.get(channel.schema_id))
     counts = total_channels([inventory.count for inventory in inventories])
-    topics = []
+    topics, definitions = [], Definitions()
     for name, schema in sorted(found.items()):
         several: list[tuple[str, str]] = []
+        stamped = False
         try:
-            several = leaves(definitions(schema), schema.name) if schema else []
+            if schema:
+                types = definitions.of(schema)
+                several, stamped = leaves(types, schema.name), is_stamped(types, schema.name)
         except NotAvailableError:
             raise
         except InputError:
             pass
         fields = tuple(each for each, kind in several if kind.startswith("float"))
-        stamped = set(STAMP) <= {each for each, _ in several}
         topics.append(Topic(name, schema.name if schema else "", counts[name].messages, stamped, fields))
     return topics
 
@@ -94,9 +98,9 @@ def first_map(bag: Path) -> str:
         "agents:",
     ]
     if pattern:
-        lines.append(f'  "{EVERY}": {{topic: "{pattern}", field: {field}}}  # {len(agents)} agents')
+        lines.append(f'  "{EVERY}": {{topic: {_quoted(pattern)}, field: {field}}}  # {len(agents)} agents')
     else:
-        lines += [f'  {i}: {{topic: "{topic.name}", field: {field}}}' for i, topic in enumerate(agents, start=1)]
+        lines += [f"  {i}: {{topic: {_quoted(topic.name)}, field: {field}}}" for i, topic in enumerate(agents, start=1)]
     if others:
         lines.append(f"# other numbers in {agents[0].type}: {listed(others, 8)}")
     stamped = all(topic.stamped for topic in agents)
@@ -104,7 +108,7 @@ def first_map(bag: Path) -> str:
     texts = [topic for topic in topics if topic.type == TEXT]
     graphs = [topic for topic in texts if OF_NETWORK.search(topic.name)]
     if graphs:
-        lines.append(f'graph: {{topic: "{graphs[0].name}", field: data}}  # names of the graphs of the law')
+        lines.append(f"graph: {{topic: {_quoted(graphs[0].name)}, field: data}}  # names of the graphs of the law")
     else:
         lines.append("# graph: {topic: /network/active, field: data}   or {file: trace.csv}, or, if it never changed:")
         lines.append("# graph: {fixed: NAME}")
@@ -117,7 +121,12 @@ def first_map(bag: Path) -> str:
     used = {topic.name for topic in (*agents, *graphs[:1])}
     rest = [f"#   {each.name}: {each.type}, {each.messages} messages" for each in topics if each.name not in used]
     lines += ["# topics that are not used:", *rest] if rest else []
-    return "\n".join(lines) + "\n"
+    return "\n".join(" ".join(line.splitlines()) for line in lines) + "\n"  # no name in a bag makes a line of its own
+
+
+def _quoted(text: str) -> str:
+    """As YAML and JSON write it."""
+    return json.dumps(text, ensure_ascii=True)
 
 
 def _agents(topics: Sequence[Topic]) -> list[Topic]:
@@ -176,11 +185,15 @@ def check_log(path: Path, mapped: LogMap | None) -> dict[str, Any]:
 
 def _count(path: Path, mapped: LogMap) -> int:
     """Number of agents: those that the map lists, or whose topics or columns are there."""
-    listed_ = [int(key) for key in mapped.agents if str(key).isdigit()]
+    listed_ = {int(key) for key in mapped.agents if is_count(key) or re.fullmatch(r"[0-9]{1,9}", str(key))}
     pattern = mapped.agents.get(EVERY)
     if pattern is None:
-        return max(listed_, default=len(mapped.agents))
-    text = pattern.topic if pattern.topic and NUMBER in pattern.topic else pattern.all_fields[0]
+        if listed_ and max(listed_) > len(mapped.agents):
+            raise InputError(f"agents: {max(listed_)}: expected all agents from 1: the map has {len(mapped.agents)}")
+        return len(mapped.agents)
+    text = next((each for each in (pattern.topic, *pattern.all_fields) if each and NUMBER in each), None)
+    if text is None:
+        raise InputError(f"agents.{EVERY}: by name: how many are there? expected {NUMBER}, or agents one by one")
     there = set(read_table(path)) if is_table(path) else {topic.name for topic in topics_of(path)}
     number = 1
     while number in listed_ or text.replace(NUMBER, str(number)) in there:
@@ -198,7 +211,7 @@ def _agent(number: int, series: Series, start: int) -> dict[str, Any]:
     usual = float(np.median(forward)) if len(forward) else None
     gaps = forward[forward > GAP * usual] if usual else np.empty(0)
     regular = forward[forward <= GAP * usual] if usual else np.empty(0)
-    finite = values[np.isfinite(values).all(axis=1)]
+    finite = values[usable(values)]
     return {
         "agent": number,
         "source": series.what,

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,7 +21,10 @@ from msg_analysis.experiment.values import NonNegative, Positive, Section, expec
 EVERY = "*"  # key of the entry of all agents that have none of their own
 NUMBER, NAME = "{i}", "{name}"  # in a topic or field of that entry
 
-Text = Annotated[str, Field(min_length=1)]
+Seconds = Annotated[Positive, Field(ge=1e-9, le=1e9)]
+Scale = Annotated[Positive, Field(ge=1e-50, le=1e50)]
+LONGEST = 1000  # characters of a topic or field
+Text = Annotated[str, Field(min_length=1, max_length=LONGEST)]
 
 
 class Source(Section):
@@ -72,8 +76,8 @@ class GraphSource(Section):
 class Units(Section):
     """How large the units of the law are in the log."""
 
-    time: Positive = Field(1.0, description="s per unit of simulated time", examples=[1.0])
-    state: Positive = Field(1.0, description="units of the log per unit of the law's states", examples=[0.01])
+    time: Seconds = Field(1.0, description="s per unit of simulated time", examples=[1.0])
+    state: Scale = Field(1.0, description="units of the log per unit of the law's states", examples=[0.01])
 
 
 def _noise(value: object) -> float | list[float] | str:
@@ -98,7 +102,7 @@ class LogMap(Section):
         description="'header' (stamp of the message), 'log' (when it was recorded), or the column of a table",
         examples=["log"],
     )
-    period: Positive | None = Field(
+    period: Seconds | None = Field(
         None, description="use the first sample of each agent in every such time [s]; by default all", examples=[0.1]
     )
     graph: GraphSource | None = Field(
@@ -170,6 +174,12 @@ def parse_map(document: Mapping[Any, Any], source: str) -> LogMap:
         lines.append(
             problem(f"agents.{EVERY}", "missing {i}", "expected {i} or {name} in the topic or field", "add it")
         )
+    texts = Counter(map(str, found.agents))
+    lines += [
+        problem(f"agents.{key}", "given twice", "expected it once", "remove one") for key in texts if texts[key] > 1
+    ]
+    if any(len(set(each.all_fields)) < len(each.all_fields) for each in found.agents.values()):
+        lines.append(problem("agents", "a field twice", "expected different coordinates of an agent", "remove one"))
     if len({len(each.all_fields) for each in found.agents.values()}) > 1:
         lines.append(problem("agents", "fields", "expected as many coordinates of every agent", "correct them"))
     if found.graph:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import csv
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,20 +17,22 @@ import numpy as np
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.bags.files import bag_files, stored_file
 from msg_analysis.bags.log_map import EVERY, GraphSource, LogMap, Source
-from msg_analysis.bags.message_fields import FieldError, FieldReader, leaves
-from msg_analysis.common.arrays import AnyArray, FloatArray, IntArray
+from msg_analysis.bags.message_fields import STAMP, Definitions, FieldError, FieldReader, is_stamped
+from msg_analysis.common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 from msg_analysis.common.resources import require_pyarrow, tell
-from msg_analysis.common.text import counted, listed
+from msg_analysis.common.text import amount, counted, listed
 from msg_analysis.errors import BagError, InputError, NotAvailableError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graph_files import GraphError
 from msg_analysis.experiment.traces import read_trace
+from msg_analysis.experiment.values import LARGEST_NUMBER
 from msg_analysis.model.log import Log
 
 TABLES = (".csv", ".parquet", ".npz")
-STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 MOST_BACK = 5.0  # median intervals that a stamp may lie before an earlier one; more is a jump of the clock
 LONGEST_CELL = 2**20
+LARGEST_TABLE = 2**29  # bytes of its columns
+LARGEST_CSV = 2**26  # bytes of the file, of which each cell becomes a text
 
 
 @dataclass(slots=True, eq=False)
@@ -40,11 +43,19 @@ class Series:
     times: list[IntArray] = field(default_factory=list)  # [ns]
     values: list[AnyArray] = field(default_factory=list)  # (b, R), or (b,) of graphs
     short: int = 0  # messages that do not have the field
+    logged: list[IntArray] = field(default_factory=list)  # when they were recorded [ns]; none of a table
 
     @property
     def count(self) -> int:
         """Of its values."""
         return sum(map(len, self.times))
+
+    def sort(self, first: int) -> None:
+        """Put what came from the piece ``first`` on into the order in which it was recorded."""
+        if len(self.times) > first:
+            order = np.argsort(np.concatenate(self.logged[first:]), kind="stable")
+            for pieces in (self.times, self.logged, self.values):
+                pieces[first:] = [np.concatenate(pieces[first:])[order]]
 
     def joined(self) -> tuple[IntArray, AnyArray]:
         """(K,) times and (K, R) values, or (K,) of graphs."""
@@ -92,10 +103,11 @@ def _of_bag(path: Path, wanted: list[tuple[str, list[str]]], time: str, agents: 
         by_topic.setdefault(topic, []).append(place)
     notes: dict[str, None] = {}
     topics: set[str] = set()
+    definitions = Definitions()
     for path_ in bag_files(path):
         file = stored_file(path_)
         readers: dict[int, list[tuple[int, FieldReader, bool]]] = {}
-        known, size = 0, path_.stat().st_size
+        known, size, before = 0, path_.stat().st_size, [len(each.times) for each in series]
         for batch in file.batches():
             tell(f"reading {path_.name}", min(batch.end, size), size)
             for number in list(file.channels)[known:]:
@@ -107,12 +119,13 @@ def _of_bag(path: Path, wanted: list[tuple[str, list[str]]], time: str, agents: 
                         raise BagError(f"{path}: topic {channel.topic}: has no type: record it again")
                     try:
                         fields = wanted[place][1]
-                        stamped = time == "header" and _has_header(schema)
+                        types = definitions.of(schema)
+                        stamped = time == "header" and is_stamped(types, schema.name)
                         if time == "header" and not stamped:
                             if place < agents:
                                 raise FieldError(f"time: header: {schema.name} has no header: expected `time: log`")
                             notes[f"The messages on {channel.topic} have no header: the times of the log count."] = None
-                        reader = FieldReader(schema, [*fields, *(STAMP if stamped else ())])
+                        reader = FieldReader(schema.name, types, [*fields, *(STAMP if stamped else ())])
                     except NotAvailableError:
                         raise
                     except InputError as error:
@@ -123,6 +136,9 @@ def _of_bag(path: Path, wanted: list[tuple[str, list[str]]], time: str, agents: 
                 chosen = np.flatnonzero(batch.channel == number)
                 for place, reader, stamped in several if len(chosen) else ():
                     _add(series[place], reader, batch, chosen, stamped, wanted[place][1], graph=place >= agents)
+        if file.unpacked_messages:  # rosbag2 compresses them in several threads, and writes each when it is done
+            for each, first in zip(series, before, strict=True):
+                each.sort(first)
         if file.torn is not None or file.damaged_chunks:
             notes[f"{path_.name} is torn or damaged: what is left is used."] = None
     empty = [each for each in series if not each.count]
@@ -133,13 +149,6 @@ def _of_bag(path: Path, wanted: list[tuple[str, list[str]]], time: str, agents: 
     return series, list(notes)
 
 
-def _has_header(schema: Any) -> bool:
-    from msg_analysis.bags.message_fields import definitions
-
-    names = {name for name, _ in leaves(definitions(schema), schema.name)}
-    return set(STAMP) <= names
-
-
 def _add(
     series: Series, reader: FieldReader, batch: Any, chosen: IntArray, stamped: bool, fields: list[str], *, graph: bool
 ) -> None:
@@ -147,10 +156,9 @@ def _add(
     series.short += len(chosen) - len(kept)
     if not len(kept):
         return
-    times = batch.head["log_time"][kept].astype(np.int64)
-    if stamped:
-        times = arrays[STAMP[0]] * SECOND + arrays[STAMP[1]]
-    series.times.append(times)
+    logged = batch.head["log_time"][kept].astype(np.int64)
+    series.times.append(arrays[STAMP[0]] * SECOND + arrays[STAMP[1]] if stamped else logged)
+    series.logged.append(logged)
     if graph:
         series.values.append(arrays[fields[0]])
         return
@@ -164,14 +172,19 @@ def read_table(path: Path) -> dict[str, AnyArray]:
     """Columns of a CSV, Parquet or NPZ file; InputError: it cannot be read."""
     try:
         if path.suffix.lower() == ".npz":
+            with zipfile.ZipFile(path) as packed:
+                _require_size(path, sum(each.file_size for each in packed.infolist()), LARGEST_TABLE)
             with np.load(path, allow_pickle=False) as archive:
                 return {name: archive[name] for name in archive.files}
         if path.suffix.lower() == ".parquet":
             require_pyarrow(str(path))
             import pyarrow.parquet
 
+            about = pyarrow.parquet.read_metadata(path)
+            _require_size(path, 8 * about.num_rows * about.num_columns, LARGEST_TABLE)
             table = pyarrow.parquet.read_table(path)
             return {name: table.column(name).to_numpy() for name in table.column_names}
+        _require_size(path, path.stat().st_size, LARGEST_CSV)
         csv.field_size_limit(LONGEST_CELL)
         with path.open(newline="", encoding="utf-8-sig") as stream:
             rows = csv.reader(stream)
@@ -187,6 +200,11 @@ def read_table(path: Path) -> dict[str, AnyArray]:
     except Exception as error:  # the readers raise many kinds of errors on damage
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise InputError(f"{path}: cannot be read as {path.suffix[1:].upper()} ({reason})") from None
+
+
+def _require_size(path: Path, size: int, most: int) -> None:
+    if size > most:
+        raise InputError(f"{path}: {amount(size)}: expected at most {amount(most)}: split it, or use fewer samples")
 
 
 def _column(columns: Mapping[str, AnyArray], path: Path, name: str) -> AnyArray:
@@ -284,10 +302,15 @@ def positions(bag: Path, mapped: LogMap) -> tuple[float, list[tuple[float, str, 
     return first / SECOND, sorted(rows, key=lambda row: row[0])
 
 
+def usable(values: FloatArray) -> BoolArray:
+    """(K,) whether all of (K, R) are numbers whose squares are, too."""
+    return np.asarray((np.abs(values) <= LARGEST_NUMBER).all(axis=1))
+
+
 def _cleaned(series: Series, number: int, period: float | None, notes: list[str]) -> tuple[IntArray, FloatArray]:
     """Ascending times and values, without duplicates and NaN; InputError: the clock jumps back."""
     times, values = series.joined()
-    finite = np.asarray(np.isfinite(values).all(axis=1))
+    finite = usable(values)
     steps = np.diff(times)
     usual = float(np.median(np.abs(steps))) if len(steps) else 0.0
     back = np.flatnonzero(steps < -max(MOST_BACK * usual, 1.0))

@@ -11,9 +11,10 @@ last field are the same: then numpy reads thousands of messages at once.
 from __future__ import annotations
 
 import functools
+import itertools
 import re
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,8 +28,12 @@ from msg_analysis.errors import InputError, NotAvailableError
 
 HEADER = 4  # bytes of the encapsulation; alignment counts from its end
 LONGEST_DEFINITION = 2**18  # bytes
+MOST_DEFINITIONS = 2**21  # bytes of all definitions of a bag, which are parsed in 5 s
+IDL_FACTOR = 25  # ros2idl takes so much longer to parse
+STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 DEEPEST = 32  # types within types
 LAYOUTS = 50  # of a batch, after which messages are read one by one
+MOST_LEAVES = 10_000  # numbers and texts of a type that are listed
 STORE = "ROS2_JAZZY"  # whose types are used where a bag has no definitions
 _CODES = {
     "bool": "?",
@@ -40,6 +45,9 @@ _CODES = {
     "float32": "f",
     "float64": "d",
 }
+_EXPRESSION = re.compile(
+    r'"(?:\\.|[^"\\])*"|//.*|@\w+\s*\([^()"]*(?:"(?:\\.|[^"\\])*"[^()"]*)*\)'
+)  # has no ( of its own
 _NO_IDL = re.compile(r"^(=+|IDL: .*|#.*)$", re.MULTILINE)  # between and in definitions; the parser does not know it
 _PART = re.compile(r"([A-Za-z]\w*)((?:\[\d+\])*)")
 _INTEGER = re.compile(r"\[(\d+)\]")
@@ -63,16 +71,14 @@ def parse_path(text: str) -> Path:
     return tuple(parts)
 
 
-@functools.lru_cache(maxsize=64)
-def _definitions(name: str, encoding: str, text: bytes) -> Types:
+@functools.lru_cache(maxsize=256)
+def _definitions(name: str, idl: bool, text: bytes) -> Types:
     try:
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
     except ImportError:
         raise NotAvailableError(
             "rosbags is not installed: expected it for messages of any type: pip install rosbags"
         ) from None
-    if len(text) > LONGEST_DEFINITION or b"<<" in text:
-        raise FieldError(f"type {name}: its definition has {len(text)} bytes or shifts: expected a plain definition")
     known: Types = get_typestore(Stores[STORE]).fielddefs
     if not text.strip():
         if name not in known:
@@ -80,7 +86,8 @@ def _definitions(name: str, encoding: str, text: bytes) -> Types:
         return known
     try:
         source = text.decode()
-        idl = encoding in ("ros2idl", "omgidl") or source.lstrip("=\n ").startswith("IDL: ")
+        if idl and ("<<" in source or "(" in _EXPRESSION.sub("", source)):  # the parser takes 70 times longer for each
+            raise ValueError("it has expressions: expected plain numbers")
         found: Types = get_types_from_idl(_NO_IDL.sub("", source)) if idl else get_types_from_msg(source, name)
     except Exception as error:  # the parser raises many kinds of errors on wrong definitions
         reason = " ".join(str(error).split())[:200] or type(error).__name__
@@ -88,20 +95,45 @@ def _definitions(name: str, encoding: str, text: bytes) -> Types:
     return {**known, **found}
 
 
-def definitions(schema: Schema) -> Types:
-    """The types in a schema, and those of ROS 2; FieldError: they are not valid."""
-    return _definitions(schema.name, schema.encoding, bytes(schema.data))
+@dataclass(slots=True)
+class Definitions:
+    """Reads the types in the schemas of a bag, together with those of ROS 2."""
+
+    left: int = MOST_DEFINITIONS
+    _seen: set[tuple[str, str, bytes]] = field(default_factory=set)
+
+    def of(self, schema: Schema) -> Types:
+        """All types by name; FieldError: the definition is not valid, or those of the bag are too long to be parsed."""
+        text = bytes(schema.data)
+        idl = schema.encoding in ("ros2idl", "omgidl") or text.lstrip(b"=\r\n ").startswith(b"IDL: ")
+        key, size = (schema.name, schema.encoding, text), len(text) * (IDL_FACTOR if idl else 1)
+        if key not in self._seen:
+            self._seen.add(key)
+            self.left -= size
+        if len(text) > LONGEST_DEFINITION or self.left < 0:
+            raise FieldError(f"type {schema.name[:200]}: its definition, or all before it, are too long to be read")
+        return _definitions(schema.name, idl, text)
+
+
+def is_stamped(types: Types, name: str) -> bool:
+    """Whether all messages have a header with a stamp."""
+    kinds = dict(leaves(types, name))
+    return kinds.get(STAMP[0]) in ("int32", "uint32") and kinds.get(STAMP[1]) == "uint32"
 
 
 def leaves(types: Types, name: str, deepest: int = 4) -> list[tuple[str, str]]:
-    """Path and type of the numbers and texts that each message has, without those in arrays."""
-    found: list[tuple[str, str]] = []
+    """Path and type of the first numbers and texts that each message has, without those in arrays."""
+    return list(itertools.islice(_leaves(types, name, "", deepest, [MOST_LEAVES]), MOST_LEAVES))
+
+
+def _leaves(types: Types, name: str, before: str, deepest: int, left: list[int]) -> Iterator[tuple[str, str]]:
+    """The same one after the other; ``left``: how many types may still be entered, since those may be empty."""
     for each, (kind, detail) in types.get(name, (None, ()))[1]:
         if int(kind) == 1:
-            found.append((each, detail[0]))
-        elif int(kind) == 2 and deepest:
-            found += [(f"{each}.{inner}", base) for inner, base in leaves(types, detail, deepest - 1)]
-    return found
+            yield before + each, detail[0]
+        elif int(kind) == 2 and deepest and left[0]:
+            left[0] -= 1
+            yield from _leaves(types, detail, f"{before}{each}.", deepest - 1, left)
 
 
 @dataclass(slots=True)
@@ -116,8 +148,8 @@ class _Layout:
 class FieldReader:
     """Reads some fields of the messages of one type. FieldError: it does not have them."""
 
-    def __init__(self, schema: Schema, paths: Sequence[str]) -> None:
-        self.name, self._types = schema.name, definitions(schema)
+    def __init__(self, name: str, types: Types, paths: Sequence[str]) -> None:
+        self.name, self._types = name, types
         self.paths = {text: parse_path(text) for text in paths}
         for text, path in self.paths.items():
             self._require(text, path)
@@ -195,7 +227,10 @@ class FieldReader:
                 texts.append(data[start + 4 : start + 4 + length].rstrip(b"\0").decode("utf-8", "replace"))
             return np.array(texts, dtype=object)
         kind = np.dtype(order + code)
-        return gather(data, at, kind.itemsize).view(kind).astype(np.float64 if code in "fd" else np.int64)
+        values = gather(data, at, kind.itemsize).view(kind)
+        large = code == "Q" and len(values) and values.max() >= 2**63
+        with np.errstate(invalid="ignore"):  # of a signalling NaN
+            return np.asarray(values.astype(np.float64 if code in "fd" or large else np.int64))
 
     def _layout(self, data: bytes) -> _Layout:
         """Where the fields are in a message; FieldError: it is too short, or of another encoding."""

@@ -117,12 +117,14 @@ def _is_quantity(name: str, values: Sequence[object]) -> bool:
 
 def file_content(key: str, file: Path) -> bytes:
     """The bytes of a file of bounded size; ``key`` is for the GraphError."""
+    if file.exists() and not file.is_file():  # a pipe or terminal would be waited for
+        raise GraphError(key, str(file), "not a regular file", "give the path of a file")
     try:
         return read_bytes(file)
     except FileNotFoundError as error:
         raise GraphError(key, str(file), "no such file", "the path is relative to the experiment file") from error
-    except OSError as error:
-        raise GraphError(key, str(file), "cannot be read", str(error.strerror)) from error
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in its name
+        raise GraphError(key, show(str(file)), "cannot be read", getattr(error, "strerror", str(error))) from error
 
 
 def _tree(key: str, file: Path) -> Element:

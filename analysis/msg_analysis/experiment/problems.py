@@ -75,6 +75,7 @@ _EXPECTED = {
     "int_from_float": "expected a whole number",
     "string_type": "expected a text",
     "string_too_short": "expected a text that is not empty",
+    "string_too_long": "expected at most {max_length} characters",
     "string_pattern_mismatch": "expected a name of the form {pattern}",
     "list_type": "expected a list",
     "dict_type": "expected keys with values",

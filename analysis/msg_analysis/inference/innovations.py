@@ -381,8 +381,11 @@ def estimate_noise(of: Filter, most: int) -> tuple[float, float]:
     largest at 0.
     """
     m = of.law.agents
-    differences = np.diff(of.values, axis=0)
-    scale = float(np.nanmedian(differences**2)) / 0.455 or of.spread**2
+    # Of each agent, from value to value: no two agents need to be measured at the same time.
+    differences = np.concatenate(
+        [np.diff(of.values[there, i], axis=0).ravel() for i, there in enumerate(of.present.T) if there.any()]
+    )
+    scale = (float(np.median(differences**2)) if len(differences) else 0.0) / 0.455 or of.spread**2
     variance = 0.25 * scale
     count = min(most, len(of.times))
 

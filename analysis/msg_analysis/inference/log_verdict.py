@@ -40,6 +40,7 @@ FEWEST = 50  # samples
 ESTIMATED_FROM = 20_000  # samples with which the measurement noise is searched for
 MOST_MATRICES = 60_000_000  # numbers in the matrices that the mean error needs
 VARIANCES = ("noise", "measurement_noise")  # kinds of causes
+MOST_CHANGE = 100.0  # of a weight; a log that knows nothing of the gains can ask for more, and for unstable laws
 OTHER_FAMILIES = 3  # of causes: rates, exchanged agents, a held leader
 
 
@@ -257,7 +258,7 @@ def _causes(
     if any(name.startswith(("innovations", "system")) for name in rejected):
         unit = of.law.unit
         several, change = parameter_causes(parameters, log.law, unit, OTHER_FAMILIES, level)
-        if change.any() and any(cause.kind in VARIANCES for cause in several):
+        if 0.0 < np.abs(change).max(initial=0.0) < MOST_CHANGE and any(cause.kind in VARIANCES for cause in several):
             # A wrong gain makes innovations larger, too: variances are judged with the gains that were found.
             law = of.law.changed(found.terms, change)
             again = of.under(law).run(noise, terms=found.terms, most=min(len(log.times), ESTIMATED_FROM))

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from msg_analysis.inference.log_verdict import LogComparison
 
 SampledLaw = Literal["continuous", "steps"]
+LARGEST = 1e15  # state or noise: its square, times that of the start, is a number of single precision
+LONGEST = 1e6  # interval [units of simulated time]: the matrices of a longer one lose their digits
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -120,8 +122,13 @@ class Log:
             raise InputError(f"{shape}: expected (N,) and (N, {law.agents}) or (N, {law.agents}, coordinates)")
         if len(moments) < 2 or not np.isfinite(moments).all() or (np.diff(moments) <= 0).any():
             raise InputError("times: expected at least two finite numbers that ascend")
-        if np.isinf(values).any():
-            raise InputError("states: infinite numbers: expected finite ones, or NaN where an agent was not measured")
+        if (np.abs(values) > LARGEST).any():
+            wanted = f"expected at most {LARGEST:g}, or NaN where an agent was not measured: are the units right?"
+            raise InputError(f"states: up to {np.nanmax(np.abs(values)):g}: {wanted}")
+        if (gap := float(np.diff(moments).max())) > LONGEST:
+            raise InputError(
+                f"times: {gap:g} units without a sample: expected at most {LONGEST:g}: are the units right?"
+            )
         starts, graphs = _path(law, graph, moments[0])
         first = int(np.searchsorted(moments, starts[0]))
         if first:
@@ -131,9 +138,14 @@ class Log:
         noise = None
         if not isinstance(measurement_noise, str):
             noise = np.asarray(measurement_noise, dtype=float)
-            if noise.shape not in ((), (law.agents,)) or not np.isfinite(noise).all() or (noise < 0).any():
-                wanted = f"expected a number >= 0, {law.agents} of them, or 'estimate'"
-                raise InputError(f"measurement_noise: {measurement_noise}: {wanted}")
+            if (
+                noise.shape not in ((), (law.agents,))
+                or not np.isfinite(noise).all()
+                or (noise < 0).any()
+                or (noise > LARGEST).any()
+            ):
+                wanted = f"expected a number from 0 to {LARGEST:g}, {law.agents} of them, or 'estimate'"
+                raise InputError(f"measurement_noise: {str(measurement_noise)[:60]}: {wanted}")
             noise = np.broadcast_to(noise, law.agents).copy()
         elif measurement_noise != "estimate":
             raise InputError(f"measurement_noise: {measurement_noise!r}: expected a number >= 0 or 'estimate'")

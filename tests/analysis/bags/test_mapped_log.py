@@ -265,13 +265,13 @@ def test_random_bytes_in_messages_are_left_out(tmp_path: Path) -> None:
         ({"agents": {1: {"topic": "/robot_1/pose", "feild": "x"}}}, "did you mean 'field'"),
         ({"agents": {}}, "agents: .*expected at least 1 entries"),
         ({"time": 3}, "time: 3: expected a text"),
-        ({"period": 0}, "period: 0: expected a number > 0"),
+        ({"period": 0}, "period: 0: expected a number >= 1e-09"),
         ({"measurement_noise": "much"}, "expected a standard deviation >= 0, one per agent, or 'estimate'"),
         ({"graph": {"topic": "/network/active"}}, "graph: none: expected one of `topic` with `field`"),
         ({"graph": {"fixed": "line", "hold": 1.0}}, r"graph\.hold: given: expected with `file` only"),
         ({"graph": {"fixed": "line", "file": "a.csv"}}, "graph: file, fixed: expected one of"),
         ({"law": "euler"}, "law: \"euler\": expected 'continuous' or 'steps'"),
-        ({"units": {"time": -1}}, r"units\.time: -1: expected a number > 0"),
+        ({"units": {"time": -1}}, r"units\.time: -1: expected a number >= 1e-09"),
     ],
 )
 def test_mistakes_in_a_map(changes: dict[str, Any], message: str) -> None:

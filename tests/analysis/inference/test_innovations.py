@@ -270,13 +270,13 @@ GOOD: dict[str, Any] = {"times": np.arange(60.0), "states": np.zeros((60, 5)), "
     [
         ({"times": np.arange(60.0)[::-1]}, "expected at least two finite numbers that ascend"),
         ({"states": np.zeros((60, 4))}, r"expected \(N,\) and \(N, 5\)"),
-        ({"states": np.full((60, 5), np.inf)}, "infinite numbers"),
+        ({"states": np.full((60, 5), np.inf)}, r"states: up to inf: expected at most 1e\+15"),
         ({"states": [["a"] * 5] * 60}, "states: expected numbers"),
         ({"graph": None}, "expected which of line, ring was there when"),
         ({"graph": "star"}, "graph: star: expected one of line, ring"),
         ({"graph": ([0.0, 1.0], ["line"])}, "expected one for each graph, ascending"),
         ({"graph": ([99.0], ["line"])}, "are the clocks the same"),
-        ({"measurement_noise": -1.0}, "expected a number >= 0, 5 of them, or 'estimate'"),
+        ({"measurement_noise": -1.0}, r"expected a number from 0 to 1e\+15, 5 of them, or 'estimate'"),
         ({"measurement_noise": "yes"}, "expected a number >= 0 or 'estimate'"),
     ],
 )
