@@ -107,7 +107,7 @@ def first_map(bag: Path) -> str:
         lines.append(f'graph: {{topic: "{graphs[0].name}", field: data}}  # names of the graphs of the law')
     else:
         lines.append("# graph: {topic: /network/active, field: data}   or {file: trace.csv}, or, if it never changed:")
-        lines.append("# graph: {fixed: NAME}")
+        lines.append("# graph: {fixed: NAME}   or, if it is not known: hidden")
     lines += [
         "measurement_noise: estimate  # or a standard deviation, 0 if the states are exact",
         "# units: {time: 1.0, state: 1.0}  # s per unit of time of the law; units of the log per unit of its states",

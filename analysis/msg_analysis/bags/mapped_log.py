@@ -24,7 +24,7 @@ from msg_analysis.errors import BagError, InputError, NotAvailableError
 from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graph_files import GraphError
 from msg_analysis.experiment.traces import read_trace
-from msg_analysis.model.log import Log
+from msg_analysis.model.log import HIDDEN, Log
 
 TABLES = (".csv", ".parquet", ".npz")
 STAMP = ("header.stamp.sec", "header.stamp.nanosec")
@@ -241,6 +241,10 @@ def read_log(path: Path, mapped: LogMap, law: Experiment, directory: Path | None
     origin = int(every[0])
     unit = SECOND * mapped.units.time
     graph: Any = mapped.graph.fixed if mapped.graph else None
+    if mapped.graph and mapped.graph.hidden:
+        if any(each.name == HIDDEN for each in law.graph_list):
+            raise InputError(f"{law.source}: graphs.{HIDDEN}: expected another name with `graph: {HIDDEN}`: rename it")
+        graph = HIDDEN
     if mapped.graph and mapped.graph.file:
         moments, names = _traced(mapped.graph, law, directory or Path())
         graph = ((moments * SECOND - origin) / unit, names)
