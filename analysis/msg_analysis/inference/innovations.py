@@ -57,8 +57,8 @@ class Innovations:
     samples: int  # N - 1, of which intervals end in
     scored: int  # samples with derivatives by the variances
     off_reference: tuple[int, int, float] | None = None  # sample, agent, deviation of a held leader that is not held
-    maps: FloatArray | None = None  # (N, m, m) single precision: Phi of the interval before each sample
-    gains: FloatArray | None = None  # (N, m, m) single precision: covariance of what each sample adds to ``filtered``
+    maps: FloatArray | None = None  # (N, m, m): Phi of the interval before each sample
+    gains: FloatArray | None = None  # (N, m, m): covariance of what each sample adds to ``filtered``
     # Of a hidden path: (N, n, m, m) E[x x^T; graph | y(0), ..., y(k)], all coordinates, and (N, n) P(graph | ...).
     moments: FloatArray | None = None
     probabilities: FloatArray | None = None
@@ -154,8 +154,8 @@ class _Pass:
             log_likelihood=0.0,
             samples=most - 1,
             scored=min(self.scored, most) - 1,
-            maps=np.zeros((most, m, m), np.float32) if keep else None,
-            gains=np.zeros((most, m, m), np.float32) if keep else None,
+            maps=np.zeros((most, m, m)) if keep else None,
+            gains=np.zeros((most, m, m)) if keep else None,
         )
         self.rows = [of.law.rows(terms, graph) for graph in range(of.law.modes)]
         self.target = np.array([term.agent for term in terms], dtype=np.int64)

@@ -353,7 +353,7 @@ def system_error(of: Filter, found: Innovations) -> Estimate | None:
     form = np.eye(m) - (1.0 / m if consensus else 0.0)
     value, total, variance = form, 0.0, 0.0
     for k in range(count - 1, begin, -1):
-        phi, gain = found.maps[k].astype(float), found.gains[k].astype(float)
+        phi, gain = found.maps[k], found.gains[k]
         expected = form @ (phi @ found.filtered[k - 1])
         w = form @ (found.filtered[k] - phi @ found.filtered[k - 1])
         pushed = value @ expected
