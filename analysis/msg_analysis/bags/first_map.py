@@ -172,7 +172,7 @@ def check_log(path: Path, mapped: LogMap | None) -> dict[str, Any]:
         if is_table(path):
             raise InputError(f"{path}: is a table: expected --map with its columns")
         mapped = parse_map(parse_yaml(first_map(path), "first map"), "first map")
-    contents = read_contents(path, mapped, mapped.sources(_count(path, mapped)))
+    contents = read_contents(path, mapped, mapped.sources(count_agents(path, mapped)))
     start = min(int(times.min()) for series in contents.agents for times in series.times)
     return {
         "source": str(path),
@@ -185,7 +185,7 @@ def check_log(path: Path, mapped: LogMap | None) -> dict[str, Any]:
     }
 
 
-def _count(path: Path, mapped: LogMap) -> int:
+def count_agents(path: Path, mapped: LogMap) -> int:
     """Number of agents: those that the map lists, or whose topics or columns are there."""
     listed_ = [int(key) for key in mapped.agents if str(key).isdigit()]
     pattern = mapped.agents.get(EVERY)

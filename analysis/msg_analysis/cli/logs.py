@@ -1,18 +1,31 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Logs of other robots: the command ``map``, and ``compare`` with a law and a map."""
+"""Logs of other robots: the command ``map``, and ``compare``, ``spectrum`` and ``export`` with a map."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from msg_analysis.cli.console import WorkProgress, examples, print_json, print_result, print_text, result_console
+from msg_analysis.cli.console import (
+    WorkProgress,
+    examples,
+    print_json,
+    print_note,
+    print_result,
+    print_text,
+    result_console,
+)
 from msg_analysis.cli.options import LOG, YAML, json_option, load_experiment
 from msg_analysis.common.resources import watched
 from msg_analysis.errors import InputError
+
+if TYPE_CHECKING:
+    from msg_analysis.report.export import Form
 
 
 @click.command(
@@ -52,6 +65,22 @@ def map_(log: Path, *, mapped: Path | None, check: bool, as_json: bool) -> None:
     from msg_analysis.report.log_text import print_log_check
 
     print_result(document, print_log_check, as_json=as_json)
+
+
+def export_mapped(log: Path, mapped: Path, directory: Path, forms: Sequence[Form], *, as_json: bool) -> None:
+    """Write a log of others as files, and print their names."""
+    from msg_analysis.bags.log_map import load_map
+    from msg_analysis.report.log_export import MappedLog, export_log
+
+    with WorkProgress() as progress, watched(progress):
+        found = MappedLog.read(log, load_map(mapped))
+        files = [str(file) for file in export_log(found, directory, forms)]
+    for note in found.notes:
+        print_note(note)
+    if as_json:
+        print_json({"files": files, "missing": found.missing})
+    else:
+        print_text("\n".join(files))
 
 
 def compare_mapped(

@@ -137,7 +137,9 @@ def test_two_coordinates_late_agents_and_steps() -> None:
 def test_of_many_graphs_the_error_alone_is_tested() -> None:
     agents = range(1, 19)
     graphs = {f"g{k}": {"path": [k, *(j for j in agents if j != k)]} for k in agents}
-    many = Experiment.parse({"name": "many", "graphs": graphs, "switching": {"generator": np.full((18, 18), 1.0) - 18.0 * np.eye(18)}})
+    many = Experiment.parse(
+        {"name": "many", "graphs": graphs, "switching": {"generator": np.full((18, 18), 1.0) - 18.0 * np.eye(18)}}
+    )
     rng = np.random.default_rng(1)
     states = rng.normal(size=(500, 18)) * 10.0
     found = Log.from_arrays(np.arange(500.0), states, law=many, graph="hidden", measurement_noise=0.1).compare()
