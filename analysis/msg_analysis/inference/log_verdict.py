@@ -38,6 +38,7 @@ from msg_analysis.inference.statistics import holm
 from msg_analysis.model.log import Log
 
 FEWEST = 50  # samples
+IRREGULAR, GAP = 0.05, 3.0  # median intervals: deviation that is said; what is longer is a gap
 ESTIMATED_FROM = 20_000  # samples with which the measurement noise is searched for
 MOST_MATRICES = 60_000_000  # numbers in the matrices that the mean error needs
 VARIANCES = ("noise", "measurement_noise")  # kinds of causes
@@ -180,7 +181,7 @@ def compare_log(log: Log, level: float = 0.01) -> LogComparison:
         else Filter(law, log.times, log.states, log.starts, log.graphs)
     )
     with blas_threads(law.agents):
-        noise, measured = _measurement_noise(log, of)
+        noise, measured = measurement_noise(log, of)
         keep = law.agents**2 * len(log.times) * (law.modes if log.hidden else 2) <= MOST_MATRICES
         found = of.run(noise, terms=of.terms(), keep=keep)
         error = None
@@ -233,7 +234,8 @@ def _errors_only(log: Log, level: float, reason: str) -> LogComparison:
     )
 
 
-def _measurement_noise(log: Log, of: Filter) -> tuple[FloatArray, MeasurementNoise]:
+def measurement_noise(log: Log, of: Filter) -> tuple[FloatArray, MeasurementNoise]:
+    """Of the map, or estimated."""
     m = of.law.agents
     if log.measurement_noise is not None:
         return log.measurement_noise, MeasurementNoise(tuple(log.measurement_noise.tolist()), estimated=False)
@@ -355,6 +357,13 @@ def _grounds(
             "models), for which the states are normal given the graph."
         )
         untested.append("The single rates of the switching: only a common factor of all, as far as states tell it.")
+    lengths = np.diff(log.times) / np.median(np.diff(log.times))
+    varies = float(lengths[lengths < GAP].std())
+    if varies > IRREGULAR and log.sampled_law == "continuous":
+        approximate.append(
+            f"The intervals vary by {varies:.0%} of their median: the stamps are taken to be the true times of the "
+            "samples; errors of 5 % of the interval can reject a right log."
+        )
     if measured.estimated:
         approximate.append("The measurement noise is estimated from the log, the same for all agents.")
     if found.scored < found.samples:

@@ -78,6 +78,17 @@ def test_assert_agrees_with_a_law(robots: Path, tmp_path: Path) -> None:
         assert_agrees(robots / "good", robots / "bad", **given)
 
 
+def test_the_spectrum_by_a_map(robots: Path, tmp_path: Path) -> None:
+    words = "spectrum", robots / "good", "--law", robots / "law.yaml", "--map", robots / "map.yaml"
+    result = call(*words, "--json", "--figure", tmp_path / "spectrum.png")
+    document = json.loads(result.stdout)
+    assert (result.exit_code, document["agrees"], document["note"]) == (0, True, None)
+    assert document["log"]["lags"][1] == pytest.approx(0.1)
+    assert (tmp_path / "spectrum.png").exists()
+    assert "The log agrees with the predicted autocovariance" in call(*words).stdout
+    assert "--law: missing" in call(*words[:2], "--map", robots / "map.yaml").stderr
+
+
 def test_export_by_a_map(robots: Path, tmp_path: Path) -> None:
     """The states that were written, to the nanosecond and the last bit; see ``write_robots``."""
     times, states, starts, names = SCRIPT["simulate"](SCRIPT["Kind"](), 1500, np.random.default_rng(1))

@@ -149,7 +149,7 @@ def test_of_many_graphs_the_error_alone_is_tested() -> None:
     assert found.system_error is not None
     assert found.system_error.measured == pytest.approx(17 * 100, rel=0.05)
     assert found.system_error.predicted == pytest.approx(many.predict().continuous.system_error)
-    with pytest.raises(InputError, match="estimate: the path of 18 hidden graphs.*expected standard deviations"):
+    with pytest.raises(InputError, match=r"estimate: the path of 18 hidden graphs.*expected standard deviations"):
         Log.from_arrays(np.arange(500.0), states, law=many, graph="hidden", measurement_noise="estimate").compare()
 
 
