@@ -78,6 +78,20 @@ def test_assert_agrees_with_a_law(robots: Path, tmp_path: Path) -> None:
         assert_agrees(robots / "good", robots / "bad", **given)
 
 
+def test_graphs_that_are_not_in_the_log(robots: Path, tmp_path: Path) -> None:
+    lines = (robots / "map.yaml").read_text().splitlines()
+    mapped = tmp_path / "map.yaml"
+    mapped.write_text("\n".join("graph: hidden" if line.startswith("graph:") else line for line in lines))
+    words = "compare", robots / "good", "--law", robots / "law.yaml", "--map", mapped
+    result = call(*words, "--report", tmp_path / "page.html")
+    assert result.exit_code == 0, result.output
+    for part in ("expected over all paths", "all rates of the switching", "Approximate: ", "models", "Not tested: "):
+        assert part in result.stdout
+    assert "models" in (tmp_path / "page.html").read_text()
+    mapped.write_text(mapped.read_text().replace("graph: hidden", "graph: {hidden: true, fixed: line}"))
+    assert "graph: hidden" in call(*words).stderr
+
+
 def test_the_spectrum_by_a_map(robots: Path, tmp_path: Path) -> None:
     words = "spectrum", robots / "good", "--law", robots / "law.yaml", "--map", robots / "map.yaml"
     result = call(*words, "--json", "--figure", tmp_path / "spectrum.png")
