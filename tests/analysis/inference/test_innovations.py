@@ -168,6 +168,14 @@ def test_with_the_law_of_the_steps_the_numbers_are_those_of_a_run(tracking: bool
     assert error.system_error.standard_error == pytest.approx(spread, rel=1e-9)
 
 
+@pytest.mark.parametrize(("irregular", "said"), [(False, False), (True, True)])
+def test_irregular_stamps_are_said(irregular: bool, said: bool) -> None:
+    kind = replace(Kind(), irregular=irregular)
+    times, states, starts, names = draw(kind, 200, np.random.default_rng(8))
+    log = Log.from_arrays(times, states, law=kind.law(), graph=(starts, names), measurement_noise=kind.r)
+    assert any("stamps are taken to be the true times" in each for each in log.compare().approximate) is said
+
+
 def test_a_late_agent_and_one_coordinate_more() -> None:
     """Two coordinates are two logs; an agent that comes late is known by its first value only."""
     times, states, starts, names = draw(Kind(), 300, np.random.default_rng(4))
