@@ -386,5 +386,7 @@ def long_run_error(law: Experiment, sampled: str, states: FloatArray, noise: Flo
     errors = (whole**2).sum(axis=1).mean(axis=1) - float(np.diag(form) @ noise**2)
     means = np.array([part.mean() for part in np.array_split(errors, BATCHES)])
     measured, error = float(means.mean()), float(means.std(ddof=1)) / math.sqrt(BATCHES)
+    if np.ptp(errors) == 0.0:
+        raise InputError("states: the same error in all samples: expected states that move")
     z = (measured - predicted) / error
     return Estimate(measured, predicted, error, z, 2.0 * float(stdtr(BATCHES - 1, -abs(z))))

@@ -151,6 +151,8 @@ def test_of_many_graphs_the_error_alone_is_tested() -> None:
     assert found.system_error.predicted == pytest.approx(many.predict().continuous.system_error)
     with pytest.raises(InputError, match=r"estimate: the path of 18 hidden graphs.*expected standard deviations"):
         Log.from_arrays(np.arange(500.0), states, law=many, graph="hidden", measurement_noise="estimate").compare()
+    with pytest.raises(InputError, match="expected states that move"):
+        Log.from_arrays(np.arange(500.0), 0 * states, law=many, graph="hidden", measurement_noise=0.1).compare()
 
 
 def test_a_given_sequence_is_not_hidden() -> None:
