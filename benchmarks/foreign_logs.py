@@ -44,6 +44,7 @@ class Kind:
     leaders: dict[str, Any] | None = None
     directed: bool = False
     estimate: bool = False
+    hidden: bool = False
     gain: float = 1.0  # faults: factor of all weights
     missing: tuple[int, int] | None = None  # edge that is in no graph
     louder: float = 1.0  # factor of the noise variance of agent 2
@@ -76,6 +77,7 @@ KINDS = {
     "tracking": Kind(leaders={"agents": [3], "gain": 1.0, "reference": 2.0}),
     "directed": Kind(directed=True),
     "r estimated": Kind(estimate=True),
+    "hidden": Kind(hidden=True),
 }
 FAULTS: dict[str, tuple[dict[str, Any], str]] = {
     "gain x 0.8": ({"gain": 0.8}, "gain"),
@@ -173,7 +175,8 @@ def judge(kind: Kind, samples: int, seed: int) -> Any:
     with one_blas_thread():
         times, states, starts, names = simulate(kind, samples, np.random.default_rng(seed))
         noise: Any = "estimate" if kind.estimate else kind.r
-        log = Log.from_arrays(times, states, law=kind.law(), graph=(starts, names), measurement_noise=noise)
+        graph = "hidden" if kind.hidden else (starts, names)
+        log = Log.from_arrays(times, states, law=kind.law(), graph=graph, measurement_noise=noise)
         found = log.compare()
     covered = {
         name: low <= 1.0 <= high for name, one in found.factors.items() if one.interval for low, high in [one.interval]
@@ -207,6 +210,8 @@ def level(pool: ProcessPoolExecutor, args: argparse.Namespace) -> None:
     """Right logs."""
     total = Tally()
     for name, kind in KINDS.items():
+        if args.kinds and name not in args.kinds:
+            continue
         kind = replace(kind, jitter=args.jitter * kind.period)
         found = tally(pool, kind, args)
         shares = ", ".join(f"{key} {found.covered[key] / count:.3f}" for key, count in sorted(found.told.items()))
@@ -223,7 +228,7 @@ def level(pool: ProcessPoolExecutor, args: argparse.Namespace) -> None:
 def power(pool: ProcessPoolExecutor, args: argparse.Namespace) -> None:
     """Wrong logs."""
     for name, (changes, cause) in FAULTS.items():
-        found = tally(pool, replace(Kind(), **changes), args)
+        found = tally(pool, replace(Kind(hidden=args.hidden), **changes), args)
         print(
             f"{name:15} found {found.rejected} of {found.logs}; first cause {cause}: {found.first[cause]}", flush=True
         )
@@ -260,6 +265,8 @@ if __name__ == "__main__":
     parser.add_argument("--samples", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jitter", type=float, default=0.0, help="of the stamps, in periods")
+    parser.add_argument("--kinds", nargs="+", metavar="KIND", help="of level: only these")
+    parser.add_argument("--hidden", action="store_true", help="of power: without the graphs")
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     with ProcessPoolExecutor(options.workers) as workers:

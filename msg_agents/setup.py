@@ -6,7 +6,7 @@ import sys
 from setuptools import find_packages, setup
 
 PACKAGE = "msg_agents"
-NODES = ("agent", "switcher", "recorder", "player", "live", "markers")
+NODES = ("agent", "switcher", "recorder", "player", "live", "markers", "external")
 # A wheel puts executables into the user's PATH, where only the command line belongs; colcon and distributions put them
 # into lib/msg_agents (setup.cfg), where `ros2 run` and `ros2 launch` find them, and the command line into bin, too.
 WHEEL = {"bdist_wheel", "editable_wheel", "dist_info"} & set(sys.argv)

@@ -38,7 +38,11 @@ FIELDS = {  # of types that tell where something is, the likeliest first
     "turtlesim/msg/Pose": "x",
     "std_msgs/msg/Float64": "data",
     "std_msgs/msg/Float32": "data",
+    "msg_agents_interfaces/msg/AgentState": "state[0]",
+    "std_msgs/msg/Float64MultiArray": "data[0]",
+    "std_msgs/msg/Float32MultiArray": "data[0]",
 }
+OWN_STATES, OWN_GRAPHS = "msg_agents_interfaces/msg/AgentState", "msg_agents_interfaces/msg/ActiveGraph"
 TEXT = "std_msgs/msg/String"
 OF_NETWORK = re.compile(r"graph|topolog|network|active|mode|formation", re.IGNORECASE)
 GAP = 3.0  # median intervals
@@ -78,6 +82,8 @@ def topics_of(bag: Path) -> list[Topic]:
         except InputError:
             pass
         fields = tuple(each for each, kind in several if kind.startswith("float"))
+        if schema and "[" in (usual := FIELDS.get(schema.name, "")):
+            fields += (usual,)
         topics.append(Topic(name, schema.name if schema else "", counts[name].messages, stamped, fields))
     return topics
 
@@ -90,6 +96,7 @@ def first_map(bag: Path) -> str:
         raise InputError(f"{bag}: no topic has a number in every message: expected states of agents")
     field = FIELDS.get(agents[0].type) or agents[0].fields[0]
     others = [name for name in agents[0].fields if name != field]
+    field = f'"{field}"' if "[" in field else field
     pattern = _pattern([topic.name for topic in agents])
     lines = [
         f"# A first map of {bag.name}: correct it, then",
@@ -105,18 +112,22 @@ def first_map(bag: Path) -> str:
         lines.append(f"# other numbers in {agents[0].type}: {listed(others, 8)}")
     stamped = all(topic.stamped for topic in agents)
     lines.append(f"time: {'header' if stamped else 'log'}  # header: stamps of the messages; log: when they arrived")
-    texts = [topic for topic in topics if topic.type == TEXT]
-    graphs = [topic for topic in texts if OF_NETWORK.search(topic.name)]
+    own = agents[0].type == OWN_STATES
+    if own:
+        lines.append('# further replicas: fields: ["state[0]", "state[1]", ...]; or compare without --map')
+    wanted = OWN_GRAPHS if own else TEXT
+    graphs = [topic for topic in topics if topic.type == wanted and OF_NETWORK.search(topic.name)]
     if graphs:
-        lines.append(f"graph: {{topic: {_quoted(graphs[0].name)}, field: data}}  # names of the graphs of the law")
+        name = "name" if own else "data"
+        lines.append(f"graph: {{topic: {_quoted(graphs[0].name)}, field: {name}}}  # names of the graphs of the law")
     else:
         lines.append("# graph: {topic: /network/active, field: data}   or {file: trace.csv}, or, if it never changed:")
-        lines.append("# graph: {fixed: NAME}")
+        lines.append("# graph: {fixed: NAME}   or, if it is not known: hidden")
     lines += [
-        "measurement_noise: estimate  # or a standard deviation, 0 if the states are exact",
+        "measurement_noise: 0" if own else "measurement_noise: estimate  # or a standard deviation, 0 if exact",
         "# units: {time: 1.0, state: 1.0}  # s per unit of time of the law; units of the log per unit of its states",
         "# period: 0.1  # s: use fewer samples",
-        "# law: steps  # if the agents make the steps of a run, and not the continuous law",
+        ("" if own else "# ") + "law: steps  # if the agents make the steps of a run, and not the continuous law",
     ]
     used = {topic.name for topic in (*agents, *graphs[:1])}
     rest = [f"#   {each.name}: {each.type}, {each.messages} messages" for each in topics if each.name not in used]
@@ -170,7 +181,7 @@ def check_log(path: Path, mapped: LogMap | None) -> dict[str, Any]:
         if is_table(path):
             raise InputError(f"{path}: is a table: expected --map with its columns")
         mapped = parse_map(parse_yaml(first_map(path), "first map"), "first map")
-    contents = read_contents(path, mapped, mapped.sources(_count(path, mapped)))
+    contents = read_contents(path, mapped, mapped.sources(count_agents(path, mapped)))
     start = min(int(times.min()) for series in contents.agents for times in series.times)
     return {
         "source": str(path),
@@ -183,7 +194,7 @@ def check_log(path: Path, mapped: LogMap | None) -> dict[str, Any]:
     }
 
 
-def _count(path: Path, mapped: LogMap) -> int:
+def count_agents(path: Path, mapped: LogMap) -> int:
     """Number of agents: those that the map lists, or whose topics or columns are there."""
     listed_ = {int(key) for key in mapped.agents if is_count(key) or re.fullmatch(r"[0-9]{1,9}", str(key))}
     pattern = mapped.agents.get(EVERY)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, PlainValidator, ValidationError
+from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, ValidationError
 
 from msg_analysis.common.text import listed
 from msg_analysis.errors import InputError
@@ -71,6 +71,7 @@ class GraphSource(Section):
     radius: Positive | None = Field(None, description="with `file`: distance of linked agents", examples=[2.5])
     undirected: bool | None = Field(None, description="with `file`: whether the source listens, too", examples=[True])
     fixed: Text | None = Field(None, description="the graph that was there all the time", examples=["line"])
+    hidden: Literal[True] | None = Field(None, description="as `graph: hidden`: not in the log", examples=[True])
 
 
 class Units(Section):
@@ -78,6 +79,10 @@ class Units(Section):
 
     time: Seconds = Field(1.0, description="s per unit of simulated time", examples=[1.0])
     state: Scale = Field(1.0, description="units of the log per unit of the law's states", examples=[0.01])
+
+
+def _graph(value: object) -> object:
+    return {"hidden": True} if value == "hidden" else value
 
 
 def _noise(value: object) -> float | list[float] | str:
@@ -105,8 +110,13 @@ class LogMap(Section):
     period: Seconds | None = Field(
         None, description="use the first sample of each agent in every such time [s]; by default all", examples=[0.1]
     )
-    graph: GraphSource | None = Field(
-        None, description="the path of the graphs; may be left out with one graph", examples=[{"fixed": "line"}]
+    graph: Annotated[
+        GraphSource | None,
+        BeforeValidator(_graph, json_schema_input_type=GraphSource | Literal["hidden"] | None),
+    ] = Field(
+        None,
+        description="the path of the graphs, or 'hidden': not in the log; may be left out with one graph",
+        examples=[{"fixed": "line"}],
     )
     units: Units = Field(Units(), description="units of the law in the log", examples=[{"time": 1.0}])
     measurement_noise: Annotated[
@@ -190,10 +200,14 @@ def parse_map(document: Mapping[Any, Any], source: str) -> LogMap:
 
 
 def _graph_problems(graph: GraphSource) -> list[str]:
-    kinds = [key for key in ("field", "file", "fixed") if getattr(graph, key) is not None]
+    kinds = [key for key in ("field", "file", "fixed", "hidden") if getattr(graph, key) is not None]
     if len(kinds) != 1:
         found = ", ".join(kinds) or "none"
-        return [problem("graph", found, "expected one of `topic` with `field`, `file`, `fixed`", "give one")]
+        return [
+            problem(
+                "graph", found, "expected one of `topic` with `field`, `file`, `fixed`, or graph: hidden", "give one"
+            )
+        ]
     others = [key for key in ("hold", "radius", "undirected") if getattr(graph, key) is not None]
     if others and graph.file is None:
         return [problem(f"graph.{others[0]}", "given", "expected with `file` only", "remove it")]

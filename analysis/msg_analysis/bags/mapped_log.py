@@ -26,7 +26,7 @@ from msg_analysis.experiment.experiment import Experiment
 from msg_analysis.experiment.graph_files import GraphError
 from msg_analysis.experiment.traces import read_trace
 from msg_analysis.experiment.values import LARGEST_NUMBER
-from msg_analysis.model.log import Log
+from msg_analysis.model.log import HIDDEN, Log
 
 TABLES = (".csv", ".parquet", ".npz")
 MOST_BACK = 5.0  # median intervals that a stamp may lie before an earlier one; more is a jump of the clock
@@ -243,10 +243,8 @@ def _of_table(
     return Contents(agents, found)
 
 
-def read_log(path: Path, mapped: LogMap, law: Experiment, directory: Path | None = None) -> Log:
-    """The log in a bag or table. InputError: it does not fit the map or the law; ``directory``: base of the trace."""
-    contents = read_contents(path, mapped, mapped.sources(law.agents, law.names))
-    notes = list(contents.notes)
+def aligned(contents: Contents, mapped: LogMap, notes: list[str]) -> tuple[IntArray, FloatArray]:
+    """(N,) times [ns] at which an agent has a value, and (N, m, R) states in units of the law; NaN: none."""
     columns, stamps = [], []
     for number, series in enumerate(contents.agents, start=1):
         times, values = _cleaned(series, number, mapped.period, notes)
@@ -256,9 +254,21 @@ def read_log(path: Path, mapped: LogMap, law: Experiment, directory: Path | None
     states = np.full((len(every), len(columns), columns[0].shape[1]), np.nan)
     for i, (times, values) in enumerate(zip(stamps, columns, strict=True)):
         states[np.searchsorted(every, times), i] = values / mapped.units.state
+    return every, states
+
+
+def read_log(path: Path, mapped: LogMap, law: Experiment, directory: Path | None = None) -> Log:
+    """The log in a bag or table. InputError: it does not fit the map or the law; ``directory``: base of the trace."""
+    contents = read_contents(path, mapped, mapped.sources(law.agents, law.names))
+    notes = list(contents.notes)
+    every, states = aligned(contents, mapped, notes)
     origin = int(every[0])
     unit = SECOND * mapped.units.time
     graph: Any = mapped.graph.fixed if mapped.graph else None
+    if mapped.graph and mapped.graph.hidden:
+        if any(each.name == HIDDEN for each in law.graph_list):
+            raise InputError(f"{law.source}: graphs.{HIDDEN}: expected another name with `graph: {HIDDEN}`: rename it")
+        graph = HIDDEN
     if mapped.graph and mapped.graph.file:
         moments, names = _traced(mapped.graph, law, directory or Path())
         graph = ((moments * SECOND - origin) / unit, names)

@@ -1,18 +1,32 @@
 # SPDX-FileCopyrightText: 2026 msg_agents contributors
 # SPDX-License-Identifier: Apache-2.0
 
-"""Logs of other robots: the command ``map``, and ``compare`` with a law and a map."""
+"""Logs of other robots: the command ``map``, and ``compare``, ``spectrum`` and ``export`` with a map."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from msg_analysis.cli.console import WorkProgress, examples, print_json, print_result, print_text, result_console
+from msg_analysis.cli.console import (
+    WorkProgress,
+    examples,
+    print_json,
+    print_note,
+    print_result,
+    print_text,
+    result_console,
+)
 from msg_analysis.cli.options import LOG, YAML, json_option, load_experiment
 from msg_analysis.common.resources import watched
 from msg_analysis.errors import InputError
+
+if TYPE_CHECKING:
+    from msg_analysis.model.log import Log
+    from msg_analysis.report.export import Form
 
 
 @click.command(
@@ -54,6 +68,22 @@ def map_(log: Path, *, mapped: Path | None, check: bool, as_json: bool) -> None:
     print_result(document, print_log_check, as_json=as_json)
 
 
+def export_mapped(log: Path, mapped: Path, directory: Path, forms: Sequence[Form], *, as_json: bool) -> None:
+    """Write a log of others as files, and print their names."""
+    from msg_analysis.bags.log_map import load_map
+    from msg_analysis.report.log_export import MappedLog, export_log
+
+    with WorkProgress() as progress, watched(progress):
+        found = MappedLog.read(log, load_map(mapped))
+        files = [str(file) for file in export_log(found, directory, forms)]
+    for note in found.notes:
+        print_note(note)
+    if as_json:
+        print_json({"files": files, "missing": found.missing})
+    else:
+        print_text("\n".join(files))
+
+
 def compare_mapped(
     logs: tuple[Path, ...],
     law: Path | None,
@@ -65,29 +95,13 @@ def compare_mapped(
     as_json: bool,
 ) -> int:
     """Compare a log of others, and print the result; the exit code."""
-    from msg_analysis.bags.log_map import load_map
-    from msg_analysis.bags.mapped_log import is_table, read_log, read_table
-    from msg_analysis.model.log import Log
     from msg_analysis.report.log_text import print_log_comparison
 
     if len(logs) > 1:
         raise InputError(f"{logs[1]}: expected one bag or table with --law: compare them one after the other")
-    log = logs[0]
-    if law is None:
-        raise InputError("--law: missing: expected the experiment file that the log should follow")
-    if mapped is None and not is_table(log):
-        raise InputError(f"--map: missing: expected where the states in {log} are: `msg-analysis map {log}` makes one")
-    experiment = load_experiment(law)
+    log = mapped_log(logs[0], law, mapped)
     with WorkProgress() as progress, watched(progress):
-        if mapped is None:
-            columns = read_table(log)
-            try:
-                found = Log.from_columns(columns, law=experiment)
-            except InputError as error:
-                raise InputError(f"{log}: {error}") from error
-        else:
-            found = read_log(log, load_map(mapped), experiment, mapped.parent)
-        comparison = found.compare(level=level)
+        comparison = log.compare(level=level)
         if report:
             from msg_analysis.report.log_page import write_log_report
 
@@ -98,3 +112,24 @@ def compare_mapped(
     else:
         print_log_comparison(document, result_console(), verbose=verbose)
     return comparison.exit_code
+
+
+def mapped_log(log: Path, law: Path | None, mapped: Path | None) -> Log:
+    """Read a log of others."""
+    from msg_analysis.bags.log_map import load_map
+    from msg_analysis.bags.mapped_log import is_table, read_log, read_table
+    from msg_analysis.model.log import Log
+
+    if law is None:
+        raise InputError("--law: missing: expected the experiment file that the log should follow")
+    if mapped is None and not is_table(log):
+        raise InputError(f"--map: missing: expected where the states in {log} are: `msg-analysis map {log}` makes one")
+    experiment = load_experiment(law)
+    with WorkProgress() as progress, watched(progress):
+        if mapped:
+            return read_log(log, load_map(mapped), experiment, mapped.parent)
+        columns = read_table(log)
+        try:
+            return Log.from_columns(columns, law=experiment)
+        except InputError as error:
+            raise InputError(f"{log}: {error}") from error

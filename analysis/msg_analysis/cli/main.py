@@ -27,8 +27,10 @@ from msg_analysis.cli.console import (
 )
 from msg_analysis.cli.options import (
     BAG,
+    LOG,
     PATH,
     SOURCE,
+    YAML,
     choice_option,
     duration_option,
     experiment_argument,
@@ -286,20 +288,24 @@ def salvage(bag: Path, out: Path, *, as_json: bool) -> None:
     epilog=examples(
         "msg-analysis export runs/line_ring_20250101_120000 --parquet",
         "msg-analysis export line_ring_twin --csv --npz --out data",
+        "msg-analysis export robots --map map.yaml --csv",
     )
 )
-@click.argument("bag", type=BAG)
+@click.argument("bag", type=LOG)
+@click.option("--map", "mapped", type=YAML, metavar="MAP", help="Of a bag or table of others: where its states are.")
 @click.option("--csv", is_flag=True, help="Write states.csv, graphs.csv and errors.csv.")
 @click.option("--parquet", is_flag=True, help="Write states.parquet, graphs.parquet and errors.parquet.")
 @click.option("--npz", is_flag=True, help="Write run.npz, the arrays of Python.")
 @click.option("--rrd", is_flag=True, help="Write run.rrd, a recording for the viewer Rerun; needs rerun-sdk.")
 @out_option("DIR", "Output directory.", show_default="<name of BAG>_export")
 @json_option
-def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Path | None, as_json: bool) -> None:
+def export(
+    bag: Path, *, mapped: Path | None, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Path | None, as_json: bool
+) -> None:
     """Convert a bag to CSV, Parquet, NumPy or Rerun files.
 
     The names of the files are printed; existing files of these names are replaced. Exit code 3: states or graphs of
-    the run are missing.
+    the run are missing. With --map, BAG is a log of others; it gives states, graphs and log.npz.
     """
     if csv or parquet:
         from msg_analysis.common.resources import pyarrow_problem
@@ -315,9 +321,14 @@ def export(bag: Path, *, csv: bool, parquet: bool, npz: bool, rrd: bool, out: Pa
     forms = [form for form, wanted in zip(FORMS, (csv, parquet, npz, rrd), strict=True) if wanted]
     if not forms:
         raise InputError("no format: expected at least one of --csv, --parquet, --npz, --rrd")
+    if rrd and mapped:
+        raise InputError("--rrd: with --map: expected --csv, --parquet or --npz")
     if rrd:
         require_rerun()
     directory = out or Path(f"{bag.resolve().name.partition('.')[0]}_export")
+    if mapped:
+        logs.export_mapped(bag, mapped, directory, forms, as_json=as_json)
+        return
     with WorkProgress() as progress, watched(progress):
         run = read_bag(bag)
         files = [str(file) for file in export_run(run, directory, forms)]

@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from msg_analysis.cli.console import examples, plain_matplotlib, print_result
+from msg_analysis.cli.logs import mapped_log
 from msg_analysis.cli.options import (
+    EXPERIMENT,
     FILE,
     SOURCE,
+    YAML,
     choice_option,
     experiment_argument,
     is_bag,
@@ -180,29 +183,43 @@ def parse_duration(key: str, text: str | None) -> float | None:
         "msg-analysis spectrum line_ring",
         "msg-analysis spectrum runs/line_ring_1 --figure spectrum.png",
         "msg-analysis spectrum line_ring --json | jq .system_density",
+        "msg-analysis spectrum robots --law law.yaml --map map.yaml",
     )
 )
 @click.argument("source", metavar="EXPERIMENT|BAG", type=SOURCE)
+@click.option(
+    "--law", type=EXPERIMENT, metavar="EXPERIMENT", help="Of a bag or table of others: what it should follow."
+)
+@click.option("--map", "mapped", type=YAML, metavar="MAP", help="With --law: where in it the states and graphs are.")
 @click.option("--figure", type=FILE, metavar="FILE", help="Also draw it: a file that ends with .png, .svg or .pdf.")
 @level_option("Of the test of a bag: probability of a false 'disagrees'.")
 @set_option
 @json_option
 @click.pass_context
 def spectrum(
-    context: click.Context, source: Path, *, figure: Path | None, level: float, changes: tuple[str, ...], as_json: bool
+    context: click.Context,
+    source: Path,
+    *,
+    law: Path | None,
+    mapped: Path | None,
+    figure: Path | None,
+    level: float,
+    changes: tuple[str, ...],
+    as_json: bool,
 ) -> None:
     """Predict autocovariance and spectrum, or test a bag.
 
-    Of a BAG they are also measured, and tested against the prediction.
+    Of a BAG they are also measured, and tested against the prediction. With --law and --map, BAG may be a bag of other
+    robots, or a CSV, Parquet or NPZ file.
 
     Exit code 0: predicted, or agrees, 1: disagrees, 3: data incomplete.
     """
     from msg_analysis.common.files import require_place
     from msg_analysis.errors import ExitCode
-    from msg_analysis.report.documents import measure_spectrum, predicted_spectrum
+    from msg_analysis.report.documents import measure_log_spectrum, measure_spectrum, predicted_spectrum
     from msg_analysis.report.theory_text import print_spectrum
 
-    if changes and is_bag(source):
+    if changes and (law or is_bag(source)):
         raise InputError(f"--set: not with the bag {source}, whose experiment is recorded: give an experiment file")
     require_place(figure)
     if figure:
@@ -210,7 +227,12 @@ def spectrum(
 
         require_format(figure)
         plain_matplotlib()
-    found = measure_spectrum(source, level) if is_bag(source) else predicted_spectrum(load_experiment(source, changes))
+    if law or mapped:
+        found = measure_log_spectrum(mapped_log(source, law, mapped), level)
+    elif is_bag(source):
+        found = measure_spectrum(source, level)
+    else:
+        found = predicted_spectrum(load_experiment(source, changes))
     if figure:
         write_spectrum(spectrum_figure(found.predicted, found.log, found.density), figure)
     print_result(found.to_json(), print_spectrum, as_json=as_json)

@@ -132,8 +132,30 @@ def logged_autocovariance(
     steps = min(observation.steps - first, int(most_numbers / max(1, len(chosen) * d * max(d, replicas))))
     chosen = chosen[chosen < steps]
     kinds = kinds[0][first : first + steps], kinds[1], kinds[2]
-    which, matrices, noise = kinds
     y, product = _coordinates(observation, first, steps)
+    measured, expected, covariance, p = autocovariances(kinds, y, product, chosen)
+    found: Spectrum = spectrum(observation.prediction, chosen, np.empty(0))
+    return LoggedAutocovariance(
+        steps=steps,
+        times=found.times,
+        predicted=found.system_autocovariance,
+        measured=measured,
+        expected=expected,
+        covariance=covariance,
+        p=p,
+    )
+
+
+def autocovariances(
+    kinds: tuple[IntArray, FloatArray, FloatArray], y: FloatArray, product: FloatArray | None, chosen: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray, float | None]:
+    """(L,) measured, (L,) expected given the path, (L, L) their covariance, and the p-value of all lags.
+
+    ``kinds``: of N steps, see ``steps_of_path``; ``y``: (N + 1, R, d); ``product``: C^T C, None: I; ``chosen``: (L,)
+    lags below N.
+    """
+    which, matrices, noise = kinds
+    steps, (replicas, d) = len(which), y.shape[1:]
     seen = y if product is None else y @ product
     along = matrices[which]  # (N, d, d) W_k
     forms = np.zeros((steps + 1, d, len(chosen), d))
@@ -159,16 +181,8 @@ def logged_autocovariance(
             felt[place, lag - 1 :] = seen[: steps - lag + 1]
     covariance = _covariance(kinds, y, forms, felt, left)
     chi2, dof = quadratic_form(measured - expected, covariance)
-    found: Spectrum = spectrum(observation.prediction, chosen, np.empty(0))
-    return LoggedAutocovariance(
-        steps=steps,
-        times=found.times,
-        predicted=found.system_autocovariance,
-        measured=measured / counts,
-        expected=expected / counts,
-        covariance=covariance / np.outer(counts, counts),
-        p=float(chi2_tail(chi2, dof)) if dof else None,
-    )
+    p = float(chi2_tail(chi2, dof)) if dof else None
+    return measured / counts, expected / counts, covariance / np.outer(counts, counts), p
 
 
 def _coordinates(observation: Observation, first: int, steps: int) -> tuple[FloatArray, FloatArray | None]:
@@ -185,9 +199,14 @@ def _coordinates(observation: Observation, first: int, steps: int) -> tuple[Floa
 def _chosen_lags(observation: Observation) -> IntArray:
     """0 and up to ``LAGS`` more, equally spaced on a logarithmic axis."""
     found = spectrum(observation.prediction, frequencies=np.empty(0))
+    return lags_of(found, observation.steps)
+
+
+def lags_of(found: Spectrum, steps: int) -> IntArray:
+    """As ``_chosen_lags``, of a predicted spectrum."""
     course = found.system_autocovariance
     last = int(found.lags[np.flatnonzero(np.abs(course) >= CORRELATED * course[0])[-1]]) if course[0] > 0.0 else 1
-    last = max(1, min(last, observation.steps // 10))
+    last = max(1, min(last, steps // 10))
     return np.unique(np.concatenate([[0], np.geomspace(1, last, LAGS).round().astype(np.int64)]))
 
 

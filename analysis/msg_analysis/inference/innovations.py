@@ -35,9 +35,9 @@ HELD = 1e-9  # relative to the largest state: deviation of a held leader that is
 
 @dataclass(frozen=True, slots=True)
 class Variance:
-    """A variance as a parameter: its logarithm."""
+    """A parameter beside the gains: the logarithm of a variance, or of all rates of the switching."""
 
-    kind: Literal["process", "measurement"]
+    kind: Literal["process", "measurement", "switching"]
     agent: int | None = None  # None: of all
 
 
@@ -57,8 +57,11 @@ class Innovations:
     samples: int  # N - 1, of which intervals end in
     scored: int  # samples with derivatives by the variances
     off_reference: tuple[int, int, float] | None = None  # sample, agent, deviation of a held leader that is not held
-    maps: FloatArray | None = None  # (N, m, m) single precision: Phi of the interval before each sample
-    gains: FloatArray | None = None  # (N, m, m) single precision: covariance of what each sample adds to ``filtered``
+    maps: FloatArray | None = None  # (N, m, m): Phi of the interval before each sample
+    gains: FloatArray | None = None  # (N, m, m): covariance of what each sample adds to ``filtered``
+    # Of a hidden path: (N, n, m, m) E[x x^T; graph | y(0), ..., y(k)], all coordinates, and (N, n) P(graph | ...).
+    moments: FloatArray | None = None
+    probabilities: FloatArray | None = None
 
 
 class Filter:
@@ -79,6 +82,10 @@ class Filter:
         self.present: BoolArray = np.asarray(~np.isnan(self.values).any(axis=2))
         self.stretches = law.stretches(times, starts, graphs)
         self.spread = float(np.nanmax(np.abs(self.values), initial=0.0)) or 1.0
+
+    def terms(self) -> list[Term]:
+        """The gains that are tested."""
+        return self.law.terms()
 
     def exchanged(self, order: Sequence[int]) -> Filter:
         """The same with the states of agent ``order[i]`` as those of agent i."""
@@ -107,6 +114,14 @@ class Filter:
         """
         return _Pass(self, noise, terms or [], variances, keep, most or len(self.times)).run()
 
+    def singular(self, variances: FloatArray, rows: IntArray, k: int) -> InputError:
+        """The error of a sample whose expected variances are 0 in some direction."""
+        agent = int(rows[int(np.argmin(variances))]) + 1
+        return InputError(
+            f"the law leaves agent {agent}, or a combination of agents, without any noise in the interval before the "
+            f"sample at {self.times[k]:g}, so nothing can be tested: give `measurement_noise` > 0"
+        )
+
 
 class _Pass:
     """One pass over the samples."""
@@ -116,7 +131,7 @@ class _Pass:
     ) -> None:
         self.of, self.law, self.terms = of, of.law, terms
         m, self.noise = of.law.agents, noise**2
-        self.variances = _variances(m, self.noise) if variances else []
+        self.variances = parameters_of(m, self.noise) if variances else []
         self.count, replicas = most, of.values.shape[2]
         self.measured = np.zeros((len(self.variances), m))  # derivatives of the measurement variances
         for place, one in enumerate(self.variances):
@@ -139,8 +154,8 @@ class _Pass:
             log_likelihood=0.0,
             samples=most - 1,
             scored=min(self.scored, most) - 1,
-            maps=np.zeros((most, m, m), np.float32) if keep else None,
-            gains=np.zeros((most, m, m), np.float32) if keep else None,
+            maps=np.zeros((most, m, m)) if keep else None,
+            gains=np.zeros((most, m, m)) if keep else None,
         )
         self.rows = [of.law.rows(terms, graph) for graph in range(of.law.modes)]
         self.target = np.array([term.agent for term in terms], dtype=np.int64)
@@ -234,7 +249,7 @@ class _Pass:
                 try:
                     inverse = np.linalg.inv(np.linalg.cholesky(s))
                 except np.linalg.LinAlgError:
-                    raise self._singular(s, rows, k) from None
+                    raise self.of.singular(np.diag(s), rows, k) from None
                 columns = p if full else p[:, rows]
                 gain = columns @ inverse.T @ inverse
                 e = self.of.values[k][rows] - x[rows]
@@ -352,15 +367,9 @@ class _Pass:
             agent = int(np.nanargmax(off))
             self.out.off_reference = k, agent, float(off[agent])
 
-    def _singular(self, s: FloatArray, rows: IntArray, k: int) -> InputError:
-        agent = int(rows[int(np.argmin(np.diag(s)))]) + 1
-        return InputError(
-            f"the law leaves agent {agent}, or a combination of agents, without any noise in the interval before the "
-            f"sample at {self.of.times[k]:g}, so nothing can be tested: give `measurement_noise` > 0"
-        )
 
-
-def _variances(m: int, noise: FloatArray) -> list[Variance]:
+def parameters_of(m: int, noise: FloatArray) -> list[Variance]:
+    """The variances of m agents with measurement noise of this size (m,)."""
     found = [Variance("process", i) for i in range(m)]
     if noise.any():
         found.append(Variance("measurement"))

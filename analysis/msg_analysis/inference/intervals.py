@@ -103,7 +103,7 @@ class IntervalLaw(ABC):
                     drifts[graphs, i, term.sender] += more
         return self.with_drifts(drifts)
 
-    def terms(self) -> list[Term]:
+    def terms(self, most: int = MAX_REGRESSORS) -> list[Term]:
         """Regressors: a constant of every agent, all links, all leaders; without links apart where these are many."""
         m, drifts = self.agents, [self.drift(graph) for graph in range(self.modes)]
         terms = [Term("constant", i) for i in range(m) if not self.held[i]]
@@ -115,7 +115,7 @@ class IntervalLaw(ABC):
                 found += [Term("link", i, graph, j, float(drift[i, j])) for j in senders]
                 if abs(pull[i]) > BALANCE * np.abs(drift[i]).sum():
                     found.append(Term("lead", i, graph, None, float(pull[i])))
-        if len(terms) + len(found) > MAX_REGRESSORS:
+        if len(terms) + len(found) > most:
             found = [Term("pull", i, None) for i in np.flatnonzero(~self.held).tolist()]
         return terms + found
 

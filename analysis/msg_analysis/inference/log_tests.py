@@ -169,6 +169,7 @@ class Parameters:
             [Candidate(one.part, one.what, np.concatenate([one.direction, more])) for one in each]
             for each in gain_classes(found.terms)
         ]
+        rates = Candidate("switching", None, self.variance(Variance("switching")))
         process = [Candidate("process", i, self.variance(Variance("process", i))) for i in range(m)]
         measured = [
             Candidate("measurement", one.agent, self.variance(one))
@@ -180,6 +181,7 @@ class Parameters:
             [Candidate("process", None, self.process)],
             measured,
             [Candidate("measurement", None, self.variance(Variance("measurement")))],
+            [rates],
         ]
         return [*gains, *(each for each in variances if any(one.direction.any() for one in each))]
 
@@ -198,6 +200,10 @@ def gain_words(one: Selected, law: Experiment, unit: float) -> Cause:
         interval = max(interval[0], 0.0), interval[1]
         words = f"{whose} is {numbers_text(factor, interval)} times what the {file} says"
         return Cause(kind, words, agent, None, None, factor, interval, 1.0, p, log_p=one.log_p)
+    if part == "switching":
+        interval = max(interval[0], 0.0), interval[1]
+        words = f"the hidden graphs seem to switch {numbers_text(factor, interval)} times as often as the law says"
+        return Cause("rate", words, None, None, None, factor, interval, 1.0, p, log_p=one.log_p)
     if part == "reference":
         at = law.reference
         value, interval = at + one.estimate, (at + low, at + high)
@@ -347,7 +353,7 @@ def system_error(of: Filter, found: Innovations) -> Estimate | None:
     form = np.eye(m) - (1.0 / m if consensus else 0.0)
     value, total, variance = form, 0.0, 0.0
     for k in range(count - 1, begin, -1):
-        phi, gain = found.maps[k].astype(float), found.gains[k].astype(float)
+        phi, gain = found.maps[k], found.gains[k]
         expected = form @ (phi @ found.filtered[k - 1])
         w = form @ (found.filtered[k] - phi @ found.filtered[k - 1])
         pushed = value @ expected

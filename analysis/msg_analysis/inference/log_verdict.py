@@ -18,6 +18,7 @@ from msg_analysis.common.text import HALF_WIDTH_95, counted, markdown_table, num
 from msg_analysis.errors import ExitCode, InputError
 from msg_analysis.inference.candidates import Cause
 from msg_analysis.inference.estimates import Estimate
+from msg_analysis.inference.hidden_path import HiddenFilter, hidden_system_error, long_run_error, why_no_filter
 from msg_analysis.inference.innovations import Filter, Innovations, Variance, estimate_noise
 from msg_analysis.inference.intervals import interval_law
 from msg_analysis.inference.log_tests import (
@@ -37,6 +38,7 @@ from msg_analysis.inference.statistics import holm
 from msg_analysis.model.log import Log
 
 FEWEST = 50  # samples
+IRREGULAR, GAP = 0.05, 3.0  # median intervals: deviation that is said; what is longer is a gap
 ESTIMATED_FROM = 20_000  # samples with which the measurement noise is searched for
 MOST_MATRICES = 60_000_000  # numbers in the matrices that the mean error needs
 VARIANCES = ("noise", "measurement_noise")  # kinds of causes
@@ -77,11 +79,12 @@ class LogComparison:
         what is wrong, the clearest first
     system_error
         mean-square error over the samples, without the measurement noise, and its expectation given the path of the
-        graphs; None where it was not computed
+        graphs, or over all paths where it is hidden; None where it was not computed
     ratios
         (m,) mean square of the standardised innovations of each agent, 1 under the law; None: never measured
     factors
-        of all gains, all noise variances, and the variance of the measurement noise, estimated together
+        of all gains, all noise variances, the variance of the measurement noise, and with a hidden path all rates,
+        estimated together
     measurement_noise
         as the map says it, or estimated
     path
@@ -132,6 +135,7 @@ class LogComparison:
             "verdict": self.verdict,
             "law": log.law.name,
             "sampled_law": log.sampled_law,
+            "hidden": log.hidden,
             "names": log.law.names,
             "level": self.level,
             "samples": len(log.times),
@@ -169,17 +173,25 @@ def compare_log(log: Log, level: float = 0.01) -> LogComparison:
     never = np.flatnonzero(np.isnan(log.states).all(axis=(0, 2)) & ~law.held)
     if len(never):
         raise InputError(f"agent {int(never[0]) + 1}: no value in the log: expected some of every agent")
-    of = Filter(law, log.times, log.states, log.starts, log.graphs)
+    reason = why_no_filter(law, log.times) if log.hidden else None
+    if reason:
+        return _errors_only(log, level, reason)
+    of = (
+        HiddenFilter(law, log.times, log.states)
+        if log.hidden
+        else Filter(law, log.times, log.states, log.starts, log.graphs)
+    )
     with blas_threads(law.agents):
-        noise, measured = _measurement_noise(log, of)
-        keep = law.agents**2 * len(log.times) * 2 <= MOST_MATRICES
-        found = of.run(noise, terms=law.terms(), keep=keep)
-        error = system_error(of, found) if keep else None
-        found.maps = found.gains = None
+        noise, measured = measurement_noise(log, of)
+        keep = law.agents**2 * len(log.times) * (law.modes if log.hidden else 2) <= MOST_MATRICES
+        found = of.run(noise, terms=of.terms(), keep=keep)
+        error = None
+        if keep:
+            error = hidden_system_error(of, found) if isinstance(of, HiddenFilter) else system_error(of, found)
+        found.maps = found.gains = found.moments = found.probabilities = None
         parameters = Parameters.of(found, estimated=measured.estimated)
-        path = path_test(
-            log.law, log.starts, log.graphs, (float(log.times[0]), float(log.times[-1])), log.sampled_law == "steps"
-        )
+        span = float(log.times[0]), float(log.times[-1])
+        path = None if log.hidden else path_test(log.law, log.starts, log.graphs, span, log.sampled_law == "steps")
         tests = _tests(found, parameters, path, error, level)
         causes = _causes(log, of, found, parameters, path, noise, tests, level)
     sizes = size_p(found)
@@ -197,7 +209,34 @@ def compare_log(log: Log, level: float = 0.01) -> LogComparison:
     )
 
 
-def _measurement_noise(log: Log, of: Filter) -> tuple[FloatArray, MeasurementNoise]:
+def _errors_only(log: Log, level: float, reason: str) -> LogComparison:
+    """The verdict by the system error alone, where a hidden path cannot be followed."""
+    if log.measurement_noise is None:
+        raise InputError(f"measurement_noise: estimate: {reason}: expected standard deviations")
+    error = long_run_error(log.law, log.sampled_law, log.states, log.measurement_noise)
+    meaning = "the mean-square error is not that of the law"
+    tests = (
+        [Test("system error", error.p, error.p, error.p < level, error, None, meaning)] if error.p is not None else []
+    )
+    words = f"the mean-square error is {number_text(error.measured)}, and not {number_text(error.predicted)}"
+    return LogComparison(
+        log=log,
+        level=level,
+        tests=tests,
+        causes=[Cause("unknown", words)] if any(test.rejected for test in tests) else [],
+        system_error=error,
+        ratios=(None,) * log.law.agents,
+        factors={},
+        measurement_noise=MeasurementNoise(tuple(log.measurement_noise.tolist()), estimated=False),
+        path=None,
+        exact=("The system error that is expected is the mean over all paths of the graphs in the steady state.",),
+        approximate=("The log is taken to be in the steady state; the interval is that of the means of its parts.",),
+        untested=(f"Innovations, gains, noise and the switching: {reason}.",),
+    )
+
+
+def measurement_noise(log: Log, of: Filter) -> tuple[FloatArray, MeasurementNoise]:
+    """Of the map, or estimated."""
     m = of.law.agents
     if log.measurement_noise is not None:
         return log.measurement_noise, MeasurementNoise(tuple(log.measurement_noise.tolist()), estimated=False)
@@ -211,18 +250,25 @@ def _tests(
 ) -> list[Test]:
     """The family, decided by Holm's method."""
     terms, largest = len(found.terms), largest_p(found)
+    rates = Variance("switching")
+    last = terms + len(found.variances) - (rates in found.variances)
     common = parameters.variance(Variance("measurement"))
     listed: list[tuple[str, float | None, str]] = [
         ("innovations: covariance", covariance_p(found), "innovations vary, or vary together, otherwise than expected"),
         ("innovations: whiteness", whiteness_p(found), "what the law did not expect can be foretold from the past"),
         ("innovations: gains", parameters.joint_p(slice(0, terms)), "a gain, a reference or an offset is wrong"),
         ("innovations: common gain", parameters.direction_p(parameters.gains), "all gains are wrong by one factor"),
-        ("innovations: variances", parameters.joint_p(slice(terms, None)), "noise or measurement noise is wrong"),
+        ("innovations: variances", parameters.joint_p(slice(terms, last)), "noise or measurement noise is wrong"),
         ("innovations: common noise", parameters.direction_p(parameters.process), "all noise is wrong by one factor"),
         ("innovations: measurement noise", parameters.direction_p(common), "the measurement noise is wrong"),
+        (
+            "innovations: rates",
+            parameters.direction_p(parameters.variance(rates)),
+            "the hidden graphs switch otherwise",
+        ),
         ("innovations: largest", largest and largest[0], "a value is far from where the law can have put it"),
         ("switching", path.p if path else None, "the graphs switch more or less often than in the law"),
-        ("system error", error.p if error else None, "the mean-square error is not that of this path"),
+        ("system error", error.p if error else None, "the mean-square error is not that of the law"),
     ]
     sizes = enumerate(size_p(found), start=1)
     meaning = "the innovations of this agent are larger or smaller than expected"
@@ -288,6 +334,8 @@ def _factors(parameters: Parameters) -> dict[str, Factor]:
         "noise": parameters.process,
         "measurement_noise": parameters.variance(Variance("measurement")),
     }
+    if Variance("switching") in parameters.found.variances:
+        named["rates"] = parameters.variance(Variance("switching"))
     factors = {}
     for name, one in zip(named, parameters.factor(list(named.values())), strict=True):
         half = 0.0 if one is None else HALF_WIDTH_95 * one[1]
@@ -303,11 +351,26 @@ def _grounds(
     exact = [f"The innovations are those of {law} over the path of the graphs in the log, with all its intervals."]
     approximate = ["The tests of gains, variances and errors are exact in the limit of many samples."]
     untested = ["Which messages were received, lost or late: a log of states does not say it."]
+    if log.hidden:
+        exact = [f"Means and covariances between two samples are those of {law} over all paths of the graphs."]
+        approximate.append(
+            "The graphs are hidden: the innovations are tested given a filter of the path (interacting multiple "
+            "models), for which the states are normal given the graph."
+        )
+        untested.append("The single rates of the switching: only a common factor of all, as far as states tell it.")
+    lengths = np.diff(log.times) / np.median(np.diff(log.times))
+    varies = float(lengths[lengths < GAP].std())
+    if varies > IRREGULAR and log.sampled_law == "continuous":
+        approximate.append(
+            f"The intervals vary by {varies:.0%} of their median: the stamps are taken to be the true times of the "
+            "samples; errors of 5 % of the interval can reject a right log."
+        )
     if measured.estimated:
         approximate.append("The measurement noise is estimated from the log, the same for all agents.")
     if found.scored < found.samples:
-        approximate.append(f"The tests of variances use the first {counted(found.scored, 'sample')} only.")
-    if path is None and len(log.law.graph_list) > 1:
+        what = "gains, variances and rates" if log.hidden else "variances"
+        approximate.append(f"The tests of {what} use the first {counted(found.scored, 'sample')} only.")
+    if path is None and len(log.law.graph_list) > 1 and not log.hidden:
         untested.append("The switching: the law has a given sequence of graphs.")
     if path is not None and len(log.starts) == 1:
         approximate.append("The log has one graph all the time: the test of the switching is about that alone.")

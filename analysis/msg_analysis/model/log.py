@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 SampledLaw = Literal["continuous", "steps"]
 LARGEST = 1e15  # state or noise: its square, times that of the start, is a number of single precision
 LONGEST = 1e6  # interval [units of simulated time]: the matrices of a longer one lose their digits
+HIDDEN = "hidden"  # a path of graphs that is not known
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -43,7 +44,8 @@ class Log:
     states
         (N, m, R) measured states of R coordinates that move independently under the same graphs; NaN: not measured
     starts, graphs
-        (p,) where the stretches of the path begin [units of simulated time], and their graphs, indices from 0
+        (p,) where the stretches of the path begin [units of simulated time], and their graphs, indices from 0; empty
+        where the path is not known
     measurement_noise
         (m,) standard deviations of the measurement noise; None: estimated from the log, the same for all agents
     sampled_law
@@ -62,9 +64,10 @@ class Log:
     notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
+        switches = "hidden graphs" if self.hidden else f"{len(self.starts) - 1} switches"
         return (
             f"<Log of {self.law.agents} agents: {len(self.times)} samples in {self.times[-1] - self.times[0]:g} units "
-            f"of time, {len(self.starts) - 1} switches; law {self.law.name!r}>"
+            f"of time, {switches}; law {self.law.name!r}>"
         )
 
     def _repr_markdown_(self) -> str:
@@ -73,10 +76,15 @@ class Log:
             ("coordinates", str(self.states.shape[2])),
             ("samples", str(len(self.times))),
             ("span", number_text(float(self.times[-1] - self.times[0]))),
-            ("switches", str(len(self.starts) - 1)),
+            ("switches", HIDDEN if self.hidden else str(len(self.starts) - 1)),
             ("values missing", str(int(np.isnan(self.states).any(axis=2).sum()))),
         ]
         return f"**Log**, law {self.law.name}, {self.sampled_law}\n\n" + markdown_table(("", ""), rows)
+
+    @property
+    def hidden(self) -> bool:
+        """Whether the path of the graphs is not known."""
+        return not len(self.starts)
 
     @classmethod
     def from_arrays(
@@ -102,7 +110,7 @@ class Log:
             the experiment
         graph
             the name of the one graph that was there all the time, or (p,) times and names of the graphs from then on;
-            None: the only graph of the law
+            None: the only graph of the law; "hidden": not known
         measurement_noise
             standard deviation, or one per agent; "estimate": from the log
         sampled_law
@@ -130,7 +138,7 @@ class Log:
                 f"times: {gap:g} units without a sample: expected at most {LONGEST:g}: are the units right?"
             )
         starts, graphs = _path(law, graph, moments[0])
-        first = int(np.searchsorted(moments, starts[0]))
+        first = int(np.searchsorted(moments, starts[0])) if len(starts) else 0
         if first:
             notes = [*notes, f"{first} samples before the first graph are not used"]
         if len(moments) - first < 2:
@@ -226,8 +234,12 @@ def _path(
     law: Experiment, graph: str | tuple[ArrayLike, Sequence[str]] | None, first: float
 ) -> tuple[FloatArray, IntArray]:
     names = [each.name for each in law.graph_list]
+    if graph == HIDDEN and HIDDEN not in names:
+        if len(names) > 1:
+            return np.empty(0), np.empty(0, dtype=np.int64)
+        graph = None
     if graph is None and len(names) > 1:
-        raise InputError(f"graph: missing: expected which of {', '.join(names)} was there when")
+        raise InputError(f"graph: missing: expected which of {', '.join(names)} was there when, or 'hidden'")
     if graph is None or isinstance(graph, str):
         graph = ([first], [graph or names[0]])
     starts = _floats("times of the graphs", graph[0])

@@ -35,7 +35,9 @@ from msg_analysis.inference.autocovariance import (
     logged_autocovariance,
     why_not_tested,
 )
+from msg_analysis.inference.log_spectrum import log_spectrum
 from msg_analysis.inference.observation import Observation
+from msg_analysis.model.log import Log
 from msg_analysis.theory import jump_system as systems
 from msg_analysis.theory.facts import check_facts
 from msg_analysis.theory.first_steps import simplification
@@ -103,6 +105,12 @@ def measure_spectrum(bag: Path, level: float) -> MeasuredSpectrum:
     elif log.steps < observation.steps:
         note = f"the first {log.steps} of {observation.steps} steps are tested"
     return MeasuredSpectrum(spectrum(prediction), level, log, density, note, trajectory.completeness.complete)
+
+
+def measure_log_spectrum(log: Log, level: float) -> MeasuredSpectrum:
+    """Of a log of any origin."""
+    predicted, measured, density, note = log_spectrum(log)
+    return MeasuredSpectrum(predicted, level, measured, density, note)
 
 
 Result = TypeVar("Result")

@@ -283,18 +283,18 @@ def export_run(trajectory: Run, directory: Path, forms: Sequence[Form], rows: in
     if "rrd" in forms:
         require_rerun()
         writers[directory / "run.rrd"] = lambda file, shown: write_recording(trajectory, file, shown)
-    with _readable(directory):
+    with readable(directory):
         directory.mkdir(parents=True, exist_ok=True)
     for path in writers:
         require_place(path)
     for path, write in writers.items():
-        with _readable(path), written_whole(path) as temporary:
+        with readable(path), written_whole(path) as temporary:
             write(temporary, path.name)
     return list(writers)
 
 
 @contextmanager
-def _readable(path: Path) -> Iterator[None]:
+def readable(path: Path) -> Iterator[None]:
     """Errors of the system as one of bad input that names the path."""
     try:
         yield

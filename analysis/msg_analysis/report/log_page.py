@@ -74,7 +74,7 @@ def log_figure(comparison: LogComparison) -> Figure:
         states.set(ylabel="state", xlim=(log.times[0], log.times[-1]))
         states.tick_params(labelbottom=False)
         legend_beside(figure, "right upper", fontsize=8)
-        ends = np.append(log.starts[1:], max(float(log.times[-1]), float(log.starts[-1])))
+        ends = np.append(log.starts[1:], max([float(log.times[-1]), *log.starts[-1:].tolist()]))
         draw_path(band, law, log.starts, ends, log.graphs)
         band.set_xlim(states.get_xlim())
         numbers = np.arange(1, law.agents + 1)

@@ -19,6 +19,7 @@ FACTORS = {
     "gains": "all gains",
     "noise": "all noise variances",
     "measurement_noise": "variance of the measurement noise",
+    "rates": "all rates of the switching",
 }
 MOST_TESTS = 12
 
@@ -41,7 +42,9 @@ def print_log_comparison(document: dict[str, Any], console: Console, *, verbose:
     )
     error = document["system_error"]
     if error:
-        say(f"system error: {measured_text(error['measured'], error['interval'])}, {_expected(error)}")
+        over = "over all paths" if document["hidden"] else "given the path of the graphs"
+        text = f"expected {over} {number_text(error['predicted'])}"
+        say(f"system error: {measured_text(error['measured'], error['interval'])}, {text}")
     noise = document["measurement_noise"]
     if noise["estimated"]:
         low, high = noise["interval"]
@@ -49,14 +52,15 @@ def print_log_comparison(document: dict[str, Any], console: Console, *, verbose:
         say(f"measurement noise, estimated: {text}")
     table = number_table(console, "Measured over expected", "", "factor", "95 %")
     for key, name in FACTORS.items():
-        found = document["factors"][key]
-        if found["interval"]:
+        found = document["factors"].get(key)
+        if found and found["interval"]:
             low, high = found["interval"]
             table.add_row(name, number_text(found["estimate"], 4), f"{number_text(low, 4)} to {number_text(high, 4)}")
     for number, ratio in enumerate(document["ratios"], start=1):
         if ratio is not None:
             table.add_row(f"squared innovations, {agent_text(number, names)}", number_text(ratio, 4), "")
-    print_table(console, table)
+    if table.row_count:
+        print_table(console, table)
     tests = sorted(document["tests"], key=lambda test: test["p"])
     shown = tests if verbose else [test for test in tests if test["rejected"]][:MOST_TESTS]
     if shown:
@@ -71,10 +75,6 @@ def print_log_comparison(document: dict[str, Any], console: Console, *, verbose:
         say(f"{title}: {' '.join(document[key])}")
     for note in document["notes"]:
         say(f"note: {note}")
-
-
-def _expected(error: dict[str, Any]) -> str:
-    return f"expected given the path of the graphs {number_text(error['predicted'])}"
 
 
 def print_log_check(document: dict[str, Any], console: Console) -> None:

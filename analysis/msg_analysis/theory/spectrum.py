@@ -24,7 +24,8 @@ import scipy.linalg
 from msg_analysis.common.arrays import FloatArray, IntArray
 from msg_analysis.common.text import markdown_table, number_text
 from msg_analysis.errors import InputError
-from msg_analysis.theory.jump_system import JumpSystem
+from msg_analysis.theory.jump_system import JumpSystem, continuous
+from msg_analysis.theory.moments import MomentSolver
 from msg_analysis.theory.prediction import Prediction
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ class Spectrum:
     covariances: FloatArray
     frequencies: FloatArray
     node_densities: FloatArray
+    period: float | None = None  # of one lag, and of the samples; None: run.dt
 
     def __repr__(self) -> str:
         last = number_text(float(self.times[-1]))
@@ -75,7 +77,7 @@ class Spectrum:
     @property
     def times(self) -> FloatArray:
         """(L,) the lags [units of simulated time]."""
-        return np.asarray(self.lags * self.prediction.step.dt, dtype=float)
+        return np.asarray(self.lags * (self.period or self.prediction.step.dt), dtype=float)
 
     @property
     def node_autocovariances(self) -> FloatArray:
@@ -104,13 +106,20 @@ class Spectrum:
 
         return spectrum_figure(self)
 
+    @property
+    def system_error(self) -> float:
+        """Predicted."""
+        if self.period is None:
+            return self.prediction.emulated.system_error
+        return float(self.system_autocovariance[0])
+
     def to_json(self) -> dict[str, Any]:
         """The keys of ``msg-analysis spectrum --json`` that are predicted."""
         experiment = self.prediction.experiment
         return {
             "experiment": experiment.name,
             "names": experiment.names,
-            "system_error": self.prediction.emulated.system_error,
+            "system_error": self.system_error,
             "lags": self.times.tolist(),
             "system_autocovariance": self.system_autocovariance.tolist(),
             "node_autocovariances": self.node_autocovariances.tolist(),
@@ -148,6 +157,33 @@ def spectrum(
     )
 
 
+def sampled_spectrum(prediction: Prediction, law: str, period: float) -> Spectrum:
+    """Of samples at equal intervals [units of simulated time] of the "continuous" law, or of the "steps" of a run.
+
+    As above, with exp(A period) in the place of B, where (A q)_j = -Z_j q_j + sum_i Gamma_ij q_i, or with B^period/dt.
+    """
+    system, steady = prediction.system, prediction.steady
+    if law == "continuous":
+        system = continuous(prediction.experiment)
+        steady = MomentSolver(system).steady()
+        drift = scipy.linalg.block_diag(*(-matrix for matrix in system.matrices))
+        operator = scipy.linalg.expm((drift + np.kron(system.chain.T, np.eye(system.dimension))) * period)
+    else:
+        operator = np.linalg.matrix_power(_operator(system), round(period / prediction.step.dt))
+    shape = steady.shape
+    moments, found = steady.reshape(-1, shape[2]), list[FloatArray]()
+    error = float(np.trace(system.lifted(steady.sum(axis=0))))
+    while len(found) < 2 or (len(found) < SHOWN_LAGS and np.trace(found[-1]) > FADED * error):
+        found.append(system.lifted(moments.reshape(shape).sum(axis=0)))
+        moments = operator @ moments
+    nyquist = 0.5 / period
+    frequencies = np.minimum(np.geomspace(0.05 / (period * max(len(found), 10)), nyquist, SHOWN_FREQUENCIES), nyquist)
+    densities = _densities(system, steady, 2.0 * np.pi * period * frequencies, MAX_SIZE, operator)
+    return Spectrum(
+        prediction, np.arange(len(found)), np.stack(found), frequencies, 2.0 * period * densities, period=period
+    )
+
+
 def _ahead(system: JumpSystem, moments: FloatArray) -> FloatArray:
     """(n, d, a): q(l + 1) from q(l) (n, d, a)."""
     moved = system.matrices @ moments
@@ -177,7 +213,20 @@ def _covariances(system: JumpSystem, steady: FloatArray, lags: IntArray) -> Floa
     return np.stack(found)
 
 
-def _densities(system: JumpSystem, steady: FloatArray, angles: FloatArray, most_unknowns: int) -> FloatArray:
+def _operator(system: JumpSystem) -> FloatArray:
+    """(n d, n d): B."""
+    n, d = system.modes, system.dimension
+    blocks = system.chain.T[:, None, :, None] * system.matrices.transpose(1, 0, 2)
+    return np.asarray(blocks.reshape(n * d, n * d))
+
+
+def _densities(
+    system: JumpSystem,
+    steady: FloatArray,
+    angles: FloatArray,
+    most_unknowns: int,
+    operator: FloatArray | None = None,
+) -> FloatArray:
     """(F, m): sum over all lags of R(l) exp(-i w l) of every agent, for angles w (F,) per step."""
     n, d = system.modes, system.dimension
     if n * d > most_unknowns:
@@ -188,7 +237,7 @@ def _densities(system: JumpSystem, steady: FloatArray, angles: FloatArray, most_
     output = system.output
     if not d:
         return np.zeros((len(angles), len(output)))
-    operator = (system.chain.T[:, None, :, None] * system.matrices.transpose(1, 0, 2)).reshape(n * d, n * d)
+    operator = _operator(system) if operator is None else operator
     triangle, vectors = scipy.linalg.schur(operator.astype(complex), output="complex")
     right = vectors.conj().T @ (steady @ output.T).reshape(n * d, -1)  # (n d, m)
     left = np.tile(output, (1, n)) @ vectors  # (m, n d)

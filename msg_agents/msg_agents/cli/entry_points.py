@@ -34,8 +34,8 @@ def _leave_garbage() -> None:
 
 
 msg_agents = partial(_run)
-agent, switcher, recorder, live, markers = (
-    partial(_run, command) for command in ("agent", "switcher", "recorder", "live", "markers")
+agent, switcher, recorder, live, markers, external = (
+    partial(_run, command) for command in ("agent", "switcher", "recorder", "live", "markers", "external")
 )
 player = partial(_run, "play")
 

@@ -63,7 +63,7 @@ def test_every_parameter_is_documented(name: str) -> None:
 
 
 def test_parameters_are_found_by_the_name_of_the_executable() -> None:
-    names = {"agent", "switcher", "recorder", "player", "live", "markers"}
+    names = {"agent", "switcher", "recorder", "player", "live", "markers", "external"}
     assert {command.node_name for command in NODES.values()} == names
 
 

@@ -12,7 +12,7 @@ import yaml
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 
-from experiments import line_ring
+from experiments import line_ring, simulate
 from msg_analysis.bags.first_map import check_log, first_map
 from msg_analysis.bags.log_map import json_schema, load_map, parse_map
 from msg_analysis.bags.mapped_log import read_log
@@ -409,3 +409,17 @@ def test_positions_of_a_bag_are_a_recorded_topology(tmp_path: Path, typestore: A
     (tmp_path / "map.yaml").write_text('agents: {"*": {topic: "/r{i}/place", fields: [point.x, point.y]}}')
     with pytest.raises(ExperimentError, match=r"switching\.map: .*list them"):
         Experiment.parse(document, directory=tmp_path)
+
+
+@pytest.mark.parametrize("replicas", [1, 2])
+def test_the_first_map_of_a_bag_of_ours_gives_the_numbers_of_its_run(tmp_path: Path, replicas: int) -> None:
+    run = simulate(line_ring(3, run={"dt": 0.1, "duration": 50, "replicas": replicas, "seed": 2}))
+    run.save(tmp_path / "own")
+    found = parse_map(yaml.safe_load(first_map(tmp_path / "own")), "first map")
+    log = read_log(tmp_path / "own", found, run.experiment)
+    assert log.sampled_law == "steps"
+    assert np.array_equal(log.states[:, :, 0], run.values[:, :, 0])
+    np.testing.assert_allclose(log.times, run.times, atol=1e-9)
+    steps = np.searchsorted(log.starts, run.times[:-1] + 1e-6, side="right") - 1
+    assert np.array_equal(log.graphs[steps], run.modes)
+    assert log.compare().verdict == "agrees"

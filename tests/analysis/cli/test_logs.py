@@ -1,5 +1,6 @@
 """The commands on logs of other robots: a first map, what is in a bag, the verdict and its exit codes."""
 
+import csv
 import html
 import json
 import re
@@ -7,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet
 import pytest
 from programs import run
-from robots import LAW, write_robots
+from robots import LAW, SCRIPT, write_robots
 
 from msg_analysis.errors import InputError
 from msg_analysis.inference.log_verdict import LogComparison
@@ -74,6 +76,55 @@ def test_assert_agrees_with_a_law(robots: Path, tmp_path: Path) -> None:
         assert_agrees(robots / "good", law=robots / "law.yaml")
     with pytest.raises(InputError, match="2 logs: expected one log"):
         assert_agrees(robots / "good", robots / "bad", **given)
+
+
+def test_graphs_that_are_not_in_the_log(robots: Path, tmp_path: Path) -> None:
+    lines = (robots / "map.yaml").read_text().splitlines()
+    mapped = tmp_path / "map.yaml"
+    mapped.write_text("\n".join("graph: hidden" if line.startswith("graph:") else line for line in lines))
+    words = "compare", robots / "good", "--law", robots / "law.yaml", "--map", mapped
+    result = call(*words, "--report", tmp_path / "page.html")
+    assert result.exit_code == 0, result.output
+    for part in ("expected over all paths", "all rates of the switching", "Approximate: ", "models", "Not tested: "):
+        assert part in result.stdout
+    assert "models" in (tmp_path / "page.html").read_text()
+    mapped.write_text(mapped.read_text().replace("graph: hidden", "graph: {hidden: true, fixed: line}"))
+    assert "graph: hidden" in call(*words).stderr
+
+
+def test_the_spectrum_by_a_map(robots: Path, tmp_path: Path) -> None:
+    words = "spectrum", robots / "good", "--law", robots / "law.yaml", "--map", robots / "map.yaml"
+    result = call(*words, "--json", "--figure", tmp_path / "spectrum.png")
+    document = json.loads(result.stdout)
+    assert (result.exit_code, document["agrees"], document["note"]) == (0, True, None)
+    assert document["log"]["lags"][1] == pytest.approx(0.1)
+    assert (tmp_path / "spectrum.png").exists()
+    assert "The log agrees with the predicted autocovariance" in call(*words).stdout
+    assert "--law: missing" in call(*words[:2], "--map", robots / "map.yaml").stderr
+
+
+def test_export_by_a_map(robots: Path, tmp_path: Path) -> None:
+    """The states that were written, to the nanosecond and the last bit; see ``write_robots``."""
+    times, states, starts, names = SCRIPT["simulate"](SCRIPT["Kind"](), 1500, np.random.default_rng(1))
+    words = "export", robots / "good", "--map", robots / "map.yaml", "--out", tmp_path
+    result = call(*words, "--csv", "--parquet", "--npz", "--json")
+    document = json.loads(result.stdout)
+    assert (result.exit_code, document["missing"]) == (0, 0)
+    assert sorted(Path(file).name for file in document["files"]) == sorted(
+        ["states.csv", "graphs.csv", "states.parquet", "graphs.parquet", "log.npz"]
+    )
+    with np.load(tmp_path / "log.npz") as arrays:
+        assert np.array_equal(arrays["states"][:, :, 0], states)
+        np.testing.assert_allclose(arrays["times"], times, atol=2e-9)
+        np.testing.assert_allclose(arrays["starts"], starts, atol=2e-9)
+        assert arrays["path"].tolist() == names
+    with (tmp_path / "states.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [float(row["state"]) for row in rows] == states.ravel().tolist()
+    assert [row["agent"] for row in rows[:6]] == ["1", "2", "3", "4", "5", "1"]
+    table = pyarrow.parquet.read_table(tmp_path / "graphs.parquet").to_pydict()
+    assert table["graph_name"] == names
+    assert "expected --csv, --parquet or --npz" in call(*words, "--rrd").stderr
 
 
 def test_what_is_in_a_bag(robots: Path) -> None:

@@ -150,6 +150,8 @@ def test_with_the_law_of_the_steps_the_numbers_are_those_of_a_run(tracking: bool
     assert p["innovations: whiteness"] == pytest.approx(residuals.p_whiteness, abs=1e-9)
     assert p["innovations: gains"] == pytest.approx(residuals.p_gain, abs=1e-9)
     assert p["innovations: common gain"] == pytest.approx(residuals.p_common_gain, abs=1e-9)
+    largest = next(test.p for test in wanted.tests if test.name == "residuals: largest")
+    assert p["innovations: largest"] == pytest.approx(largest, abs=1e-9)
     assert wanted.switching is not None
     assert p["switching"] == pytest.approx(wanted.switching.p, abs=1e-9)
     np.testing.assert_allclose(found.ratios, residuals.ratios, atol=1e-9)
@@ -161,9 +163,17 @@ def test_with_the_law_of_the_steps_the_numbers_are_those_of_a_run(tracking: bool
     given = wanted.given.given
     assert error.system_error is not None
     spread = np.sqrt(given.trace @ given.covariance @ given.trace)
-    assert error.system_error.measured == pytest.approx(given.trace @ given.measured, rel=1e-5)
-    assert error.system_error.predicted == pytest.approx(given.trace @ given.predicted, rel=1e-3)
-    assert error.system_error.standard_error == pytest.approx(spread, rel=1e-3)
+    assert error.system_error.measured == pytest.approx(given.trace @ given.measured, rel=1e-9)
+    assert error.system_error.predicted == pytest.approx(given.trace @ given.predicted, rel=1e-9)
+    assert error.system_error.standard_error == pytest.approx(spread, rel=1e-9)
+
+
+@pytest.mark.parametrize(("irregular", "said"), [(False, False), (True, True)])
+def test_irregular_stamps_are_said(irregular: bool, said: bool) -> None:
+    kind = replace(Kind(), irregular=irregular)
+    times, states, starts, names = draw(kind, 200, np.random.default_rng(8))
+    log = Log.from_arrays(times, states, law=kind.law(), graph=(starts, names), measurement_noise=kind.r)
+    assert any("stamps are taken to be the true times" in each for each in log.compare().approximate) is said
 
 
 def test_a_late_agent_and_one_coordinate_more() -> None:
