@@ -12,7 +12,7 @@ import pytest
 import setuptools
 
 SETUP = Path(__file__).parents[2] / "msg_agents" / "setup.py"
-NODES = {"agent", "live", "markers", "player", "recorder", "switcher"}
+NODES = {"agent", "external", "live", "markers", "player", "recorder", "switcher"}
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A right bag, and one whose link 2-3 is missing."""
     place = tmp_path_factory.mktemp("robots")
     write_robots(place / "good", 1500)
-    write_robots(place / "bad", 3000, missing=(2, 3))
+    write_robots(place / "bad", 800, missing=(2, 3))
     (place / "law.yaml").write_text(LAW)
     (place / "map.yaml").write_text(call("map", place / "good").stdout)
     return place
