@@ -32,7 +32,7 @@ unexport PIP_TARGET PIP_PREFIX PIP_ROOT
 # With --jobs, what is started here would look for other jobs of this make, and build with one core.
 unexport MAKEFLAGS MFLAGS
 
-.PHONY: help setup demo wheels wheels-test test test-fast test-ros test-least stress fuzz mutants lint lint-container format bench calibrate docs colcon colcon-test container lock clean
+.PHONY: help setup demo wheels wheels-test test test-fast test-ros test-least stress fuzz mutants lint lint-container format bench calibrate docs pages colcon colcon-test container lock clean
 
 help: ## Say what can be made
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -88,14 +88,15 @@ SKIPPED := build/skipped
 TEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --skipped-to=$(SKIPPED) $(TEST_OPTIONS)
 
 DOCS_TESTS := tests/docs tests/integration/test_docs.py
+PAGES_TESTS := $(wildcard tests/analysis/report/*_browser.py)
 
-test: setup $(VENV)/.compiled ## Run all tests but those of the documentation, which make docs runs
+test: setup $(VENV)/.compiled ## Run all tests but those of the documentation and of pages: make docs, make pages
 	@rm -f $(SKIPPED)
-	$(TEST) $(SEVERAL_AT_ONCE) $(addprefix --ignore=,$(DOCS_TESTS))
+	$(TEST) $(SEVERAL_AT_ONCE) $(addprefix --ignore=,$(DOCS_TESTS) $(PAGES_TESTS))
 	@test ! -s $(SKIPPED) || { echo "Not tested:"; cat $(SKIPPED); } >&2
 
 test-fast: setup $(VENV)/.compiled ## Run the tests that start no network
-	$(TEST) $(SEVERAL_AT_ONCE) $(addprefix --ignore=,$(DOCS_TESTS)) --ignore tests/integration
+	$(TEST) $(SEVERAL_AT_ONCE) $(addprefix --ignore=,$(DOCS_TESTS) $(PAGES_TESTS)) --ignore tests/integration
 
 # What another distribution could break, as briefly as possible: equal to the twin in lockstep, kills and takeovers, real
 # time, rejected messages, the bag, discovery, watchers that print nothing else.
@@ -157,6 +158,9 @@ calibrate: setup ## Measure error rates and power of the verdict into docs/calib
 docs: setup ## Build the documentation into site/, and test it: links, every page in Chromium, its commands and examples
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	SITE=site OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(TEST_OPTIONS) --numprocesses 3 --dist loadfile $(DOCS_TESTS)
+
+pages: setup ## Test reports and other pages in Chromium, on a screen, a phone and paper
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(TEST_OPTIONS) $(PAGES_TESTS)
 
 # Build the workspace as a ROS 2 user does. With ROS 2 from wheels, the virtual environment is the underlay.
 WORKSPACE := build/colcon$(SUFFIX)
