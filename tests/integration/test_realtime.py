@@ -161,9 +161,7 @@ def test_an_agent_stands_still_and_the_clock_is_set_back(network: Any) -> None:
     network.wait_for(lambda: np.ptp(read_steps(steps) or [0, 999]) < 50, 30, "everybody at the same step")
     clock.set_ahead(-3.0)
     stdout, stderr = network.ended(run)
-    assert re.search(
-        r"note: agents? .*\(PID \d+\) ha(s|ve) made no step for \d+\.\d s; the other \d (is|are)", stderr
-    )
+    assert re.search(r"note: agents? .*\(PID \d+\) ha(s|ve) made no step for \d+\.\d s; the other \d (is|are)", stderr)
     assert re.search(r"note: the clock of this machine was set back by 3\.0 s: no step is due", stderr)
     assert_possible(read_bag(json.loads(stdout)["bag"]))
 
