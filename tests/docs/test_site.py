@@ -173,7 +173,7 @@ def seen(tab: Tab, site: Path, pages: dict[Path, Links]) -> Seen:
                 poor[scheme] += [(file.name, width, one) for one in page.evaluate(FAINT)]
     page.set_viewport_size({"width": 1280, "height": 900})
     page.goto((site / "index.html").as_uri())
-    page.locator(".md-search__input").fill("supermodularity")
+    page.locator(".md-search__input").press_sequentially("supermodularity")  # the search listens to keys
     first = page.locator(".md-search-result__link").first
     first.wait_for()
     return Seen(log, str(first.get_attribute("href")), wide, poor)
