@@ -84,15 +84,8 @@ WRONG = [  # values of maps that take long, lead elsewhere, or look like code
     *(1e-300, 5e-324, 1e99, -1.0, 2**62, 2**70, 1e-9, 1e9, "1e9", float("nan"), float("inf"), "estimate", "continuous"),
     *("/robot_.*", "/robot_[0-9]+/pose", "(a+)+$", "{i}" * 100, "{name}", "*", "/robot_1/pose", "x1", "t", "data[999]"),
     *("/etc/passwd", "../../../etc/shadow", "/dev/zero", "/dev/stdin", "fifo", ".", "~", "file:///etc/passwd", "a\0b"),
-    *(
-        "__class__.__mro__[1]",
-        "os.system('touch hacked')",
-        "{0.__class__}",
-        "%(x)s",
-        "$HOME",
-        "`id`",
-        "=cmd|' /C x'!A0",
-    ),
+    *("__class__.__mro__[1]", "os.system('touch hacked')", "{0.__class__}", "=cmd|' /C x'!A0"),
+    *("%(x)s", "$HOME", "`id`"),
     *("header.stamp.sec", "header.frame_id", "pose", "pose.position", "[0]", "pose..x", "x" * 100_000, "\u202e", "²"),
     *([0.1] * 100_000, [[]], {"topic": "/robot_1/pose", "field": "pose.position.x"}, ["x1"] * 200, ["x1", "{i}"]),
 ]
@@ -319,22 +312,20 @@ HOSTILE: list[Callable[[random.Random], str]] = [
     lambda _: "wstring s\nfloat64 x",
     lambda _: "float64[<=3] h\nfloat64 x",
     lambda rng: "module lab_msgs { module msg { " * rng.choice([1, 50, 5000]) + "struct Tank { double x; };",
-    lambda rng: (
-        f"module lab_msgs {{ module msg {{ const long A = {'(' * rng.choice([5, 500, 50_000])}1; struct Tank {{ double x; }}; }}; }};"  # noqa: E501
-    ),
-    lambda rng: (
-        f"module lab_msgs {{ module msg {{ const long A = 9 {'* 9' * rng.choice([5, 20, 5000])}; struct Tank {{ double x[A]; }}; }}; }};"  # noqa: E501
-    ),
-    lambda _: (
-        "module lab_msgs { module msg { typedef double T[1000]; typedef T S[1000]; struct Tank { S s; double x; }; }; };"  # noqa: E501
-    ),
-    lambda _: "module lab_msgs { module msg { struct Tank { sequence<sequence<double>> s; double x; }; }; };",
-    lambda _: "/*" * 1000 + "module lab_msgs { module msg { struct Tank { double x; }; }; };",
+    lambda rng: _module("double x;", f"const long A = {'(' * rng.choice([5, 500, 50_000])}1;"),
+    lambda rng: _module("double x[A];", f"const long A = 9 {'* 9' * rng.choice([5, 20, 5000])};"),
+    lambda _: _module("S s; double x;", "typedef double T[1000]; typedef T S[1000];"),
+    lambda _: _module("sequence<sequence<double>> s; double x;"),
+    lambda _: "/*" * 1000 + _module("double x;"),
 ]
 
 
 def _also(name: str, text: str) -> str:
     return f"\n{'=' * 80}\nMSG: lab_msgs/{name}\n{text}"
+
+
+def _module(fields: str, before: str = "") -> str:
+    return f"module lab_msgs {{ module msg {{ {before} struct Tank {{ {fields} }}; }}; }};"
 
 
 def _wide(count: int) -> str:
@@ -480,12 +471,8 @@ def _fuzz_values(rng: random.Random, _sources: list[Path], folder: Path) -> str:
     definition = in_idl(types) if idl else in_msg(types)
     with _trusted():
         store = get_typestore(Stores.EMPTY)
-        parsed = (
-            get_types_from_idl(re.sub(r"(?m)^(=+|IDL: .*)$", "", definition))
-            if idl
-            else get_types_from_msg(definition, TANK)
-        )
-        store.register(parsed)
+        plain = re.sub(r"(?m)^(=+|IDL: .*)$", "", definition)  # of definitions in IDL
+        store.register(get_types_from_idl(plain) if idl else get_types_from_msg(definition, TANK))
         values = [_value("Tank", "", types, store.types, rng) for _ in range(SAMPLES)]
         little = rng.random() < 0.7
         messages = [bytes(store.serialize_cdr(each, TANK, little_endian=little)) for each in values]

@@ -151,17 +151,20 @@ def test_an_agent_stands_still_and_the_clock_is_set_back(network: Any) -> None:
     """Each by three seconds: the run names it, and catches up; then, that no step is due, and waits."""
     # The clock is that of all processes of the run, whose log is possible.
     clock = SetClock(network.directory)
-    file = network.file(run=REALTIME | {"duration": 35, "processes": 2})
+    # Of several agents in a process, that which stands still for the shorter time is told: here there is one.
+    file = network.file(run=REALTIME | {"duration": 35, "processes": 3})
     run = network.execute(*network.recording(file), "--json", **clock.environment)
     steps = network.wait_for_steps()
-    (agent, *_) = network.processes("agent")
+    (agent,) = (process for process in network.processes("agent") if process.agent == 1)
     agent.kill(signal.SIGSTOP)
     time.sleep(3.0)
     agent.kill(signal.SIGCONT)
     network.wait_for(lambda: np.ptp(read_steps(steps) or [0, 999]) < 50, 30, "everybody at the same step")
     clock.set_ahead(-3.0)
     stdout, stderr = network.ended(run)
-    assert re.search(r"note: agents? .*\(PID \d+\) ha(s|ve) made no step for \d+\.\d s; the other \d (is|are)", stderr)
+    assert re.search(
+        r"note: agents? .*\(PID \d+\) ha(s|ve) made no step for [2-5]\.\d s; the other \d (is|are)", stderr
+    )
     assert re.search(r"note: the clock of this machine was set back by 3\.0 s: no step is due", stderr)
     assert_possible(read_bag(json.loads(stdout)["bag"]))
 

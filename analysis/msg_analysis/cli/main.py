@@ -38,6 +38,7 @@ from msg_analysis.cli.options import (
     json_option,
     load_experiment,
     out_option,
+    parse_agents,
     seed_option,
     set_option,
     storage_options,
@@ -111,7 +112,7 @@ def predict(
         if "seed" in given:
             loaded = loaded.with_run(seed=given.pop("seed"))
         if "agents" in given:
-            given["agents"] = [int(agent) if agent.isdigit() else agent for agent in given["agents"].split(",")]
+            given["agents"] = parse_agents(given["agents"])
         if "precision" in given:
             given["precision"] = theory.parse_share(given["precision"])
         if "within" in given:

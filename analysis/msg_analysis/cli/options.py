@@ -235,6 +235,11 @@ def storage_options(command: Callable[..., None]) -> Callable[..., None]:
     return decorated
 
 
+def parse_agents(text: str) -> list[int | str]:
+    """Numbers and names between commas."""
+    return [int(word) if word.isascii() and word.isdigit() else word for word in map(str.strip, text.split(","))]
+
+
 def suggest(*words: str) -> Callable[..., list[CompletionItem]]:
     """A ``shell_complete`` function that offers these words; the option takes others, too."""
     return lambda _context, _option, incomplete: [CompletionItem(w) for w in words if w.startswith(incomplete)]

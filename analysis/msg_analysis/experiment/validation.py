@@ -318,6 +318,20 @@ def whole_link_problems(loss: FloatArray, noise: NoiseSpec) -> list[str]:
     return [problem("noise.whole_link", True, wanted, "give noise.loss.edges in place of arcs")]
 
 
+def listed_problems(
+    key: str, numbers: Sequence[int], what: str, agents: int | None, names: Sequence[str] | None = None
+) -> list[str]:
+    """Agents that a list has twice, or that are not there; ``agents``: None if unknown."""
+    found = []
+    for label in sorted(label for label in set(numbers) if numbers.count(label) > 1):
+        who = agent_text(label, names)
+        found.append(problem(key, f"{who} twice", f"expected every {what} once", "remove one"))
+    for label in numbers:
+        if agents is not None and label > agents:
+            found.append(problem(key, f"agent {label}", f"expected agents 1 to {agents}", "correct it"))
+    return found
+
+
 def leader_problems(
     problem_kind: str, leaders: LeadersSpec | None, agents: int | None, names: Sequence[str] | None = None
 ) -> list[str]:
@@ -330,14 +344,9 @@ def leader_problems(
         wanted = "expected leaders, since problem is tracking"
         return [problem("leaders", "missing", wanted, "for example leaders: {agents: [1], gain: 1.0}")]
     found = []
-    for label in sorted(label for label in set(leaders.agents) if leaders.agents.count(label) > 1):
-        who = agent_text(label, names)
-        found.append(problem("leaders.agents", f"{who} twice", "expected every leader once", "remove one"))
+    found += listed_problems("leaders.agents", leaders.agents, "leader", agents, names)
     if agents is None:
         return found
-    for label in leaders.agents:
-        if label > agents:
-            found.append(problem("leaders.agents", f"agent {label}", f"expected agents 1 to {agents}", "correct it"))
     if math.isinf(leaders.gain) and len(set(leaders.agents)) >= agents:
         wanted = "expected at least one agent that follows"
         found.append(problem("leaders.agents", "all agents, with gain inf", wanted, "remove a leader"))
@@ -401,12 +410,8 @@ def run_problems(run: RunSpec, time: Time, agents: int | None) -> list[str]:
 
 def external_problems(run: RunSpec, agents: int | None, *, protocol: bool) -> list[str]:
     """External agents that are not there, or twice, or of a protocol; a frame without poses."""
-    found, external = [], run.external or []
-    for agent in dict.fromkeys(external):
-        if agents is not None and agent > agents:
-            found.append(problem("run.external", f"agent {agent}", f"expected agents 1 to {agents}", "correct it"))
-        if external.count(agent) > 1:
-            found.append(problem("run.external", f"agent {agent} twice", "expected every agent once", "remove one"))
+    external = run.external or []
+    found = listed_problems("run.external", external, "agent", agents)
     if external and protocol:
         wanted = "expected none with a protocol: its agents are in its package"
         found.append(problem("run.external", show(external), wanted, "remove run.external, or the protocol"))

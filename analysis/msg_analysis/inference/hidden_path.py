@@ -49,17 +49,8 @@ class HiddenFilter(Filter):
         self.chain, self.continuous = chain, isinstance(law, ContinuousLaw)
         self.substeps = substeps(law, self.lengths)
 
-    def run(
-        self,
-        noise: FloatArray,
-        *,
-        terms: list[Term] | None = None,
-        variances: bool = True,
-        keep: bool = False,
-        most: int | None = None,
-    ) -> Innovations:
-        """See ``Filter.run``."""
-        return _Pass(self, noise, terms or [], variances, keep, most or len(self.times)).run()
+    def _pass(self, noise: FloatArray, terms: list[Term], variances: bool, keep: bool, most: int) -> Innovations:
+        return _Pass(self, noise, terms, variances, keep, most).run()
 
     def terms(self) -> list[Term]:
         """As ``IntervalLaw.terms``, fewer."""

@@ -112,7 +112,10 @@ class Filter:
 
         ``terms``: gains with derivatives; ``keep``: the matrices for the means of errors; ``most``: samples used.
         """
-        return _Pass(self, noise, terms or [], variances, keep, most or len(self.times)).run()
+        return self._pass(noise, terms or [], variances, keep, most or len(self.times))
+
+    def _pass(self, noise: FloatArray, terms: list[Term], variances: bool, keep: bool, most: int) -> Innovations:
+        return _Pass(self, noise, terms, variances, keep, most).run()
 
     def singular(self, variances: FloatArray, rows: IntArray, k: int) -> InputError:
         """The error of a sample whose expected variances are 0 in some direction."""

@@ -68,21 +68,19 @@ def export_log(log: MappedLog, directory: Path, forms: Sequence[Form]) -> list[P
         require_pyarrow("Parquet")
     with readable(directory):
         directory.mkdir(parents=True, exist_ok=True)
-    files = []
-    for form in forms:
-        whole = {
-            "times": log.times,
-            "states": log.states,
-            "starts": log.starts,
-            "path": np.array(log.graphs, dtype=str),
-        }
-        for name, columns in {"log": whole}.items() if form == "npz" else log.tables().items():
-            path = directory / f"{name}.{form}"
-            require_place(path)
-            with readable(path), written_whole(path) as temporary:
-                _write(temporary, form, columns)
-            files.append(path)
-    return files
+    path = np.array(log.graphs, dtype=str)
+    whole = {"log": {"times": log.times, "states": log.states, "starts": log.starts, "path": path}}
+    contents = {
+        directory / f"{name}.{form}": (form, columns)
+        for form in forms
+        for name, columns in (whole if form == "npz" else log.tables()).items()
+    }
+    for file in contents:
+        require_place(file)
+    for file, (form, columns) in contents.items():
+        with readable(file), written_whole(file) as temporary:
+            _write(temporary, form, columns)
+    return list(contents)
 
 
 def _write(file: Path, form: Form, columns: Mapping[str, Any]) -> None:

@@ -32,6 +32,7 @@ from msg_analysis.cli.options import (
     json_option,
     max_missed_option,
     out_option,
+    parse_agents,
     positive_option,
     seed_option,
     set_option,
@@ -205,8 +206,7 @@ def run(
     until = Until.parse(until_text) if until_text is not None else None
     values = {key: given.pop(key) for key in ("seed", "duration", "pace", "speed", "delivery", "processes")}
     if external is not None:
-        words = [word.strip() for word in external.split(",") if word.strip()]
-        values["external"] = [int(word) if word.isdecimal() else word for word in words]
+        values["external"] = parse_agents(external)
     what = load_with_overrides(
         experiment,
         values,

@@ -18,7 +18,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from msg_agents.nodes.base import NetworkNode
-from msg_agents.nodes.ros import after
+from msg_agents.nodes.ros import after, state_messages
 from msg_agents.process_layout import RECORDER
 from msg_agents.recovery import Checkpoint, entry_size, published_size
 from msg_agents.stepping.monitoring import StallDetector
@@ -145,10 +145,8 @@ class Agent(NetworkNode):
         self._exact: Publisher | None = self.publisher_of(topics.TRUTH, agent) if experiment.truth else None
         self._pose: Callable[[float], None] | None = None
         if experiment.run.publish:
-            from msg_agents.nodes.poses import StateMessages  # few runs need these messages
-
-            poses, make = self.publisher_of(topics.POSE, agent), StateMessages(self, record, "pose").message
-            self._pose = lambda x: poses.publish(make(x))
+            poses, (_, pose) = self.publisher_of(topics.POSE, agent), state_messages(self, "pose", experiment.run.frame)
+            self._pose = lambda x: poses.publish(pose(x))
 
     @property
     def number(self) -> int:

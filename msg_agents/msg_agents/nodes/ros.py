@@ -280,3 +280,25 @@ def objection(before: QoSProfile, after: QoSProfile, *, publishes: bool) -> str:
             names = [str(getattr(value, "name", value)).lower() for value in (theirs, ours)]
             return f"{policy}: {names[0]}: messages of the run would be lost or never arrive: expected {names[1]}"
     return ""
+
+
+FRAME = "map"  # of positions
+
+
+def state_messages(node: Node, kind: str, frame: str | None) -> tuple[type[Any], Callable[[float], Any]]:
+    """A type of messages for programs that know nothing of this software, by ``hears`` of a map, and its messages.
+
+    x is the state. They are stamped with the time of the node's clock; the orientation of a pose is the identity.
+    """
+    from geometry_msgs.msg import Point, PointStamped, Pose, PoseStamped  # here, since few processes need them
+    from std_msgs.msg import Float64, Header
+
+    def header() -> Header:
+        return Header(stamp=node.get_clock().now().to_msg(), frame_id=frame or FRAME)
+
+    kinds: dict[str, tuple[type[Any], Callable[[float], Any]]] = {
+        "number": (Float64, lambda x: Float64(data=x)),
+        "point": (PointStamped, lambda x: PointStamped(header=header(), point=Point(x=x))),
+        "pose": (PoseStamped, lambda x: PoseStamped(header=header(), pose=Pose(position=Point(x=x)))),
+    }
+    return kinds[kind]

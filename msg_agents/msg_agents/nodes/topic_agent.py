@@ -16,8 +16,7 @@ from rclpy.qos import qos_profile_sensor_data
 from rclpy.subscription import Subscription
 
 from msg_agents.nodes.external_agent import ExternalAgent
-from msg_agents.nodes.poses import StateMessages
-from msg_agents.nodes.ros import DueTimer, foreign_message_class
+from msg_agents.nodes.ros import DueTimer, foreign_message_class, state_messages
 from msg_agents.run.external import NOTHING_ON, robot_source
 from msg_analysis.arithmetic.reproducible import SECOND
 from msg_analysis.bags.log_map import LogMap
@@ -57,12 +56,12 @@ class TopicAgent(ExternalAgent):
 
     def connected(self, node: Node) -> None:
         """Make the topics for the robot."""
-        made = StateMessages(node, self._record, self._hears)
+        kind, message = state_messages(node, self._hears, self.experiment.run.frame)
 
         def publishing(topic: str) -> Callable[[float], None]:
-            publisher = node.create_publisher(made.type, topic, qos_profile_sensor_data)
+            publisher = node.create_publisher(kind, topic, qos_profile_sensor_data)
             self._publishers.append(publisher)
-            return lambda x: publisher.publish(made.message(x * self._unit))
+            return lambda x: publisher.publish(message(x * self._unit))
 
         for j in self._record.model.listens()[self.number - 1].nonzero()[0].tolist():
             self._tell[j + 1] = publishing(HEARD.format(self.number, j + 1))

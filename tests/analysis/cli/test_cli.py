@@ -86,6 +86,7 @@ def test_predict_samples() -> None:
         (("--precision", "2"), "--precision 2: expected a share above 0, below 1"),
         (("--within", "soon"), "--within soon: expected a number above 0 with s, min, h or d"),
         (("--agents", "1,9"), "agents: 9: expected numbers from 1 to 5"),
+        (("--agents", "1,²"), 'agents: "²": expected numbers from 1 to 5'),
         (("--workers", "2", "--scheduler", "tcp://10.0.0.1:8786"), "--workers: not together with --scheduler"),
         (("--from", "3", "--seed", "1"), "--from 3: expected with a schedule"),
     ):

@@ -125,6 +125,9 @@ def test_export_by_a_map(robots: Path, tmp_path: Path) -> None:
     table = pyarrow.parquet.read_table(tmp_path / "graphs.parquet").to_pydict()
     assert table["graph_name"] == names
     assert "expected --csv, --parquet or --npz" in call(*words, "--rrd").stderr
+    (tmp_path / "taken/log.npz").mkdir(parents=True)
+    assert call(*words[:-1], tmp_path / "taken", "--csv", "--npz").exit_code == 2
+    assert [file.name for file in (tmp_path / "taken").iterdir()] == ["log.npz"]  # nothing is half-written
 
 
 def test_what_is_in_a_bag(robots: Path) -> None:

@@ -119,7 +119,7 @@ def test_sampled_by_matrices(leader: bool) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_correct_runs(kind: str) -> None:
     law = lazy(**KINDS[kind])
-    runs = [simulate(law.with_run(seed=seed)) for seed in range(8)]
+    runs = [simulate(law.with_run(seed=seed)) for seed in range(12)]
     if kind in ("plain", "hears nobody"):
         rests = (runs[0].states[1:] == runs[0].states[:-1]).all(axis=2)
         assert 0.2 < rests.mean() < 0.4

@@ -41,7 +41,7 @@ def scheduled(**changes: Any) -> Experiment:
 @pytest.mark.parametrize("messages", MESSAGES)
 def test_correct_runs(messages: str) -> None:
     law = scheduled(**MESSAGES[messages])
-    found = [compare(simulate(law.with_run(seed=seed))) for seed in range(8)]
+    found = [compare(simulate(law.with_run(seed=seed))) for seed in range(10)]
     assert_covered(found)
     assert all(one.switching is None for one in found)
 

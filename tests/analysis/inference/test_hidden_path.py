@@ -113,7 +113,7 @@ def test_the_expected_error_is_that_over_all_paths() -> None:
 
 def test_right_logs_agree_and_the_wrong_ones_do_not() -> None:
     """Of 6 right logs none is rejected, with a false-alarm rate of 1 % each; seeds are fixed."""
-    assert not any(judge(Kind(hidden=True), 300, seed)[0] for seed in range(6))
+    assert not any(judge(Kind(hidden=True), 400, seed)[0] for seed in range(6))
     causes = judge(Kind(hidden=True, louder=2.0), 1000, 1)[1]
     assert causes[0][1].startswith("agent 2's noise variance is")
     causes = judge(Kind(hidden=True, period=0.5, r=0.0, faster=4.0), 2000, 2)[1]

@@ -120,7 +120,7 @@ def test_how_errors_are_known() -> None:
 @pytest.mark.parametrize("messages", MESSAGES)
 def test_correct_runs(messages: str) -> None:
     law = linked(9 if messages == "plain" else 6, **MESSAGES[messages])
-    found = [compare(simulate(law.with_run(seed=seed))) for seed in range(8)]
+    found = [compare(simulate(law.with_run(seed=seed))) for seed in range(12)]
     assert_covered(found)
     assert all("links" in [test.name for test in one.tests] for one in found)
 

@@ -74,7 +74,7 @@ def test_exact_prediction_and_a_sampled_one(changes: dict[str, Any]) -> None:
 
 
 def test_correct_runs() -> None:
-    found = [compare(simulate(held(run={"seed": seed, "duration": 200, "replicas": 1}))) for seed in range(8)]
+    found = [compare(simulate(held(run={"seed": seed, "duration": 200, "replicas": 1}))) for seed in range(12)]
     assert_covered(found)
     assert all("sojourns" in [test.name for test in one.tests] for one in found)
 
