@@ -338,8 +338,12 @@ def _factors(parameters: Parameters) -> dict[str, Factor]:
         named["rates"] = parameters.variance(Variance("switching"))
     factors = {}
     for name, one in zip(named, parameters.factor(list(named.values())), strict=True):
-        half = 0.0 if one is None else HALF_WIDTH_95 * one[1]
-        factors[name] = Factor(None, None) if one is None else Factor(one[0], (one[0] - half, one[0] + half))
+        if one is None:
+            factors[name] = Factor(None, None)
+            continue
+        value, half = one[0], HALF_WIDTH_95 * one[1]
+        least = -math.inf if name == "gains" else 0.0  # variances and rates are not negative
+        factors[name] = Factor(max(value, least), (max(value - half, least), max(value + half, least)))
     return factors
 
 

@@ -172,7 +172,6 @@ def run_figure(trajectory: Run, agents: Sequence[int] | None, replica: int) -> N
 def draw_path(axes: Axes, experiment: Experiment, starts: FloatArray, ends: FloatArray, graphs: IntArray) -> None:
     """A stripe for each graph, filled while it is active: in stretches (p,) of the path [units of simulated time]."""
     names = [graph.name for graph in experiment.graph_list]
-    ends = ends[: len(starts)]
     for mode in range(len(names)):
         own = graphs == mode
         stretches = np.stack([starts[own], ends[own] - starts[own]], axis=1)

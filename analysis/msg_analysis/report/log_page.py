@@ -66,17 +66,19 @@ def log_figure(comparison: LogComparison) -> Figure:
     law, few = log.law, min(log.law.agents, MOST_LINES)
     every = max(1, -(-len(log.times) // MOST_POINTS))
     with mpl.rc_context(STYLE):
-        figure, (states, band, ratios) = stacked_panels(3.0, 0.7, 2.0)
+        figure, (states, *band, ratios) = stacked_panels(3.0, *([] if log.hidden else [0.7]), 2.0)
         for agent in range(few):
             label = plain(shorten(f"agent {agent_name(agent + 1, law.names)}"))
             there = np.flatnonzero(~np.isnan(log.states[:, agent, 0]))[::every]
             states.plot(log.times[there], log.states[there, agent, 0], lw=0.9, color=LINES[agent], label=label)
-        states.set(ylabel="state", xlim=(log.times[0], log.times[-1]))
-        states.tick_params(labelbottom=False)
+        states.set(xlabel="simulated time", ylabel="state", xlim=(log.times[0], log.times[-1]))
         legend_beside(figure, "right upper", fontsize=8)
-        ends = np.append(log.starts[1:], max([float(log.times[-1]), *log.starts[-1:].tolist()]))
-        draw_path(band, law, log.starts, ends, log.graphs)
-        band.set_xlim(states.get_xlim())
+        for path in band:
+            states.set_xlabel("")
+            states.tick_params(labelbottom=False)
+            ends = np.append(log.starts[1:], max(float(log.times[-1]), float(log.starts[-1])))
+            draw_path(path, law, log.starts, ends, log.graphs)
+            path.set_xlim(states.get_xlim())
         numbers = np.arange(1, law.agents + 1)
         counts = np.maximum(1, (~np.isnan(log.states)).sum(axis=(0, 2)))
         low, high = chi2.ppf(0.025, counts) / counts, chi2.ppf(0.975, counts) / counts

@@ -87,7 +87,11 @@ def test_graphs_that_are_not_in_the_log(robots: Path, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     for part in ("expected over all paths", "all rates of the switching", "Approximate: ", "models", "Not tested: "):
         assert part in result.stdout
-    assert "models" in (tmp_path / "page.html").read_text()
+    page = (tmp_path / "page.html").read_text()
+    assert "models" in page
+    assert "<!-- ring -->" not in page  # no band of a path that is not known
+    found = json.loads(call(*words, "--json").stdout)["factors"]
+    assert all(found[kind]["interval"][0] >= 0.0 for kind in ("noise", "measurement_noise", "rates"))
     mapped.write_text(mapped.read_text().replace("graph: hidden", "graph: {hidden: true, fixed: line}"))
     assert "graph: hidden" in call(*words).stderr
 
