@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import scipy.linalg
 
 from msg_analysis.common.arrays import BoolArray, FloatArray, IntArray
 from msg_analysis.common.resources import tell
@@ -140,6 +141,7 @@ class _Pass:
         for place, one in enumerate(self.variances):
             if one.kind == "measurement":
                 self.measured[place] = self.noise if one.agent is None else self.noise * (np.arange(m) == one.agent)
+        self.disturbed = bool(self.measured.any())
         self.silent = of.law.held & (noise == 0.0)  # always exactly at the reference
         flops = 12.0 * len(self.variances) * m**3
         self.scored = min(most, int(WORK / flops) + 1) if flops else most
@@ -232,80 +234,102 @@ class _Pass:
         keeps, whiteners = np.zeros((count, m, m)), np.zeros((count, m, m))
         white = np.zeros((count, m, replicas))  # 0 where not measured
         tangents = np.zeros((count, m, len(self.variances) * replicas))
-        starts = np.concatenate([self.x[None], np.empty((count - 1, m, replicas))])
-        everything, identity = np.arange(m), np.eye(m)
+        states, moments = np.empty((count + 1, m, replicas)), np.empty((count, m, m))
+        errors, expected = np.zeros((count, m, replicas)), np.ones((count, m))  # innovations, and their variances
+        states[0] = self.x
+        measured = self.of.present[done + 1 : last + 1] & ~self.silent
+        whole = measured.all(axis=1)
+        everything, identity, noise = np.arange(m), np.eye(m), np.diag(self.noise)
         for b in range(count):
             k = done + 1 + b
             scoring = bool(self.variances) and k < self.scored
-            present = self.of.present[k] & ~self.silent
-            rows = everything if present.all() else np.flatnonzero(present)
+            full = bool(whole[b])
+            rows = everything if full else np.flatnonzero(measured[b])
             map_, right = phi[b], phi[b].T
             x, p = map_ @ self.x, map_ @ self.p @ right + q[b]
             if scoring:
                 self.dp = map_ @ self.dp @ right
                 self.dp[:m] += parts[b]
                 self.dx = map_ @ self.dx
+            keeps[b] = identity
             if len(rows):
-                full = len(rows) == m
-                part = p if full else p[np.ix_(rows, rows)]
-                s = part + np.diag(self.noise[rows])
-                try:
-                    inverse = np.linalg.inv(np.linalg.cholesky(s))
-                except np.linalg.LinAlgError:
-                    raise self.of.singular(np.diag(s), rows, k) from None
+                here = b if full else (b, rows)
                 columns = p if full else p[:, rows]
+                s = p + noise if full else columns[rows] + np.diag(self.noise[rows])
+                # The routines themselves: with matrices as small as these, what numpy has around them takes longer.
+                factor, failed = scipy.linalg.lapack.dpotrf(s, lower=1)
+                if failed:
+                    raise self.of.singular(np.diag(s), rows, k)
+                inverse = scipy.linalg.lapack.dtrtri(factor, lower=1)[0]
                 gain = columns @ inverse.T @ inverse
                 e = self.of.values[k][rows] - x[rows]
                 z = inverse @ e
-                new = ~self.seen[rows]
-                if new.any():
-                    out.white[k][rows], out.marginal[k][rows] = _without(new, z), _without(new, e, s)
-                    self.seen[rows] = True
+                errors[here], white[here], expected[here] = e, z, s.diagonal()
+                keeps[b][:, rows] -= gain
+                keep = keeps[b]
+                if full:
+                    whiteners[b] = inverse
                 else:
-                    out.white[k][rows], out.marginal[k][rows] = z, e / np.sqrt(np.diag(s))[:, None]
-                    logarithm = np.log(np.diag(inverse)).sum() * replicas
-                    out.log_likelihood += float(logarithm - 0.5 * np.vdot(z, z))
-                keep = identity.copy()
-                keep[:, rows] -= gain
+                    whiteners[b][np.ix_(rows, rows)] = inverse
                 if scoring:
-                    tangents[b][rows] = inverse @ self.dx[rows]
+                    tangents[here] = inverse @ self.dx[rows]
                     self._score(z, inverse, gain, keep, rows)
                 x = x + gain @ e
                 p = keep @ p @ keep.T + (gain * self.noise[rows]) @ gain.T
-                white[b][rows] = z
-                whiteners[b][np.ix_(rows, rows)] = inverse
-                keeps[b] = keep
                 if out.gains is not None:
                     out.gains[k] = gain @ s @ gain.T
-            else:
-                keeps[b] = identity
             self.x, self.p = x, (p + p.T) / 2.0
-            out.filtered[k] = x
-            out.uncertainty[k] = np.einsum("ij,ij->i", self.centre @ self.p, self.centre)
-            if out.maps is not None:
-                out.maps[k] = map_
-            if b + 1 < count:
-                starts[b + 1] = x
-            if self.silent.any():
+            states[b + 1], moments[b] = x, self.p
+        self._keep(done, last, measured, white, errors / np.sqrt(expected)[:, :, None], whiteners)
+        out.filtered[done + 1 : last + 1] = states[1:]
+        out.uncertainty[done + 1 : last + 1] = np.einsum("kij,ij->ki", self.centre @ moments, self.centre)
+        if out.maps is not None:
+            out.maps[done + 1 : last + 1] = phi
+        if self.silent.any():
+            for k in range(done + 1, last + 1):
                 self._check_held(k)
-        self._gain_scores(phi, keeps, whiteners, white, tangents, self._regressors(done, last, first, end, starts))
+        regressors = self._regressors(done, last, first, end, states[:-1])
+        self._gain_scores(phi, keeps, whiteners, white, tangents, regressors)
+
+    def _keep(
+        self,
+        done: int,
+        last: int,
+        measured: BoolArray,
+        white: FloatArray,
+        marginal: FloatArray,
+        whiteners: FloatArray,
+    ) -> None:
+        """Add a block of innovations, and their likelihood; the first value of an agent is none."""
+        seen = np.logical_or.accumulate(np.concatenate([self.seen[None], measured]))
+        self.seen = seen[-1]
+        usual = measured & seen[:-1]
+        part = slice(done + 1, last + 1)
+        self.out.white[part] = np.where(usual[:, :, None], white, np.nan)
+        self.out.marginal[part] = np.where(usual[:, :, None], marginal, np.nan)
+        counted = (usual == measured).all(axis=1)
+        scales = np.diagonal(whiteners, axis1=1, axis2=2)[counted][measured[counted]]
+        chosen = white[counted]
+        self.out.log_likelihood += float(np.log(scales).sum() * white.shape[2] - 0.5 * np.vdot(chosen, chosen))
 
     def _score(self, z: FloatArray, inverse: FloatArray, gain: FloatArray, keep: FloatArray, rows: IntArray) -> None:
         """Add what a sample says about the variances by its own size, and move the derivatives past it."""
-        count, replicas = len(self.variances), z.shape[1]
-        ds = self.dp[:, rows[:, None], rows]
-        diagonal = range(len(rows))
-        ds[:, diagonal, diagonal] += self.measured[:, rows]
+        count, replicas, full = len(self.variances), z.shape[1], len(rows) == len(gain)
+        ds, moved = (self.dp, self.dp) if full else (self.dp[:, rows[:, None], rows], self.dp[:, :, rows])
+        if self.disturbed:
+            measured = self.measured[:, rows]
+            ds = ds + measured[:, :, None] * np.eye(len(rows))
         size = inverse @ ds @ inverse.T
         flat = size.reshape(count, -1)
         first = len(self.terms)
-        self.out.score[first:] += 0.5 * (flat @ (z @ z.T).reshape(-1) - replicas * np.trace(size, axis1=1, axis2=2))
+        self.out.score[first:] += 0.5 * (flat @ (z @ z.T).reshape(-1) - replicas * size.trace(axis1=1, axis2=2))
         self.out.information[first:, first:] += 0.5 * replicas * (flat @ flat.T)
         u = inverse.T @ z
-        moved = self.dp[:, :, rows] @ u - gain @ (ds @ u)  # (V, m, R)
-        self.dx = self.dx - gain @ self.dx[rows] + moved.transpose(1, 0, 2).reshape(len(gain), -1)
-        added = (gain * self.measured[:, None, rows]) @ gain.T
-        self.dp = keep @ self.dp @ keep.T + added
+        change = moved @ u - gain @ (ds @ u)  # (V, m, R)
+        self.dx = self.dx - gain @ self.dx[rows] + change.transpose(1, 0, 2).reshape(len(gain), -1)
+        self.dp = keep @ self.dp @ keep.T
+        if self.disturbed:
+            self.dp += (gain * measured[:, None]) @ gain.T
 
     def _regressors(self, done: int, last: int, first: int, end: int, starts: FloatArray) -> FloatArray:
         """(intervals, m, K, R): derivatives of the prediction by the gains, given the state before each interval."""
@@ -378,12 +402,6 @@ def parameters_of(m: int, noise: FloatArray) -> list[Variance]:
         found.append(Variance("measurement"))
         found += [Variance("measurement", i) for i in range(m) if m <= MOST_EACH]
     return found
-
-
-def _without(new: BoolArray, values: FloatArray, s: FloatArray | None = None) -> FloatArray:
-    """(rows, R) without those of agents that are measured for the first time; over their standard deviation by S."""
-    scaled = values if s is None else values / np.sqrt(np.diag(s))[:, None]
-    return np.asarray(np.where(new[:, None], np.nan, scaled))
 
 
 def estimate_noise(of: Filter, most: int) -> tuple[float, float]:
