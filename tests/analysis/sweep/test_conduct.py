@@ -5,7 +5,6 @@ import dataclasses
 import os
 import signal
 import sys
-import time
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import psutil
 import pyarrow
 import pytest
 import yaml
+from worker_jobs import cubes, first_last, killed_by_the_third, much_memory, sockets
 
 import experiments
 from msg_analysis.errors import InputError
@@ -159,12 +159,6 @@ def test_a_failure_does_not_hide_a_disagreement() -> None:
     assert evaluate_sweep([with_p(0.5, unpredicted="a protocol")], 0.01).verdicts == ("unpredicted",)
 
 
-def cubes(number: int, _stopping: Any) -> int:
-    if number == 13:
-        os.kill(os.getpid(), 9)
-    return number**3
-
-
 def test_what_kills_its_workers_is_given_up_and_the_others_are_done() -> None:
     """Real workers: each death is that of a process, and a new one takes its place."""
     with LocalWorkers(2) as pool, closing(pool.outcomes(cubes, list(range(30)))) as batches:
@@ -173,14 +167,6 @@ def test_what_kills_its_workers_is_given_up_and_the_others_are_done() -> None:
     assert isinstance(lost, Lost)
     assert "killed every worker" in lost.reason
     assert found == {number: number**3 for number in range(30) if number != 13}
-
-
-def sockets(_item: int, _stopping: Any) -> list[Any]:
-    return [each.laddr for each in psutil.Process().net_connections("all")]
-
-
-def much_memory(size: int, _stopping: Any) -> int:
-    return len(bytearray(size))
 
 
 def test_nobody_else_can_reach_a_worker() -> None:
@@ -209,17 +195,6 @@ def test_workers_that_do_not_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/nowhere")
     with LocalWorkers(2) as pool, pytest.raises(InputError, match="--workers: number 1 cannot be started"):
         list(pool.outcomes(cubes, list(range(30))))
-
-
-def first_last(item: int, _: Any) -> int:
-    time.sleep(0.0 if item else 0.3)
-    return item**3
-
-
-def killed_by_the_third(item: int, _: Any) -> int:
-    if item == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return item
 
 
 def test_results_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
