@@ -218,11 +218,12 @@ def _through(
     third, fourth = second * (2.0 * p - 1.0), second * (1.0 - 3.0 * second)
     pairs = (u[:, :, None] * u[:, None, :]).reshape(events, size**2)
     if events:
-        inside = (v[:, :, None] * v[:, None, :]).reshape(pairs.shape) @ tensor.reshape(size**2, -1)
+        differences = (v[:, :, None] * v[:, None, :]).reshape(pairs.shape)
+        inside = differences @ tensor.reshape(size**2, -1)
         inside = inside.reshape(events, size, size)  # T(v_e, v_e; ., .)
         across = np.einsum("ebcd,ec->ebd", (v @ tensor.reshape(size, -1)).reshape(events, *shape[1:]), v)
         once = np.einsum("eab,eb->ea", inside, v) @ matrix.T
-        beside, apart = (np.einsum("eab,fa,fb->ef", seen, v, v, optimize=True) for seen in (inside, across))
+        beside, apart = (seen.reshape(pairs.shape) @ differences.T for seen in (inside, across))  # (E, E)
         weights = np.outer(second, second)
         np.fill_diagonal(weights, fourth)
         rest = second[:, None, None] * (matrix @ inside @ matrix.T) + third[:, None, None] * _both(u, once)
