@@ -29,6 +29,14 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
+@pytest.fixture(scope="module")
+def missing_link(robots: Path) -> tuple[str, str]:
+    """What is shown of the bad bag, in full, and its report."""
+    words = robots / "bad", "--law", robots / "law.yaml", "--map", robots / "map.yaml", "--verbose"
+    shown = call("compare", *words, "--report", robots / "page.html").stdout
+    return shown, (robots / "page.html").read_text()
+
+
 def call(*words: Any) -> Any:
     return run("msg-analysis", *map(str, words))
 
@@ -41,23 +49,20 @@ def test_a_right_bag_agrees(robots: Path) -> None:
     assert not (robots / "good/result.json").exists()
 
 
-def test_a_missing_link_is_named(robots: Path) -> None:
-    words = robots / "bad", "--law", robots / "law.yaml", "--map", robots / "map.yaml"
-    result = call("compare", *words, "--json")
+def test_a_missing_link_is_named(robots: Path, missing_link: tuple[str, str]) -> None:
+    result = call("compare", robots / "bad", "--law", robots / "law.yaml", "--map", robots / "map.yaml", "--json")
     document = json.loads(result.stdout)
     assert (result.exit_code, document["verdict"]) == (1, "disagrees")
     assert [cause["link"] for cause in document["causes"]] == [[2, 3]]
     assert document["causes"][0]["words"].endswith("it seems to be missing")
-    shown = call("compare", *words, "--verbose").stdout
+    shown, _ = missing_link
     assert shown.startswith("The log disagrees with the law.\n  the gain of edge 2-3 in both directions")
     assert "rejected" in shown
 
 
-def test_the_report(robots: Path, tmp_path: Path) -> None:
+def test_the_report(missing_link: tuple[str, str]) -> None:
     """One file that loads nothing: the text of the terminal, and a picture with every agent."""
-    words = robots / "bad", "--law", robots / "law.yaml", "--map", robots / "map.yaml"
-    shown = call("compare", *words, "--report", tmp_path / "page.html").stdout
-    page = (tmp_path / "page.html").read_text()
+    shown, page = missing_link
     text = html.unescape(re.sub(r"<[^>]*>", "", page[page.index("<pre>") : page.index("</pre>")]))
     assert " ".join(shown.splitlines()[1].split()) in " ".join(text.split())
     assert page.count("<svg") == 1

@@ -43,7 +43,10 @@ def decisions(share: float, runs: int = 2000, repeats: int = 2000) -> tuple[np.n
     """(repeats,) whether a claim of 0.95 is rejected ever, and after how many runs."""
     good = np.cumsum(np.random.default_rng(1).random((repeats, runs)) < share, axis=1)
     bad = np.arange(1, runs + 1) - good
-    rejected = share_evidence(good, bad, ASKED) >= -math.log(LEVEL)
+    # Of each pair of numbers once: the repeats have most of them in common.
+    number, failures = np.ogrid[1 : runs + 1, : bad.max() + 1]
+    rejects = share_evidence((number - failures).clip(0), failures, ASKED) >= -math.log(LEVEL)
+    rejected = rejects[np.arange(runs), bad]
     return rejected.any(axis=1), rejected.argmax(axis=1) + 1
 
 

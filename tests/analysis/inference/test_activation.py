@@ -49,14 +49,13 @@ def lazy(activation: float = 0.7, dt: float = 0.05, **changes: Any) -> Experimen
 def enumerated(w: np.ndarray, noise: np.ndarray, activation: float, centre: np.ndarray) -> np.ndarray:
     """Second moments (m, m) of the steady state: the mean of W C W^T over all 2^m sets of agents, step by step."""
     m = len(w)
-    sets = [np.array(there, dtype=float) for there in product((0, 1), repeat=m)]
+    there = np.array(list(product((0.0, 1.0), repeat=m)))  # (2^m, m)
+    chances = np.prod(np.where(there, activation, 1.0 - activation), axis=1)[:, None, None]
+    steps = np.where(there[:, :, None], w, np.eye(m))
+    added = (chances * there[:, :, None] * there[:, None, :] * noise).sum(axis=0)
     moments = np.zeros((m, m))
     for _ in range(4000):
-        after = np.zeros((m, m))
-        for there in sets:
-            chance = np.prod(np.where(there, activation, 1.0 - activation))
-            step = np.where(there[:, None], w, np.eye(m))
-            after += chance * (step @ moments @ step.T + np.outer(there, there) * noise)
+        after = (chances * (steps @ moments @ steps.transpose(0, 2, 1))).sum(axis=0) + added
         moments = centre @ after @ centre.T
     return moments
 

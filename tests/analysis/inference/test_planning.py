@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.stats
+from report_texts import without_figures
 from tests.support.watched_run import sums_of
 
 import experiments
@@ -122,7 +123,7 @@ def test_noise_that_agents_share_has_that_divergence_too() -> None:
 
 
 @pytest.mark.parametrize("duration", [1.0, 100.0])
-def test_a_run_that_agrees_says_what_it_could_have_found(duration: float) -> None:
+def test_a_run_that_agrees_says_what_it_could_have_found(duration: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """20 steps, and 2000: the interval of the table, and the power that the plan of this run has."""
     run = simulate(line_ring(duration=duration))
     document = compare(run).to_json()
@@ -137,6 +138,7 @@ def test_a_run_that_agrees_says_what_it_could_have_found(duration: float) -> Non
     )
     assert power_words(document) == [words]
     assert power_words(document | {"verdict": "disagrees"}) == []
+    without_figures(monkeypatch)
     assert words in render(compare(run))
 
 

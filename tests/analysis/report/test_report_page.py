@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from report_texts import without_figures
 
 from experiments import Completeness, claimed, compare, late, line_ring, simulate
 from msg_analysis import Experiment, InputError
@@ -122,11 +123,6 @@ def test_incomplete(tmp_path: Path, first_gap: int) -> None:
     assert "rejected: torn file" in page.text
 
 
-def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports of which only the texts are looked at."""
-    monkeypatch.setattr(report_page, "pack", lambda models: (dict.fromkeys(models, ""), ""))
-
-
 def test_what_became_of_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Only where something did; texts from outside are texts."""
     comparison, quiet = _agreeing(2)
@@ -176,8 +172,9 @@ def test_real_time_has_its_sections(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "0 of 600 (0 %)" in text
 
 
-def test_a_run_that_disagrees_says_what_decided_and_what_check_finds(tmp_path: Path) -> None:
+def test_a_run_that_disagrees_says_what_decided_and_what_check_finds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where the twin finds no difference: the same run, judged by a level that few correct runs pass."""
+    without_figures(monkeypatch)
     wrong = simulate(line_ring(noise={"process": [1.0, 1.0, 2.0]}))
     for run, level, words in (
         (
