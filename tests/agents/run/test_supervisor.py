@@ -66,7 +66,7 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Child]]:
             )
         child = Child(ProcessSpec(name, (), resumes=resumes), process, log, number)
         children.append(child)
-        wait_for(lambda: "ready" in log.read_text() or not child.running)
+        wait_for(lambda: "ready\n" in log.read_text() or not child.running)
         return child
 
     yield start_child
