@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import distributed
 import pytest
 import yaml
 from programs import put_foreign_files
@@ -50,6 +49,8 @@ def generators(*rates: float) -> list[list[list[float]]]:
 @pytest.fixture
 def cluster(network: Any) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """A scheduler and two workers, as `dask scheduler` and `dask worker` start them."""
+    from distributed import Client  # here, since every worker of the tests would import it
+
     where = network.directory / "scheduler.json"
     quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     started = [
@@ -62,7 +63,7 @@ def cluster(network: Any) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]
     address = json.loads(where.read_text())["address"]
     worker = [BIN / "dask", "worker", address, "--nthreads", "1", "--no-nanny", "--dashboard-address", "127.0.0.1:0"]
     started += [subprocess.Popen([*worker, "--local-directory", network.directory], **quiet) for _ in range(2)]
-    with distributed.Client(address) as client:
+    with Client(address) as client:
         client.wait_for_workers(2, timeout=60)
     yield address, started[1:]
     for process in started:

@@ -141,7 +141,6 @@ class _Pass:
         for place, one in enumerate(self.variances):
             if one.kind == "measurement":
                 self.measured[place] = self.noise if one.agent is None else self.noise * (np.arange(m) == one.agent)
-        self.disturbed = bool(self.measured.any())
         self.silent = of.law.held & (noise == 0.0)  # always exactly at the reference
         flops = 12.0 * len(self.variances) * m**3
         self.scored = min(most, int(WORK / flops) + 1) if flops else most
@@ -237,14 +236,14 @@ class _Pass:
         states, moments = np.empty((count + 1, m, replicas)), np.empty((count, m, m))
         errors, expected = np.zeros((count, m, replicas)), np.ones((count, m))  # innovations, and their variances
         states[0] = self.x
-        measured = self.of.present[done + 1 : last + 1] & ~self.silent
-        whole = measured.all(axis=1)
+        present = self.of.present[done + 1 : last + 1] & ~self.silent
+        whole = present.all(axis=1)
         everything, identity, noise = np.arange(m), np.eye(m), np.diag(self.noise)
         for b in range(count):
             k = done + 1 + b
             scoring = bool(self.variances) and k < self.scored
             full = bool(whole[b])
-            rows = everything if full else np.flatnonzero(measured[b])
+            rows = everything if full else np.flatnonzero(present[b])
             map_, right = phi[b], phi[b].T
             x, p = map_ @ self.x, map_ @ self.p @ right + q[b]
             if scoring:
@@ -280,7 +279,7 @@ class _Pass:
                     out.gains[k] = gain @ s @ gain.T
             self.x, self.p = x, (p + p.T) / 2.0
             states[b + 1], moments[b] = x, self.p
-        self._keep(done, last, measured, white, errors / np.sqrt(expected)[:, :, None], whiteners)
+        self._record(done, last, present, white, errors / np.sqrt(expected)[:, :, None], whiteners)
         out.filtered[done + 1 : last + 1] = states[1:]
         out.uncertainty[done + 1 : last + 1] = np.einsum("kij,ij->ki", self.centre @ moments, self.centre)
         if out.maps is not None:
@@ -291,45 +290,42 @@ class _Pass:
         regressors = self._regressors(done, last, first, end, states[:-1])
         self._gain_scores(phi, keeps, whiteners, white, tangents, regressors)
 
-    def _keep(
+    def _record(
         self,
         done: int,
         last: int,
-        measured: BoolArray,
+        present: BoolArray,
         white: FloatArray,
         marginal: FloatArray,
         whiteners: FloatArray,
     ) -> None:
         """Add a block of innovations, and their likelihood; the first value of an agent is none."""
-        seen = np.logical_or.accumulate(np.concatenate([self.seen[None], measured]))
+        seen = np.logical_or.accumulate(np.concatenate([self.seen[None], present]))
         self.seen = seen[-1]
-        usual = measured & seen[:-1]
+        usual = present & seen[:-1]
         part = slice(done + 1, last + 1)
         self.out.white[part] = np.where(usual[:, :, None], white, np.nan)
         self.out.marginal[part] = np.where(usual[:, :, None], marginal, np.nan)
-        counted = (usual == measured).all(axis=1)
-        scales = np.diagonal(whiteners, axis1=1, axis2=2)[counted][measured[counted]]
+        counted = (usual == present).all(axis=1)
+        scales = np.diagonal(whiteners, axis1=1, axis2=2)[counted][present[counted]]
         chosen = white[counted]
         self.out.log_likelihood += float(np.log(scales).sum() * white.shape[2] - 0.5 * np.vdot(chosen, chosen))
 
     def _score(self, z: FloatArray, inverse: FloatArray, gain: FloatArray, keep: FloatArray, rows: IntArray) -> None:
         """Add what a sample says about the variances by its own size, and move the derivatives past it."""
         count, replicas, full = len(self.variances), z.shape[1], len(rows) == len(gain)
-        ds, moved = (self.dp, self.dp) if full else (self.dp[:, rows[:, None], rows], self.dp[:, :, rows])
-        if self.disturbed:
-            measured = self.measured[:, rows]
-            ds = ds + measured[:, :, None] * np.eye(len(rows))
+        ds, columns = (self.dp, self.dp) if full else (self.dp[:, rows[:, None], rows], self.dp[:, :, rows])
+        measured = self.measured[:, rows]
+        ds = ds + measured[:, :, None] * np.eye(len(rows))
         size = inverse @ ds @ inverse.T
         flat = size.reshape(count, -1)
         first = len(self.terms)
         self.out.score[first:] += 0.5 * (flat @ (z @ z.T).reshape(-1) - replicas * size.trace(axis1=1, axis2=2))
         self.out.information[first:, first:] += 0.5 * replicas * (flat @ flat.T)
         u = inverse.T @ z
-        change = moved @ u - gain @ (ds @ u)  # (V, m, R)
-        self.dx = self.dx - gain @ self.dx[rows] + change.transpose(1, 0, 2).reshape(len(gain), -1)
-        self.dp = keep @ self.dp @ keep.T
-        if self.disturbed:
-            self.dp += (gain * measured[:, None]) @ gain.T
+        moved = columns @ u - gain @ (ds @ u)  # (V, m, R)
+        self.dx = self.dx - gain @ self.dx[rows] + moved.transpose(1, 0, 2).reshape(len(gain), -1)
+        self.dp = keep @ self.dp @ keep.T + (gain * measured[:, None]) @ gain.T
 
     def _regressors(self, done: int, last: int, first: int, end: int, starts: FloatArray) -> FloatArray:
         """(intervals, m, K, R): derivatives of the prediction by the gains, given the state before each interval."""

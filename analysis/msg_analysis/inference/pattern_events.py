@@ -57,7 +57,7 @@ class Periods:
         self._laws: dict[tuple[int, int], _Law] = {}  # by graph and agent
         self._cache: dict[bytes, Period] = {}
         self._cached, self._most_cached = 0, CACHED_BLOCKS * observation.block_numbers
-        self.steps, self.agents, self.block_numbers = observation.steps, step.agents, observation.block_numbers
+        self.steps, self.agents = observation.steps, step.agents
         self.largest = step.agents + int(np.diff(self._extras.ends).max(initial=0))  # entries of the largest stack
 
     def entries(self, number: int) -> int:

@@ -118,8 +118,7 @@ def _follow(
     for block in reversed(range(len(beginnings))):
         first, last = block * length, min((block + 1) * length, steps)
         beginning, here = beginnings[block]
-        if length > 1:
-            periods.release()
+        periods.release()
         moments_of = [here]
         for number in range(first + 1, last):
             moments_of.append(_next(periods, number, moments_of[-1]))
@@ -156,16 +155,14 @@ def _start(observation: Observation) -> FloatArray:
 
 def _forward(periods: Periods, start: FloatArray) -> tuple[FloatArray, list[tuple[FloatArray, FloatArray]], int]:
     """Sum of E[X X^T] (m, m), M before and at the beginning of every block, and the number of periods in a block."""
-    m, small = periods.agents, periods.steps * periods.largest**2 <= periods.block_numbers
-    length = 1 if small else max(1, math.isqrt(periods.steps))  # small: all moments are kept, so none is computed again
+    m, length = periods.agents, max(1, math.isqrt(periods.steps))
     total, beginnings, moment, before = np.zeros((m, m)), [], start, start
     for number in range(periods.steps):
         if number:
             before, moment = moment, _next(periods, number, moment)
         if number % length == 0:
             beginnings.append((before, moment))
-            if length > 1:
-                periods.release()
+            periods.release()
         total += moment[:m, :m]
     return total, beginnings, length
 

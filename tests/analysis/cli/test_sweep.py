@@ -117,7 +117,7 @@ def test_interrupted_and_resumed_it_is_as_if_it_never_was(tmp_path: Path, here: 
     before = journal.read_bytes()
     kept = before.count(b"\n")
     assert f"interrupted: {kept} of 6 points are kept" in stderr
-    code, stdout, _ = here(path, "--out", out, "--workers", "1", "--json")
+    code, stdout, _ = here(path, "--out", out, "--json")
     document = json.loads(stdout)
     assert (code, document["kept"], document["done"], document["verdict"]) == (0, kept, 6, "agrees")
     assert journal.read_bytes().startswith(before)
