@@ -33,6 +33,7 @@ rclpy.init()
 node = rclpy.create_node("monitor", enable_rosout=False)
 node.create_subscription(DiagnosticArray, "/diagnostics", say, 100)
 node.create_subscription(Progress, "/progress", lambda m: print(m.agent, m.step, file=sys.stderr, flush=True), 100)
+print("[]", flush=True)  # it listens
 rclpy.spin(node)
 """
 
@@ -55,11 +56,13 @@ def test_a_stopped_agent_and_second_processes_of_others(network: Any) -> None:
     other.write_text(new_record(network.experiment(run={"duration": 100, "seed": 8})).to_json(with_key=True))
     heard, reports = network.directory / "heard", network.directory / "reports"
     with free_domain() as domain, heard.open("w") as output, reports.open("w") as errors:
-        file = network.file(run={"duration": 300, "processes": "one_per_agent"})
-        run = network.record(file, "--domain", str(domain), "--json")
+        file = network.file(run={"duration": 600, "processes": "one_per_agent"})
         command = [sys.executable, "-P", "-c", MONITOR]
         monitor = subprocess.Popen(command, env=node_environment(domain), stdout=output, stderr=errors)
         try:
+            # Before the run, which takes a few seconds.
+            network.wait_for(heard.read_text, 30, "the monitor")
+            run = network.record(file, "--domain", str(domain), "--json")
             network.wait_until_moving()
             network.wait_for(lambda: len(heard_of(heard)) == 7, 30, "diagnostics of every node")
             (victim,) = (process for process in network.processes("agent") if process.agent == 2)
